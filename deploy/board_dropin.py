@@ -90,10 +90,10 @@ def device_unit(path: str) -> str:
 def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list[str]:
     """Return the DeviceAllow lines for a device file, which may be a symbolic link made by udev.
 
-    systemd resolves a file to one device number when the service starts. A USB device may reconnect under
-    another number, such as ttyUSB1 instead of ttyUSB0, so the class of the driver is allowed. For a device
-    that does not exist yet, the driver classes `plugged` are allowed. The folder `root` contains proc and
-    sys.
+    systemd resolves a file to one device number when the service starts. A USB device may reconnect under a
+    different number, such as ttyUSB1 instead of ttyUSB0, so the class of its driver is permitted. For a
+    device that does not exist yet, the driver classes `plugged` are allowed. The folder `root` contains proc
+    and sys.
     """
     try:
         mode, number = (found := os.stat(path)).st_mode, found.st_rdev

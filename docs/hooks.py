@@ -1,4 +1,4 @@
-"""Build hooks of the documentation site: guides stand before module pages in the search results."""
+"""Build hooks of the documentation site: guides are listed before module pages in the search results."""
 
 from __future__ import annotations
 

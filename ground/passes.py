@@ -236,7 +236,10 @@ class OrbitPrediction:
         return self._at, self._seen_from(station.on_earth(), self._at)[0]
 
     def eclipses(self) -> list[tuple[datetime, datetime]]:
-        """Return begin and end of each eclipse in the span, defined by half of the Sun's disc visible."""
+        """Return start and end of each eclipse in the span.
+
+        At both times, half of the Sun's disc is visible.
+        """
         dates = np.array([julian_date(at) for at in self._at])
         # The Sun's direction changes slowly, so that 25 ephemeris values a day are sufficient.
         knots = np.linspace(dates[0], dates[-1], 2 + math.ceil(24.0 * (dates[-1] - dates[0])))

@@ -50,7 +50,7 @@ def draw_marks(
         picture: the picture.
         endpoints: end points of the streaks (n, 2, 2), px.
         used: whether (n,) each streak was used; rings of used streaks are orange, other rings are blue.
-        objects: end points (2, 2), px, of each object, which get wider vermillion rings.
+        objects: end points (2, 2), px, of each object, which are marked by wider vermilion rings.
     """
     drawn = picture.copy()
     for ends, is_used in zip(endpoints, used, strict=True):
@@ -90,7 +90,7 @@ _EXPECTED: Colour = (0, 158, 115)
 _NAME: Colour = (240, 228, 66)
 _MAX_NAMES = 25
 _BRIGHTEST = 8
-"""Number of brightest stars that get a label even without a proper name."""
+"""Number of brightest stars that are labelled even without a proper name."""
 _ARROW = 0.06
 """Length of the compass's north arrow as a fraction of the picture size."""
 

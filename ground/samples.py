@@ -37,7 +37,7 @@ EARTH_PIXELS, EARTH_FIELD_DEG, ALTITUDE_KM = 512, 67.0, 515.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SamplePicture:
-    """A sample picture, its true parameters, and a command to try, with `{}` for the picture's file."""
+    """A sample image, its true parameters, and an example command, with `{}` for the image file."""
 
     name: str
     pixels: Image

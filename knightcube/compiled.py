@@ -37,7 +37,7 @@ _COMPILING = (
     f"({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []
-"""Functions that loop forms call, until numba knows them."""
+"""Functions that are called by loop forms and not yet compiled by numba."""
 
 
 class HotFunction(Generic[Parameters, Result]):
@@ -73,7 +73,7 @@ class HotFunction(Generic[Parameters, Result]):
         return self._chosen
 
     def compiled_form(self) -> Callable[Parameters, Result]:
-        """Return the loop form as a function that numba compiles, and keeps in a file where it can write one.
+        """Return the loop form as a function that numba compiles and, if possible, stores in a file.
 
         Raises ImportError if numba is not installed, or does not fit the installed numpy.
         """

@@ -122,7 +122,7 @@ def assemble(
     The function `now_ns` returns the simulation time. `expose` and `expose_wide` replace the renderers of the
     cameras, which in real time run in another process. Raises ConfigError for an invalid world.
     """
-    # All devices begin at one instant; in real time the clock runs on while they are built.
+    # All devices start at the same instant; in real time the clock advances while they are built.
     start_ns = now_ns()
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     circuit, monitor = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wires)

@@ -94,7 +94,7 @@ class TimedWorld(Protocol):
     """A simulated world that a SimClock advances."""
 
     def next_event_ns(self) -> int:
-        """Return the time of the world's next event."""
+        """Return the time of the next event in the simulated world."""
 
     def run_events(self, event_ns: int) -> None:
         """Process the events at `event_ns`, which is the time of the next event."""

@@ -218,7 +218,7 @@ class EmulatedBench:
         held.turn(axis, angle, self.rig.clock.now_ns(), seconds)
 
     def cover(self, on: bool) -> None:
-        """Put the cap on the lens or take it off. A camera with another fault keeps this fault."""
+        """Put the cap on the lens or take it off. A camera that already has a fault keeps its fault."""
         camera = self.hardware.camera
         if camera is not None and camera.fault in {"", "capped"}:
             camera.fault = "capped" if on else ""

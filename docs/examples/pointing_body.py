@@ -59,7 +59,7 @@ DUE_NS = 60_000_000_000
 # --8<-- [start:law]
 @dataclass(frozen=True, slots=True)
 class FixedAttitude:
-    """An `TargetLaw`: an attitude that stands still."""
+    """A `TargetLaw` with a constant attitude."""
 
     wanted: tuple[float, ...]
 
@@ -243,7 +243,7 @@ class View:
         self._events = services.events
 
     def record_cycle(self, output: ControlOutput) -> None:
-        """Record nothing of its own."""
+        """Record no additional packets."""
 
     def announce(self, target: Target, now_ns: int) -> None:
         """Report a new target."""

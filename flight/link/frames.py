@@ -279,7 +279,7 @@ class FrameStream:
         self._header_bytes = header_bytes
         self._decode = decode
         self._wrong_bits = wrong_bits
-        self._follows = False  # whether the data begin directly after a frame with a correct CRC
+        self._follows = False  # whether the data follow directly after a frame with a correct CRC
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:

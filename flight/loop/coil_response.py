@@ -201,7 +201,7 @@ can make the gain of a healthy coil of 0.8 look as small as 0.5."""
 _STRONG_GAIN = 1.25
 """Lower limit of the gain of a coil that is stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
-"""Smallest gain of a weak coil that is worth using, and largest standard deviation of a gain to be used."""
+"""Smallest gain at which a weak coil is used, and largest standard deviation of a used gain."""
 _STEADY = 2.0
 """Largest difference between the gain of the newest half of the bins and that of all bins, in standard
 deviations of the gain of the newest half."""
@@ -455,7 +455,7 @@ class CoilResponse:
             self._count(axis, whole.possible, alone=alone, is_reversed=bool(shown), is_steady=is_steady)
 
     def _solved(self, rows: FloatArray, span: float) -> MotionFit:
-        """Fit all gains freely, and fit each gain with the other coils assumed healthy.
+        """Fit all gains freely, and fit each gain under the assumption that the other coils are healthy.
 
         `rows` (m, f, n + 3 + k) are those of m neighbouring bins, and `span` is the time (s) from bin to bin.
         """

@@ -257,7 +257,7 @@ class FlightLoop:
     def _correct_label(self, now_ns: int) -> None:
         """Record the properties of the run again after a change of the UTC, and then once a minute.
 
-        The repetitions let a link process that starts later know the corrected UTC.
+        Because of the repetitions, a link process that starts later receives the corrected UTC.
         """
         changed = abs(self._utc_at_zero() - self._zero_utc_ns) > CLOCK_OFF_NS
         self._is_corrected = self._is_corrected or changed

@@ -700,7 +700,7 @@ class Imaging:
             self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
             return
         if self._due_ns is None:
-            # A free-running camera first completes the exposure under way.
+            # A free-running camera first completes its present exposure.
             self._due_ns = now_ns + 2 * exposure_ns + self._settings.late_ns
 
     def serve(self, now_ns: int) -> None:
@@ -760,7 +760,7 @@ class Imaging:
         return replace(job, lens=(self._lens, elapsed))
 
     def _keep_lens(self, frame: Frame, lens: LensKnowledge | None, now_ns: int) -> None:
-        """Accept the lens after a frame for the next frames. A frame without stars changes nothing."""
+        """Accept the lens after a frame for the next frames. A frame without stars has no effect."""
         before = self._lens
         if lens is None or before is None or lens.frames == before.frames:
             return

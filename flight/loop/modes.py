@@ -200,7 +200,7 @@ class ModeMachine:
         self.since_ns = 0
 
     def answer(self, trigger: Trigger) -> Mode | TriggerAnswer:
-        """Return the mode to which `trigger` would lead now, or why it would not change the mode."""
+        """Return the mode after `trigger`, or the reason why the mode would not change."""
         return self._table[self.mode][trigger]
 
     def fire(self, trigger: Trigger, now_ns: int) -> ModeChange | None:

@@ -143,7 +143,7 @@ class _Loader(yaml.SafeLoader):
 
 
 _TOLERATED = re.compile("[\t!?\ufeff]|[|>][0-9+-]*#")
-"""Characters that libyaml reads in more places, or with another meaning, than PyYAML's own parser."""
+"""Characters that libyaml accepts at more positions, or interprets differently, than PyYAML's own parser."""
 
 
 class _FastLoader(_Loader):
@@ -227,7 +227,7 @@ def read_document(text: str, name: str) -> Document:
 
     The value of the key `extends` is a path relative to the file `name`, or the name of a packaged
     configuration. Mappings are merged key by key; lists and scalars replace those of the extended file. Error
-    messages name the file in which a value stands.
+    messages name the file that contains the value.
 
     Raises ConfigError, also if files extend each other in a circle, and UnreadConfigError if an extended file
     cannot be read.

@@ -398,8 +398,8 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
 def _scratch(out: Path) -> Iterator[str]:
     """Yield a folder for temporary files of the workers, and delete the folder at the end.
 
-    A link in the folder of the campaign leads to it, by which the next start deletes the folder of a killed
-    campaign. The folder itself has a short path, because paths of sockets are limited to 107 characters.
+    A symbolic link in the campaign's folder points to it. After a kill, the next start deletes the folder by
+    this link. The folder itself has a short path, because paths of sockets are limited to 107 characters.
     """
     link = out / "temporary"
     _clear(link)

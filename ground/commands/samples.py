@@ -36,7 +36,7 @@ def configure_samples(parser: argparse.ArgumentParser) -> None:
 
 
 def run_samples(options: argparse.Namespace) -> int:
-    """Render and write the pictures, and print the commands to try."""
+    """Render and write the sample images, and print example commands."""
     from ground.samples import FIELD_DEG, write_samples, write_truth  # noqa: PLC0415 - slow to load
 
     out: Path = options.out

@@ -257,7 +257,7 @@ class _Predictor:
         return error, (saa, pab, pab, sbb)
 
     def note_switch(self, jump: float) -> None:
-        """Update the derivative by the delay, because a longer delay lets the old current act longer."""
+        """Update the derivative by the delay: with a longer delay, the old current acts longer."""
         self._by_rate = self._by_rate.copy()
         self._by_rate[_DELAY] -= self._constants.gain * math.cos(self._angle) * jump
 

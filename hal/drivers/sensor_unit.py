@@ -159,7 +159,7 @@ class SensorUnit:
         for part in self._parts:
             try:
                 self._drivers.append(part.make())
-            # CircuitPython drivers raise RuntimeError or ValueError for a missing or another sensor.
+            # CircuitPython drivers raise RuntimeError or ValueError for a missing or a different sensor.
             except (OSError, RuntimeError, ValueError, DeviceError) as error:
                 self._drivers = []
                 raise NotResponding(self.name, f"{part.name}: {error}; check power and wiring") from error

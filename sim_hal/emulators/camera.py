@@ -58,7 +58,7 @@ class EmulatedCamera:
         fault: present fault, "off", "frozen", "torn" or a key of `SPOILT`; empty for a camera without a
             fault.
         late_ns: additional delay of the frames, ns.
-        one_of: number n of a fault in which the camera obeys only every n-th trigger.
+        one_of: number n of a fault in which the camera reacts only to every n-th trigger.
     """
 
     def __init__(

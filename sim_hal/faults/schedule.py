@@ -181,7 +181,7 @@ _EMULATED = {
 
 
 def other_driver(device: str, config: Config) -> str:
-    """Return why the device of a fault has no faults, which is another driver, or an empty text."""
+    """Return the reason why a fault cannot act on a device with a different driver, or an empty text."""
     kind, driver = _EMULATED.get(device.partition("-")[0], ("", ""))
     section = getattr(config, kind, None)
     if section is None or section.driver == driver:

@@ -1,4 +1,4 @@
-"""Configurations of boards for flights against emulated devices, and what such a flight must show."""
+"""Configurations of boards for runs with emulated devices, and the requirements on such a run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from sim_hal.serving.device_link import RemoteI2cBus
 from tests.deploy.scripts import ROOT
 
 WORLDS = {"board_testbed": "step_demo", "board_orbit": "orbit"}
-"""Configurations with the worlds in which the devices of the boards are emulated."""
+"""Configurations of boards, each with the simulated world for its emulated devices."""
 
 
 def board_text(name: str, folder: Path) -> str:
     """Return a board's configuration for devices in `folder`, a busy machine and a short flight.
 
-    The inhibit after separation is shortened. The testbed turns to another angle every 10 s, so that the
+    The inhibit after separation is shortened. The testbed rotates to a new angle every 10 s, so that the
     frames have streaks.
     """
     text = (ROOT / "config" / f"{name}.yaml").read_text(encoding="utf-8")

@@ -41,7 +41,7 @@ ExecStart={sys.prefix}/bin/python -m tests.deploy.emulated_video {_CONFIG} {{}} 
 
 
 def fly_board(name: str) -> dict[str, Any]:
-    """Fly a board's configuration as the service, and return what was seen."""
+    """Run a board's configuration as the service, and return the observations."""
     _CONFIG.write_text(board_text(name, Path("/dev")), encoding="utf-8")
     for device in ("imu", "gps", "camera", "wide-1", "wide-2"):
         link = Path(f"/dev/knightcube-{device}")

@@ -1,8 +1,8 @@
-"""A board's files with releases that are built in a second: its Python makes empty environments.
+"""Files of a board whose releases are built in a second, because its Python makes empty environments.
 
-The Python that the installer is given is a script: it makes virtual environments whose Python is the script
-again, "installs" by writing one file, and flies by printing which release it is. All else, such as the
-installer's own modules, is run by the real Python.
+The installer gets a script as its Python. The script makes virtual environments with itself as Python,
+"installs" by writing one file, and prints its release instead of starting a flight. All other programs, such
+as the installer's own modules, are run by the real Python.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ esac
 
 
 def starts_record(starts: dict[str, int], *proven: str) -> bytes:
-    """Return the record of the starts of releases that are not proven, and of the proven releases."""
+    """Return the record of the starts of releases that are not accepted yet, and of the accepted releases."""
     return to_record(json.dumps({"starts": starts, "proven": proven}).encode())
 
 
 @dataclass(frozen=True)
 class FakeBoard:
-    """A board's files below `root`, and Pythons that build releases of several labels."""
+    """Files of a board below `root`, and Python scripts that build releases with given labels."""
 
     root: Path
     config: Path = TESTBED
 
     @property
     def prefix(self) -> Path:
-        """Where the software stands."""
+        """Folder of the software."""
         return self.root / "opt/knightcube"
 
     def python(self, label: str) -> Path:
@@ -82,7 +82,7 @@ class FakeBoard:
         return {**os.environ, "DESTDIR": str(self.root)}
 
     def install(self, label: str) -> str:
-        """Install a release; return what was printed."""
+        """Install a release, and return the output."""
         words = self.words(label)
         done = subprocess.run(words, env=self.environment(), capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
@@ -95,10 +95,10 @@ class FakeBoard:
         return shlex.split(line.replace("$$", "$").replace("/opt/knightcube", str(self.prefix)))[:4]
 
     def fly(self, *program: str) -> tuple[str, str]:
-        """Start the flight; return the label of what flew, "" for nothing, and the complaints.
+        """Start the flight, and return the label of the started release ("" for none) and the error output.
 
-        The line that reports an ordinary start of the current release is left out. Without the words of a
-        `program`, such as those of a unit, the first copy of the launcher starts the flight.
+        The line that reports an ordinary start of the current release is left out. By default, the first copy
+        of the launcher starts the flight; `program` gives another command line, such as a unit's.
         """
         state = self.root / "state"
         state.mkdir(exist_ok=True)

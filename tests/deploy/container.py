@@ -1,4 +1,4 @@
-"""A machine of its own for the service: this one's files in an overlay, systemd booted in them by nspawn.
+"""Boots systemd by nspawn on an overlay of the machine's files, as a separate machine for the service.
 
 `boot` runs `python -m tests.deploy.container FOLDER SCENARIO` in a mount namespace of its own, so that its
 mounts are not seen outside and end with it. The program installs the service by `deploy/install.sh` and
@@ -38,13 +38,13 @@ Environment=PATH={_SHARE}/bin:/usr/bin PYTHONPATH={ROOT}"""
 """What the sandbox must let through here: an interpreter in a home, and the stand-in for i2cset."""
 
 _HIDDEN = tuple(map(Path, ("/tmp", "/run", "/mnt", "/dev", "/proc", "/sys")))
-"""Where the container has mounts of its own, which cover this machine's files."""
+"""Folders where the container has its own mounts, which hide the machine's files."""
 
 _TOOLS = ("systemd-nspawn", "unshare", "systemctl", "mount", "useradd")
 
 
 def why_not() -> str:
-    """Return why this machine cannot boot such a container, "" where it can."""
+    """Return the reason why this machine cannot boot such a container, or ""."""
     if os.environ.get("CI"):
         return "takes two minutes: not in continuous integration"
     if os.geteuid() != 0:
@@ -77,7 +77,7 @@ def needs_mount(place: Path) -> bool:
 
 
 def _mounted() -> list[Path]:
-    """Return the folders that the container needs and must be given by mounts of their own."""
+    """Return the folders that the container needs and that must be mounted separately."""
     needed = {place.resolve() for place in (ROOT, Path(sys.prefix), Path(sys.base_prefix))}
     wanted = [place for place in needed if needs_mount(place)]
     return [place for place in wanted if not any(other in place.parents for other in wanted)]
@@ -118,7 +118,8 @@ def main(folder: Path, scenario: str) -> None:
                 "--register=no",
                 "--keep-unit",
                 "--private-network",
-                # Without these the units' device policy and address filter would not be in force inside.
+                # Without these mounts, the device policy and address filter of the units would not be active
+                # in the container.
                 "--system-call-filter=bpf",
                 "--capability=CAP_BPF,CAP_PERFMON",
                 "--console=pipe",
@@ -149,7 +150,7 @@ def main(folder: Path, scenario: str) -> None:
 
 
 def _overlay() -> Path:
-    """Mount this machine's files with a layer of memory above that takes all writes."""
+    """Mount the machine's files with an overlay in memory that receives all writes."""
     _do("mount", "-t", "tmpfs", "tmpfs", "/mnt")
     for name in ("upper", "work", "root"):
         Path("/mnt", name).mkdir()
@@ -161,10 +162,11 @@ def _overlay() -> Path:
             folder.mkdir()
         layers = f"lowerdir={place},upperdir={upper},workdir={work}"
         _do("mount", "-t", "overlay", "overlay", "-o", layers, str(shown))
-        # For the installer. At the boot the container's own mounts cover it, and nspawn mounts it again.
+        # This mount is for the installer. At the boot, the container's own mounts hide it, and nspawn mounts
+        # it again.
         Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
         _do("mount", "--bind", str(shown), f"/mnt/root{place}")
-    # nspawn keeps its own things here; they go with the mount.
+    # nspawn stores its files here; they are removed with the mount.
     _do("mount", "-t", "tmpfs", "tmpfs", "/run/systemd")
     return Path("/mnt/root")
 
@@ -189,7 +191,7 @@ def _furnish(root: Path, folder: Path, scenario: str) -> None:
         _do("chroot", str(root), "chown", "-R", "knightcube-link:", str(Path(KEYS).parent))
     again = subprocess.run([*installer, "--dry-run", *options], capture_output=True, text=True, check=True)
     (folder / "second_install.txt").write_text(again.stdout, encoding="utf-8")
-    # The interpreter may stand in somebody's home, which the service's user must be let into here.
+    # The interpreter may be in a home folder, which the service's user must be able to enter in this test.
     for place in (Path(sys.base_prefix), *Path(sys.base_prefix).parents, ROOT, *ROOT.parents):
         inside = root / place.relative_to("/")
         inside.chmod(inside.stat().st_mode | 0o055)
@@ -251,12 +253,15 @@ def _make_keys(root: Path, folder: Path) -> None:
 
 
 def _opened() -> str:
-    """Return what the services' sandbox lets through, with what a /tmp of their own would cover."""
+    """Return the paths that the sandbox must permit, including those that a private /tmp would hide."""
     return "\n".join([_OPENED, *(f"BindReadOnlyPaths={place}" for place in _mounted())])
 
 
 def _write_i2cset(folder: Path) -> None:
-    """Put an i2cset first in the services' path that reaches the emulated chip, and notes why it was run."""
+    """Put a replacement of i2cset first in the services' PATH.
+
+    It writes to the emulated chip and records why it ran.
+    """
     (folder / "bin").mkdir()
     printed = folder / "result.txt"
     printed.touch()
@@ -286,7 +291,7 @@ def _enter_cgroup() -> Path:
     _do("mount", "-t", "cgroup2", "cgroup2", "/sys/fs/cgroup")
     before = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
     home = next(line.removeprefix("0::") for line in before if line.startswith("0::"))
-    # A name of this process's own: another run's cgroup, and what lives in it, is none of this one's.
+    # The name contains the process identifier, so that concurrent runs use different cgroups.
     own = _own_cgroup()
     own.mkdir()
     (own / "cgroup.procs").write_text(str(os.getpid()), encoding="ascii")
@@ -306,7 +311,7 @@ def _leave_cgroup(home: Path) -> None:
             try:
                 Path(inside).rmdir()
                 break
-            except OSError:  # who was killed is still leaving
+            except OSError:  # killed processes are still ending
                 subprocess.run(["sleep", "0.05"], check=True)
 
 

@@ -1,10 +1,10 @@
-"""The devices of a board's configuration, emulated at the files that the flight software opens on a board.
+"""Emulated devices of a board, with the frames of `tests.deploy.emulated_video`.
 
 `python -m tests.deploy.emulated_board CONFIG WORLD FOLDER` emulates the devices of CONFIG in the world that
 the section `simulation` of WORLD describes. The device files of serial devices in CONFIG become links to
-pseudo-terminals. Programs with the printed environment open the I2C bus by its device file through the
-preload library of `sim_hal emulate i2c`. Frames come through `tests.deploy.emulated_video`. The true state is
-logged in FOLDER. The program prints one JSON object when the devices answer, and ends at SIGTERM.
+pseudo-terminals. With the printed environment, programs open the I2C bus by its device file, by the preload
+library of `sim_hal emulate i2c`. Frames come through `tests.deploy.emulated_video`. The true state is logged
+in FOLDER. The program prints one JSON object when the devices answer, and ends at SIGTERM.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ def serve(path: Path, world: Path, folder: Path) -> None:
         body = msgspec.structs.replace(section.free_body, release=release)
         section = msgspec.structs.replace(section, free_body=body)
     server = DeviceServer(config, section, folder)
-    with suppress(PermissionError):  # hardware does not wait for the programs of a busy machine
+    with suppress(PermissionError):  # real devices do not wait for the programs of a busy machine
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     signal.signal(signal.SIGTERM, server.stop)
     bus_socket = folder / "bus.sock"
     bus = I2cServer(server.hardware.wires.i2c(), bus_socket)
     try:
         for name, line in server.lines.items():
-            Path(name).resolve().symlink_to(line)  # a link may stand at the name where only root can write
+            Path(name).resolve().symlink_to(line)  # it may be a link
         server.attend(bus.fileno(), partial(bus.serve, 0.0))
         facts: dict[str, Any] = {
             "socket": str(server.socket_path),

@@ -41,11 +41,11 @@ class ServedVideo(IoctlCamera):
     """
 
     def __init__(self, camera: Camera | WideCamera, source: RemoteFrameSource, clock: SystemClock) -> None:
-        """Appear at the device file of `camera`, which is named `camera` in a folder of its own."""
+        """Create the device file of `camera`, with the name `camera` in a separate folder."""
         device = camera.device
         assert isinstance(device, V4l2Device)
         folder = Path(device.path).parent
-        folder.resolve().mkdir(exist_ok=True)  # the folder may be a link, where only root can write
+        folder.resolve().mkdir(exist_ok=True)  # only root may be able to write here: the folder may be a link
         super().__init__(folder, clock.now_ns)
         assert str(self.path) == device.path
         self.sizes = {device.pixel_format: (camera.columns, camera.rows)}
@@ -56,7 +56,7 @@ class ServedVideo(IoctlCamera):
 
     @property
     def inode(self) -> int:
-        """The number of the file that an opened device is."""
+        """File descriptor of an opened device."""
         return os.fstat(self._memory).st_ino
 
     def _streamon(self, argument: Any) -> None:
@@ -64,7 +64,7 @@ class ServedVideo(IoctlCamera):
         self._abandoned_ns = 0
 
     def _run(self) -> None:
-        """Finish the frame that has arrived, and begin the next exposure when it is due."""
+        """Finish the frame that has arrived, and begin the next exposure at its time."""
         if not self._streaming:
             return
         frame, now_ns = self._source.poll(), self._now_ns()

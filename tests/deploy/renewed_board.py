@@ -1,4 +1,4 @@
-"""A board whose root part of the renewal runs, with signing keys, bundles and services that are files."""
+"""A board with the privileged part of the renewal, signing keys, bundles and services that are files."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class RenewedBoard:
     processes = False
 
     def __init__(self, place: Path) -> None:
-        """Use a folder that `make` has filled."""
+        """Use a folder that `make` has created."""
         self.place, self.root, self.now = place, place / "root", 1000.0
         self.files = FakeBoard(self.root, place / "flight.yaml")
         self.own, self.link = self.root / "var/lib/knightcube-renewal", self.root / "var/lib/knightcube-link"
@@ -101,7 +101,7 @@ class RenewedBoard:
         return cls(place)
 
     def set_active(self, unit: str, active: bool) -> None:
-        """Let a unit be active or not."""
+        """Set whether a unit is active."""
         path = self.place / "active" / unit
         path.touch() if active else path.unlink(missing_ok=True)
 
@@ -111,12 +111,12 @@ class RenewedBoard:
         return {**os.environ, "PATH": path, "BOARD": str(self.place)}
 
     def words(self) -> list[str]:
-        """Return the command of one step of the root part."""
+        """Return the command of one step of the privileged part."""
         program = self.files.prefix / "bin/renewal.py"
         return [sys.executable, "-I", "-S", str(program), "--root", str(self.root), "--now", str(self.now)]
 
     def step(self, seconds: float = 10.0) -> str:
-        """Let time pass and run one step; return its complaints."""
+        """Advance the clock, run one step, and return its error output."""
         self.now += seconds
         return self.run()
 
@@ -143,26 +143,26 @@ class RenewedBoard:
         return sign(Namespace(folder=signing, kind=kind, version=version, **options), data)
 
     def put(self, bundle: Path, kind: str = "configuration") -> str:
-        """Put a bundle where the link puts a selected one; return its SHA-256."""
+        """Store a bundle as the link stores a selected bundle, and return its SHA-256."""
         place = self.link / "files/chosen" / kind / bundle.name
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(bundle, place)
         return hashlib.sha256(bundle.read_bytes()).hexdigest()
 
     def request(self, word: str, kind: str = "configuration", **values: Any) -> str:
-        """Leave a request of the link; return its name."""
+        """Write a request of the link, and return its name."""
         self.count += 1
         name = f"1-{self.count}-0-0"
         (self.link / "renewal" / name).write_bytes(encoded({"do": word, "kind": kind, **values}))
         return name
 
     def activate(self, bundle: Path, kind: str = "configuration", hours: float = 1.0, **changes: Any) -> str:
-        """Put a bundle and request its activation; return the name of the request."""
+        """Store a bundle and request its activation, and return the name of the request."""
         values = {"name": bundle.name, "sum": self.put(bundle, kind), "hours": hours, "despite_faults": False}
         return self.request("activate", kind, **values | changes)
 
     def contact(self, frames: int, session: str = "a", limit_s: float = 0.0, fault: str = "") -> None:
-        """Leave the link's record of its contact."""
+        """Write the link's record of its last contact."""
         values = {"session": session, "frames": str(frames), "limit_s": limit_s, "fault": fault}
         (self.link / "renewal/contact").write_bytes(encoded(values))
 
@@ -182,14 +182,14 @@ class RenewedBoard:
         return next(line[6:] for line in data.decode().splitlines() if line.startswith("name: "))
 
     def restarted(self) -> bool:
-        """Return whether flight and link are to be restarted, which then happens."""
+        """Return whether flight and link must be restarted, and restart them."""
         path = self.own / "restart"
         found = path.exists()
         path.unlink(missing_ok=True)
         return found
 
     def release(self) -> str:
-        """Return the label of the release that would fly now."""
+        """Return the label of the release that would start at present."""
         return self.files.fly()[0]
 
     def reports(self, request: str) -> list[tuple[str, str]]:
@@ -198,7 +198,7 @@ class RenewedBoard:
         return [(result, text) for _, name, result, _, text in status["reports"] if name == request]
 
     def source(self, label: str) -> Path:
-        """Return the folder of a release's sources, whose flight is called `label`."""
+        """Return the folder of a release's sources with the given label."""
         builder = self.place / "bin/python3"
         builder.write_text(f'#!/bin/sh\nexec {self.files.python(label)} "$@"\n', encoding="utf-8")
         builder.chmod(0o755)

@@ -1,4 +1,4 @@
-"""A renewed board with its link and its ground in this process, and services that start as on a board."""
+"""A renewed board, its link and its ground in one process, with services that start as on a board."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class RenewedEnds(FiledEnds):
         self.restart()
 
     def activate(self, bundle: Path, kind: str, hours: float) -> None:
-        """Send a bundle up and activate it."""
+        """Uplink a bundle and activate it."""
         self.session.put(bundle, f"{kind}/{bundle.name}", self.clock.now_ns())
         self.until_closed()
         self.ask(Activate(f"received/{kind}/{bundle.name}", sha256_of(bundle), hours, 0))
@@ -77,12 +77,12 @@ class RenewedEnds(FiledEnds):
             self.record(self.mode_packet(Mode.SAFE, "reaction safe"))
 
     def flown_release(self) -> str:
-        """Return the label of the release that flies, or an empty text if it ends at once."""
+        """Return the label of the running release, or an empty text if it ends at once."""
         label = self.board.release()
         return "" if label == self.crashes else label
 
     def _flown(self) -> str:
-        """Return the name of the configuration that flies, or an empty text if the flight ends at once."""
+        """Return the name of the configuration in use, or an empty text if the flight ends at once."""
         state = self.board.place / "state"
         state.mkdir(exist_ok=True)
         if not self.flown_release():

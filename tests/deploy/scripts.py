@@ -1,4 +1,4 @@
-"""The scripts of deploy/ as they are called by hand, and configurations to call them with."""
+"""The scripts of deploy/ as a user calls them, and their configurations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def script(name: str) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules.setdefault(name, module)  # where dataclasses look for the module of a class
+    sys.modules.setdefault(name, module)  # dataclasses look up the module of a class here
     spec.loader.exec_module(module)
     return module
 
@@ -36,17 +36,17 @@ def dropin(config: Path) -> str:
 
 
 def safe_dropin(config: Path) -> str:
-    """Return that of the unit which is left when the flight is given up."""
+    """Return the drop-in of the safe-state unit."""
     return str(board_dropin.safe_dropin(load(config)))
 
 
 def link_dropin(config: Path, root: Path = Path("/")) -> str:
-    """Return that of the link's unit, on a board whose proc and sys stand in `root`."""
+    """Return the drop-in of the link's unit for a board whose /proc and /sys are in `root`."""
     return str(board_dropin.link_dropin(load(config), root))
 
 
 def changed_testbed(folder: Path, **sections: str) -> Path:
-    """Return a copy of the testbed's configuration with other sections, or other values `coils_bus`."""
+    """Return a copy of the testbed's configuration with changed sections or coil bus."""
     text = TESTBED.read_text(encoding="utf-8")
     for name, section in sections.items():
         if name == "coils_bus":

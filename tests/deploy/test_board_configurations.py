@@ -1,4 +1,4 @@
-"""The configurations of boards: they name real devices, and are refused as `check` refuses."""
+"""Tests that board configurations name real devices and are refused with the reasons of `check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The environment that the installer makes for a board, with real wheels but without a network."""
+"""Tests of the environment that the installer makes for a board, with real wheels and no network."""
 
 from __future__ import annotations
 
@@ -35,9 +35,10 @@ class Board:
         self.venv = folder / "image/opt/knightcube/venv"
 
     def install(self) -> None:
-        """Install; the dependencies are those of the interpreter that runs the tests."""
+        """Install with the dependencies of the interpreter that runs the tests."""
         python = self.folder / "python"
-        # A line in a .pth file adds the folder but not what its own .pth files add, such as this checkout.
+        # A line in a .pth file adds the folder, but not the folders of its own .pth files, such as this
+        # checkout.
         python.write_text(
             f"""#!/bin/sh
 if [ "$2" = venv ]; then

@@ -1,4 +1,4 @@
-"""The configurations of boards, checked and started as on a board, with every device of theirs emulated.
+"""Tests of the configurations of boards, checked and started as on a board with emulated devices.
 
 The flight software uses its drivers of real devices: serial ports are pseudo-terminals, the I2C bus is
 /dev/i2c-N or a name made by udev, through the preload library, and cameras answer the ioctls of Video for
@@ -66,15 +66,15 @@ GYRO_NOISE = 5e-4
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight that the unit's commands started and SIGTERM ended.
+    """A flight process that was started by the unit's commands and ended by SIGTERM.
 
     Attributes:
         found: devices that `knightcube check` found before the flight.
         run: packets of the flight.
         driven: whether the coils carried current during the flight.
         currents: currents (A) of the coils after the flight process had ended.
-        statuses: exit statuses of the unit's commands before, of and after the flight.
-        said: what the flight wrote on standard output and standard error.
+        statuses: exit statuses of the unit's commands before the flight, of the flight and after it.
+        said: standard output and standard error of the flight.
     """
 
     found: set[str]
@@ -86,7 +86,7 @@ class Flown:
 
 
 def unit_words(config: Path, runs: Path) -> list[str]:
-    """Return the words after `fly` in the unit's ExecStart, for another configuration and archive."""
+    """Return the arguments of `fly` in the unit's ExecStart for a given configuration and archive."""
     unit = (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
     (line,) = re.findall(r"' fly (run .*)$", unit, re.MULTILINE)
     places = {"/etc/knightcube/flight.yaml": str(config), "/var/lib/knightcube/runs": str(runs)}
@@ -202,7 +202,7 @@ def test_packets_of_every_device_arrive(flown: Flown) -> None:
 
 
 def test_the_rates_of_the_frames_are_those_of_the_gyro(flown: Flown) -> None:
-    """Exposure time, time stamp and field of view decide the rate, whose sign may be unknown."""
+    """The rate depends on exposure time, time stamp and field of view; its sign may be unknown."""
     imu, frames = flown.run["imu"], frames_with_rate(flown.run)
     middle = frames["exposure_start_ns"] + 0.5e9 * frames["exposure"]
     gyro = np.linalg.norm([np.interp(middle, imu["time_ns"], axis) for axis in imu["rate"].T], axis=0)

@@ -1,4 +1,4 @@
-"""`coils-off`: the coils zeroed without the flight software, where it last reached them and by the unit."""
+"""Tests that `coils-off` zeroes the coils without the flight software, at known addresses and as a unit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.deploy.scripts import DEPLOY
 
 
 class Tools:
-    """Stand-ins for i2cset and python3, which note how they were called, and whether they succeed."""
+    """Test doubles of i2cset and python3 that record their calls and succeed or fail as set."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -38,7 +38,7 @@ class Tools:
         tool.chmod(0o755)
 
     def emulate(self, bus: Path) -> None:
-        """Have python3 open the bus served at a socket as /dev/i2c-7; there is no i2cset."""
+        """Let python3 open the bus served at a socket as /dev/i2c-7, without i2cset."""
         shutil.copy(Path(smbus_byte.__file__), self.folder)
         self.put("i2cset", 1)
         (self.folder / "bin/python3").write_text(
@@ -113,7 +113,7 @@ def test_an_address_that_the_unit_and_the_note_share_is_written_once(tools: Tool
 
 
 def test_every_write_of_a_unit_and_of_a_note_is_executed_whatever_another_chip_does(tools: Tools) -> None:
-    """Bridges with an I2C interface are one chip a coil; each has a register of its own to be cleared."""
+    """Bridges with an I2C interface have one chip per coil, and each chip has a register to be cleared."""
     (tools.folder / "bin/i2cset").write_text(
         f'#!/bin/sh\necho "$*" >>"{tools.folder}/calls"\n[ "$3" != 0x61 ]\n', encoding="utf-8"
     )

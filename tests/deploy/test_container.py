@@ -1,4 +1,4 @@
-"""The service installed, booted under systemd and hurt in every way: the coils are at zero each time."""
+"""Tests of the installed service under systemd: the coils are at zero after each induced failure."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def seen(folder: Path) -> dict[str, Any]:
 
 def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
     assert seen["active"] == "active"
-    # Real time is the machine's to grant: without CAP_SYS_RESOURCE systemd cannot raise limits.
+    # Real-time limits depend on the machine: without CAP_SYS_RESOURCE, systemd cannot raise them.
     granted, *refused = seen["status"].removeprefix("flying; ").split("; ")
     assert granted == "SCHED_FIFO 50, memory locked" or refused
 
@@ -37,9 +37,9 @@ def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
 def test_the_coils_are_at_zero_and_it_comes_back(
     seen: dict[str, Any], act: str, result: str, limit: float
 ) -> None:
-    """Guardian and flight killed at a stroke leave ExecStopPost; a stopped flight is the watchdog's.
+    """If guardian and flight are killed together, ExecStopPost acts. A stopped flight ends by the watchdog.
 
-    What systemd must start first takes a busy machine longer: that limit is not the guardian's.
+    systemd needs longer on a busy machine, so its limit is larger than the guardian's.
     """
     facts = seen[act]
     assert facts["zero_after"] is not None
@@ -95,7 +95,7 @@ def test_a_second_installation_changes_nothing(seen: dict[str, Any], folder: Pat
     assert seen
     printed = (folder / "second_install.txt").read_text(encoding="utf-8").splitlines()
     changes = [line for line in printed if line.startswith("would ")]
-    # The link to the release is set once more, to what it is.
+    # The symbolic link to the release is set again to its present target.
     assert [line.endswith("switch current") for line in changes] == [True]
 
 

@@ -1,4 +1,4 @@
-"""Folders that the container would not see are known before it is booted, and are mounted for it."""
+"""Tests that folders which the container would hide are detected and mounted before it boots."""
 
 from __future__ import annotations
 

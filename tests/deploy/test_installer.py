@@ -1,4 +1,4 @@
-"""The installer: into an image, where root and systemd are not needed, and as a dry run on this machine."""
+"""Tests of the installer into an image, without root and systemd, and as a dry run."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_device_names_that_were_edited_survive_an_update(image: Image) -> None:
     image.rules.write_text(mine, encoding="utf-8")
     assert image.install()[0] == 0
     assert image.rules.read_text(encoding="utf-8") == mine
-    # An update with other rules: unedited ones are replaced, edited ones are kept and reported.
+    # An update with new udev rules replaces unedited rules, and keeps and reports edited rules.
     copy = image.root / "opt/knightcube/share/99-knightcube.rules"
     copy.write_text(shipped + "# of yesterday\n", encoding="utf-8")
     status, output = image.install()

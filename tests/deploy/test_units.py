@@ -1,4 +1,4 @@
-"""The units, their drop-ins and the device names, as far as they can be tried without booting."""
+"""Tests of the systemd units, their drop-ins and the device names, without booting."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.flights import CONFIG
 
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"
-"""Beside the network a line that is there, and not plugged in."""
+"""In addition to the network, a line that is built in or not plugged in."""
 CAMERA = "{device: {driver: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
@@ -37,7 +37,7 @@ needs_systemd = pytest.mark.skipif(
 
 
 def put_units(folder: Path, config: Path) -> Path:
-    """Put the units in a folder, the commands in them where they are now, the drop-ins at their end."""
+    """Copy the units into a folder, with the present paths of their commands and the drop-ins appended."""
     for name, added in zip(UNITS, (dropin(config), safe_dropin(config), link_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
         (folder / name).write_text(text + "\n" + added, encoding="utf-8")
@@ -46,7 +46,7 @@ def put_units(folder: Path, config: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the units of a board that uses all there is: lasting names, a camera, a ground link."""
+    """Return the units of a board with all features: persistent names, a camera and a ground link."""
     folder = tmp_path_factory.mktemp("units")
     config = changed_testbed(
         folder,
@@ -66,7 +66,7 @@ def test_systemd_finds_nothing_to_complain_of(units: Path) -> None:
 
 
 def exposure(unit: Path) -> float:
-    """Return what systemd makes of a unit's sandbox: 0 the tightest, 10 none."""
+    """Return systemd's rating of a unit's sandbox, from 0 (tightest) to 10 (none)."""
     words = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)]
     output = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", output)
@@ -77,7 +77,7 @@ def exposure(unit: Path) -> float:
 @needs_systemd
 @pytest.mark.parametrize("name", UNITS)
 def test_the_sandbox_leaves_an_exposure_of_at_most_1(units: Path, name: str) -> None:
-    """Wherever in the network the link's peer is, also with a radio at a serial line of the board."""
+    """The rating holds for any address of the link's peer, and also with a radio on a serial line."""
     assert exposure(units / name) <= 1.0
 
 
@@ -146,7 +146,7 @@ def test_the_watchdog_leaves_room_for_four_meals() -> None:
 
 
 def test_the_link_is_watched_restarted_and_does_not_wait_for_the_flight() -> None:
-    """A flight that waits at its start never becomes active: a link ordered after it would never begin."""
+    """A flight that waits at its start is not active, so that a link ordered after it would not start."""
     text = (DEPLOY / "knightcube-link.service").read_text(encoding="utf-8")
     for line in ("Type=notify", "NotifyAccess=main", "Restart=always"):
         assert f"{line}\n" in text
@@ -267,7 +267,7 @@ def test_the_flight_opens_the_bus_by_its_lasting_name(tmp_path: Path) -> None:
 
 
 def board(folder: Path, below: str) -> Path:
-    """Return a proc and a sys in which the device /dev/null, 1:3, is a serial line somewhere `below`."""
+    """Return folders like /proc and /sys in which /dev/null (1:3) is a serial line at `below`."""
     (folder / "proc").mkdir(exist_ok=True)
     (folder / "proc/devices").write_text(
         "Character devices:\n  1 ttyUSB\n  4 tty\n\nBlock devices:\n  1 ramdisk\n", encoding="ascii"
@@ -282,7 +282,10 @@ def board(folder: Path, below: str) -> Path:
 
 
 def test_what_hangs_on_usb_is_let_through_whatever_number_it_comes_back_with(tmp_path: Path) -> None:
-    """DeviceAllow of a file is one number, found when the unit starts; a class is all of its driver's."""
+    """DeviceAllow of a file permits one device number, found at the start of the unit.
+
+    A class permits all devices of a driver.
+    """
     node = "DeviceAllow=/dev/null rw"
     usb = board(tmp_path, "pci0000:00/0000:00:14.0/usb1/1-3/1-3:1.0/ttyUSB0/tty/ttyUSB0")
     assert board_dropin.allowed("/dev/null", (), usb) == [node, "DeviceAllow=char-ttyUSB rw"]

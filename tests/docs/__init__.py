@@ -1,1 +1,1 @@
-"""The documentation: its commands run, its examples work, its site is complete and needs no network."""
+"""Tests of the documentation: commands run, examples work, and the site is complete and works offline."""

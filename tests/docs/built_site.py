@@ -1,4 +1,4 @@
-"""Checks the built site: `python -m tests.docs.built_site build/site`; exit 1 on a find.
+"""Checks the built site: `python -m tests.docs.built_site build/site`; exit status 1 for any fault.
 
 The pages must be readable without a network, so no page may load anything from another host. Links to
 follow are allowed. Where Chromium is installed, the search of the site is tried on a page that is opened as a

@@ -1,4 +1,4 @@
-"""The page "Add a device" builds a driver from an empty file, and flies it by its own commands."""
+"""Tests that the page "Add a device" builds a driver from an empty file and uses it in a run."""
 
 from __future__ import annotations
 

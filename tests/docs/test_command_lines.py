@@ -1,4 +1,4 @@
-"""Every command line in the documentation works, or its block says why it is not run here."""
+"""Tests that each command line in the documentation works, or that its block states why it is not run."""
 
 from __future__ import annotations
 

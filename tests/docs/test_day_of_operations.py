@@ -1,4 +1,4 @@
-"""The page "A day of operations": its commands are run in order against a simulated satellite."""
+"""Runs the commands of the page "A day of operations" in order against a simulated satellite."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each measured figure stands on one page. The figures that the README quotes from a page are compared."""
+"""Tests that each measured figure is stated on one page only."""
 
 from __future__ import annotations
 

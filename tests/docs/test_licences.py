@@ -1,4 +1,4 @@
-"""The page of licences names every locked package, under the licence that the package states."""
+"""Tests that the page of licences names each locked package with the licence that the package states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page about a satellite of one's own: its blocks are read, and its commands are run."""
+"""Tests of the page about the user's own satellite: its blocks are valid and its commands run."""
 
 from __future__ import annotations
 

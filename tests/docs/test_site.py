@@ -1,4 +1,4 @@
-"""The site is complete: every module has its reference, and the check of the built pages can fail."""
+"""Tests that the site has a reference of every module, and that the check of built pages finds faults."""
 
 from __future__ import annotations
 

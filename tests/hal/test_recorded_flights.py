@@ -1,4 +1,4 @@
-"""The drivers report faults of their devices as in the recorded flights."""
+"""Tests that the drivers report device faults as in the recorded runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inertial units of separate sensors: starts, failures, attitude, and the SPI device of Linux."""
+"""Tests of IMUs of separate sensors: starts, failures, attitude, and the SPI device of Linux."""
 
 from __future__ import annotations
 

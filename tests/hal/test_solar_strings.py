@@ -1,4 +1,4 @@
-"""Solar strings on ADS1115 converters: driver, emulator and bus, in sunlight and shadow, with faults."""
+"""Tests of solar strings on ADS1115 converters in sunlight and shadow, with faults."""
 
 from __future__ import annotations
 

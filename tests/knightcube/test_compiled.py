@@ -1,4 +1,4 @@
-"""Functions with a compiled form: which form runs, and that numba's installation is optional."""
+"""Tests of compiled functions: the executed form, and operation without numba."""
 
 from __future__ import annotations
 

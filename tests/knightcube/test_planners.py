@@ -1,4 +1,4 @@
-"""The planners of the public interface: a step about one axis, and a slew in three axes."""
+"""Tests of the public planners: a single-axis step and a three-axis slew."""
 
 from __future__ import annotations
 

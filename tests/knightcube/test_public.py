@@ -1,4 +1,4 @@
-"""The public interface of the library: every exported name exists and is documented."""
+"""Tests that each exported name of the public interface exists and is documented."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers of a commanded flight that several tests read."""
+"""Answers to commands in flight, for several tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.flights import Rigged, fly
 
 
 class Script:
-    """A channel that says prepared datagrams at prepared times and keeps the answers."""
+    """A command channel that delivers given datagrams at given times and stores the answers."""
 
     name = "socket"
 
@@ -41,7 +41,7 @@ class Script:
 
 
 def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
-    """Fly while datagrams come at mission times in s."""
+    """Run a simulation with datagrams at mission times, s."""
     channel = Script()
 
     def prepare(rigged: Rigged) -> None:
@@ -51,5 +51,5 @@ def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
         for at, data in script:
             rigged.at(at, partial(channel.say, data))
 
-    far = {"at": 1e6, "mode": "safe"}  # a time line, so that the commands' group runs
+    far = {"at": 1e6, "mode": "safe"}  # timed commands, so that the rate group of commands runs
     return fly(commanded(4.0, far), folder, prepare), channel

@@ -1,4 +1,4 @@
-"""Flights through the modes: configurations with a time line of commands, and the modes entered."""
+"""Runs through the modes: configurations with timed commands, and the entered modes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tests.support.flights import demo_config, demo_world
 
 CYCLE = 0.025
 BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}
-"""Modes' settings with little patience, s."""
+"""Mode settings with short timeouts, s."""
 
 
 def commanded(
     duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any
 ) -> TestbedConfig:
-    """Return the demonstration without a camera, with a time line of commands, and little patience."""
+    """Return the demonstration without camera, with timed commands and short timeouts."""
     config = demo_config(duration, camera=False)
     timeline = tuple(CommandStep(**step) for step in steps)
     section = configuration.replace(config.modes, initial=initial, **{**BRIEF, **modes})
@@ -32,7 +32,7 @@ def commanded(
 
 
 def path_of_modes(run: Run) -> list[tuple[Mode, str]]:
-    """Return the modes entered, each with its trigger."""
+    """Return the entered modes with their triggers."""
     return [(Mode(int(row["mode"])), to_text(row["trigger"])) for row in run["mode"]]
 
 
@@ -47,7 +47,7 @@ def entered(run: Run, mode: Mode) -> float:
 
 
 def currents(run: Run, since: float, until: float) -> FloatArray:
-    """Return |I| of the coil that carried most at each sample of the truth in an interval."""
+    """Return the largest coil current |I| at each sample of the truth in an interval."""
     time = run["truth"]["time_ns"] * 1e-9
     largest: FloatArray = np.abs(run["truth"]["current"]).max(axis=1)
     return largest[(time >= since) & (time < until)]

@@ -1,4 +1,4 @@
-"""Flights with objects that several tests share."""
+"""Runs with objects for several tests."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def flight_with_objects(folder: Path, objects: tuple[SkyObject, ...], duration: 
 
 
 def _line(across_deg: float, rate_deg: float, towards_deg: float) -> LineOfSight:
-    """Return the line of sight to an object that begins this far from the boresight, along the camera's x."""
+    """Return the line of sight to an object with a given initial offset from the boresight along camera x."""
     angle = np.radians(across_deg)
     seen = np.array([np.sin(angle), 0.0, np.cos(angle)]) @ attitude_matrix(_HELD)
     return LineOfSight(

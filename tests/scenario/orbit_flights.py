@@ -1,4 +1,4 @@
-"""Configurations and worlds of short flights in orbit that several tests share."""
+"""Configurations and worlds of short orbit runs for several tests."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ def speed(run: Run) -> FloatArray:
 
 
 NEAR_REST = 0.00524
-"""rad/s, 0.3 deg/s: slower than where braking ends."""
+"""Initial rate (rad/s) of 0.3 deg/s, below the end of detumbling."""
 
 
 DURATION, ACQUIRED = 62.0, 28.0
-"""s, of the flight, and by when the attitude is fine; the frame of 17 s shows no motion."""
+"""Duration (s) of the run, and latest time (s) of a fine attitude; the frame at 17 s shows no motion."""
 
 
 GYRO_BIAS, FIELD_BIAS = (4e-4, -5e-4, 3e-4), (2e-7, -1e-7, 1.5e-7)
-"""rad/s and T, which the belief takes for zero."""
+"""Gyro bias (rad/s) and field error (T), which the filter initially assumes to be zero."""
 
 
 MUTE = FaultEntry(fault="gps: off", at=35.0, span=60.0)
 
 
 def skyward() -> Simulation:
-    """Return the world with body -y across the orbit; the star camera's boresight is 22 deg above it."""
+    """Return the world with body -y normal to the orbit; the star camera's boresight is 22 deg above -y."""
     section = world(NEAR_REST, MUTE)
     craft = section.free_body
     assert craft is not None

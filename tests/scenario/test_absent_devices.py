@@ -1,4 +1,4 @@
-"""A board that begins without a device waits for it in BOOT, the coils at zero, and flies when it comes."""
+"""Tests that a board with a missing device waits in BOOT with zero coil current until the device appears."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slew in the cage: the field stands almost along body x, where the coil on x alone makes no torque."""
+"""Tests of a slew in the cage with the field almost along body x, where coil x makes no useful torque."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) ->
     """67 deg from -z and 0.225 mT at the start, by the table of `OrbitField`; the body held at 23 deg."""
     field = flown["imu"]["field"][0].astype(float)
     assert np.hypot(field[0], field[2]) == pytest.approx(2.25e-4, rel=0.05)
-    # The body turned by +angle sees a field of the testbed's axes turned by as much.
+    # In body axes rotated by +angle, the field rotates by the same angle.
     towards = np.degrees(np.arctan2(field[0], -field[2]))
     assert towards == pytest.approx(67.0 + np.degrees(2.0 * np.arcsin(0.2)), abs=3.0)
 

@@ -1,4 +1,4 @@
-"""A camera whose frames are not the sky's or not in time, a slow worker: reported, and not believed."""
+"""Tests that false or late camera frames and a slow worker are reported, and not used."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
 def test_what_is_late_is_reported_with_the_next_frame(
     fault: str, event: str, within: float, tmp_path: Path
 ) -> None:
-    """A frame is exposed each 2 s."""
+    """A frame is exposed every 2 s."""
     run = flown(tmp_path, "hold", fault)
     assert AT < first_event(run, event) < AT + within
     assert "task-failed" not in event_names(run)

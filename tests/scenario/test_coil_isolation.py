@@ -1,4 +1,4 @@
-"""From a coil that breaks on the wire to the torque of the others in its place; from heat to safe."""
+"""Tests that a broken coil is isolated and the others take over, and that overheating leads to SAFE."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DIPOLE = 80 * 0.0081
 
 
 def flown(fault: str, folder: Path, duration: float, initial: str = "testbed-demo") -> tuple[Run, FloatArray]:
-    """Fly with a fault from AT on; return the log, and the currents (k, 3) A that steering wished for."""
+    """Run with a fault from AT on, and return the log and the requested currents (k, 3), A."""
     wishes: list[FloatArray] = []
 
     def listen(rigged: Rigged) -> None:
@@ -75,7 +75,7 @@ def test_an_axis_that_breaks_is_left_out_and_the_others_keep_the_direction_of_th
     assert text.startswith("coil x")
     truth, count = run["truth"], len(wishes)
     after = np.arange(count) * 0.025 > isolated + 0.5
-    # What the truth has at a cycle's start is of the command before.
+    # The true current at the start of a cycle belongs to the previous command.
     carried, attitude = truth["current"][1 : count + 1], truth["quaternion"][:count]
     assert np.abs(carried[after, 0]).max() < 1e-9, "the broken coil carries nothing"
     wanted, made = torque(wishes, attitude)[after], torque(carried, attitude)[after]

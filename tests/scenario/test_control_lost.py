@@ -1,8 +1,8 @@
-"""From the loss of control the coils are at zero within a tenth of a second; the rest follows by itself.
+"""Tests that the coils are at zero within 0.1 s of a loss of control, and that control recovers.
 
-Lost is control as soon as no reading comes, or none that makes a reading, or none that agrees with the
-estimate; in detumble, which goes by the magnetometer alone, as soon as none comes. The current is that of the
-simulated coils' circuit, looked at each millisecond from the fault on.
+Control is lost as soon as no reading arrives, no complete reading, or no reading that agrees with the
+estimate. Detumbling, which uses only the magnetometer, is lost as soon as no reading arrives. The current of
+the simulated coil circuit is checked every millisecond after the fault.
 """
 
 from __future__ import annotations
@@ -53,13 +53,16 @@ def in_the_unit(alter: Callable[[Vn100Sample], Vn100Sample] | None) -> Break:
 
 
 def elsewhere(seen: Vn100Sample) -> Vn100Sample:
-    """Return a sample that no estimate agrees with."""
+    """Return a sample that contradicts any estimate."""
     turn = from_rotation_vector(np.array([0.0, 0.2, 0.0]))
     return replace(seen, quaternion=multiply(turn, seen.quaternion), rate=seen.rate + 0.1)
 
 
 def shifted(seen: Vn100Sample, by: float) -> Vn100Sample:
-    """Return a sample with `by` added to rate (rad/s) and field, because without a rate alone it flies on."""
+    """Return a sample with `by` added to rate (rad/s) and field.
+
+    A missing rate alone does not end control.
+    """
     return replace(seen, rate=seen.rate + by, mag=seen.mag + by)
 
 
@@ -71,7 +74,7 @@ LOSSES: dict[str, tuple[Break, Break]] = {
     "out of range": (in_the_unit(lambda seen: shifted(seen, 1e3)), in_the_unit(None)),
     "refused": (in_the_unit(elsewhere), in_the_unit(None)),
 }
-"""What begins, and what ends it."""
+"""Start and end of the loss of control."""
 
 
 def slewing(duration: float) -> TestbedConfig:
@@ -85,7 +88,7 @@ def slewing(duration: float) -> TestbedConfig:
         (thesis_config, -0.1, tuple(LOSSES)),
         (lambda duration: commanded(duration, initial="hold"), -0.1, tuple(LOSSES)),
         (slewing, -0.1, tuple(LOSSES)),
-        # Readings that the estimate refuses are good enough to brake by.
+        # Readings that the filter rejects suffice for detumbling.
         (lambda duration: commanded(duration, initial="detumble"), 0.45, tuple(LOSSES)[:-1]),
     ],
     ids=["demonstration", "thesis", "hold", "slew", "detumble"],
@@ -93,7 +96,7 @@ def slewing(duration: float) -> TestbedConfig:
 def test_whatever_takes_the_readings_away_no_coil_carries_current_a_tenth_of_a_second_later(
     tmp_path: Path, configured: Callable[[float], TestbedConfig], rate: float, losses: tuple[str, ...]
 ) -> None:
-    # Just after a reading, and just after the windows of detumble began to brake: what lasts longest.
+    # The worst cases are a loss just after a reading, and just after the start of a detumbling window.
     begins = {name: 3.126 + 1.5 * place for place, name in enumerate(losses)}
     carried: dict[str, list[float]] = {name: [] for name in losses}
 
@@ -148,7 +151,7 @@ def test_a_hold_that_is_declared_impossible_ends_at_once(tmp_path: Path) -> None
 
 
 def test_with_the_planner_gone_and_no_readings_nothing_is_flown_to_its_end(tmp_path: Path) -> None:
-    """A path under way is steered along by the readings; without them it moves no coil."""
+    """A running path is tracked with the readings; without readings no coil is driven."""
     run = fly(thesis_config(6.0), tmp_path, silence, planner_latency=0.9)
     assert run["plan"]["accepted"].tolist() == [1]
     assert currents(run, SILENT_AT - 0.5, SILENT_AT).max() > ZERO
@@ -167,7 +170,10 @@ def test_with_the_planner_gone_and_no_path_the_coils_stay_at_zero(tmp_path: Path
 def test_the_demonstration_is_completed_within_its_limits_after_five_seconds_without_the_unit(
     tmp_path: Path,
 ) -> None:
-    """In the middle of a step, where it costs most; Sease 2013, Table 5.3, for the step after it."""
+    """The loss comes in the middle of a step, the worst case.
+
+    Sease 2013, Table 5.3, for the step after it.
+    """
     config = demo_config(130.0, camera=False)
     steps = (Step(at=0.0, q2=-0.3), Step(at=65.0, q2=-0.2))
     run = fly(configuration.replace(config, steps=steps), tmp_path, lambda rigged: silence(rigged, 5.0))

@@ -1,4 +1,4 @@
-"""The thesis's 700 s step demonstration, flown by the command that a newcomer types."""
+"""Tests of the thesis's 700 s step demonstration with the documented command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.ideal_power import clairvoyant_power
 ROOT = CONFIG.parents[1]
 PIXELS_PER_RAD = 2904.0
 LEAST_STREAK = 4.0
-"""px: the estimator gives no rate below 3."""
+"""Longest streak (px) without a rate; the estimator needs 3 px."""
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
@@ -75,7 +75,7 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any])
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any]) -> None:
-    """On the true attitude, all noise on; R I^2 beside the optimum of one who knows the plant."""
+    """On the true attitude with all noise; R I^2 is compared with the optimum for the true plant."""
     steps = summary["steps"]
     assert max(step["steady_state_deg"] for step in steps) <= 0.05
     assert max(step["overshoot_percent"] for step in steps) <= 0.5
@@ -96,7 +96,7 @@ def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
-    """Angle and rate: the share of errors within 3 sigma, and their rms over sigma, in 28,000 cycles."""
+    """Fraction of angle and rate errors within 3 sigma, and their rms relative to sigma, in 28,000 cycles."""
     run = demonstration
     control, truth = run["control"][200:], run["truth"][200:28_000]
     angle = 2.0 * np.arcsin(truth["quaternion"][:, 1])
@@ -116,9 +116,9 @@ def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: Run) -
 
 
 def _assert_streaks_right(run: Run, moving: int) -> None:
-    """Hold every moving frame to a rate within 1 % of the truth, accepted, its error as its sigma says.
+    """Assert that each moving frame gives an accepted rate within 1 % of the truth and with a valid sigma.
 
-    Of chi-square, per degree of freedom, 1 % is beyond 2.1 with 14 and 2.7 with 6.
+    A chi-square per degree of freedom exceeds 2.1 (14 degrees) or 2.7 (6 degrees) with 1 % probability.
     """
     truth_time = run["truth"]["time_ns"]
     angle = 2.0 * np.arcsin(run["truth"]["quaternion"][:, 1])
@@ -170,7 +170,7 @@ def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_readme_states_the_power_that_is_measured(summary: dict[str, Any]) -> None:
-    """At the coils, at the bus, and R I^2, mW."""
+    """Mean powers (mW) at the coils and at the bus, and R I^2."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     row = re.search(
         r"^\| average power from the supply.*\| 0\.10 W \| (.+) mW; (.+) mW \|$", text, re.MULTILINE

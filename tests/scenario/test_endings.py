@@ -1,4 +1,4 @@
-"""Any way a flight ends leaves the coils at zero: `tests.support.flights.fly` looks at each end."""
+"""Tests that each way of ending a run leaves the coils at zero, which `tests.support.flights.fly` checks."""
 
 from __future__ import annotations
 

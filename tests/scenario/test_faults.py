@@ -1,4 +1,4 @@
-"""Whatever comes over the wires, control is kept or the coils are at zero, with an event in the log."""
+"""Tests that any device fault leaves the body controlled or the coils at zero, with an event in the log."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ AT_TARGET = released(-0.3, 0.0)
 SHAM = 0.5
 """Begin (s) of a camera fault, between the first frame and the second."""
 WITHIN = 0.1
-"""s from the loss of control until the coils are at zero."""
+"""Longest time (s) from the loss of control until the coils are at zero."""
 
 
 def true_current(run: Run, since: float, until: float) -> FloatArray:
-    """Return the largest current that any coil carried at each sample of an interval of the truth."""
+    """Return the largest coil current at each sample of the truth in an interval."""
     truth = run["truth"]
     time = truth["time_ns"] * 1e-9
     largest: FloatArray = np.abs(truth["current"]).max(axis=1)
@@ -35,7 +35,7 @@ def true_current(run: Run, since: float, until: float) -> FloatArray:
 
 
 def assert_whole(run: Run, duration: float = DURATION) -> None:
-    """Every packet that was written is there, in order, to the end of the flight."""
+    """All written packets are in the log, in order, to the end of the run."""
     for log in run.logs.values():
         assert log.intact
     assert len(run["control"]) == round(duration / 0.025)
@@ -43,7 +43,7 @@ def assert_whole(run: Run, duration: float = DURATION) -> None:
 
 
 def line(faults: LineFaults) -> Callable[[Rigged], None]:
-    """Return what spoils the unit's line between BEGIN and END."""
+    """Return the fault that disturbs the VN-100's line between BEGIN and END."""
 
     def prepare(rigged: Rigged) -> None:
         wire = rigged.lock.line.to_host
@@ -106,7 +106,7 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
     time = run["truth"]["time_ns"] * 1e-9
     error = np.degrees(np.abs(angle - 2 * np.arcsin(-0.3)))
     assert error[(time > 13.0) & (time < 14.0)].max() < 0.1
-    # The thread alone turns it by k theta / (2 J) t^2 = 0.17 deg in the second, and it must be stopped.
+    # The thread rotates the body by k theta / (2 J) t^2 = 0.17 deg in this second; the loop must stop this.
     assert error[time > 14.0].max() < 0.3
     assert error[time > 18.5].max() < 0.1
 
@@ -134,7 +134,7 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
         wire = rigged.lock.line.to_host
         rigged.at(BEGIN, lambda: setattr(wire, "faults", LineFaults(silent=True)))
         for k in range(100):
-            # The line's own noise has no sender, so it passes where the unit's bytes are lost.
+            # Line noise needs no sender, so that noise arrives although the VN-100's bytes are lost.
             def spark(k: int = k) -> None:
                 wire.faults = SOUND
                 wire.noise(40, rigged.lock.clock.now_ns(), 115200)
@@ -151,7 +151,7 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
 
 
 def test_a_unit_that_restarts_is_distinguished_from_noise_and_silence(tmp_path: Path) -> None:
-    """After its reset the unit sends the ASCII lines it was born with: packets, but no readings."""
+    """After its reset, the VN-100 sends its default ASCII lines, which are not readings."""
 
     def prepare(rigged: Rigged) -> None:
         host = rigged.lock.line.host
@@ -209,7 +209,7 @@ def test_a_bus_that_fails_is_reported_and_flown_again_when_it_is_back(tmp_path: 
 def test_a_chip_that_keeps_its_outputs_leads_the_estimate_astray_no_more_than_a_silent_one(
     tmp_path: Path,
 ) -> None:
-    """It acknowledges every write; for half a second the filter believes in currents that do not flow."""
+    """The chip acknowledges each write; for half a second the filter assumes currents that do not flow."""
     world = replace(demo_world(), faults=(FaultEntry(fault="pwm: stuck", at=1.55, span=3.0),))
     run = fly(demo_config(18.0, camera=False), tmp_path, section=world)
     names = event_names(run)

@@ -1,4 +1,4 @@
-"""Health in flight: the watchdog's food, the guardian's heartbeat, streams, resources, a restart wanted."""
+"""Tests of health in flight: watchdog, guardian heartbeat, streams, resources, and requested restarts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SECOND = 1_000_000_000
 
 
 class Signs:
-    """Counts the signs of life of a flight: mission times in s."""
+    """Records the mission times (s) of the heartbeats of a flight."""
 
     def __init__(self) -> None:
         self.fed: list[float] = []
@@ -37,7 +37,7 @@ class Signs:
 
 
 def failing(rigged: Rigged, since: float, until: float) -> None:
-    """Have the control task raise between two mission times."""
+    """Let the control task raise an exception between two mission times."""
     host = rigged.lock.line.host
     receive = host.receive
 
@@ -117,7 +117,7 @@ def test_a_unit_that_sends_half_its_packets_is_slow(tmp_path: Path) -> None:
 
 
 def reading(memory: Callable[[float], float], rigged: Rigged) -> None:
-    """Have the board looked at each 0.5 s, as if all processes together took `memory` bytes."""
+    """Check resources every 0.5 s, as if all processes together used `memory` bytes."""
 
     def look(now_ns: int) -> ResourceSample:
         seconds = (now_ns - rigged.epoch_ns) / SECOND

@@ -1,4 +1,4 @@
-"""The flights that `make` offers run in short form, with the commands of their recipes."""
+"""Runs the `make` targets of runs in short form, with the commands of their recipes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flight.app.cli import main
 ROOT = Path(__file__).resolve().parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text()
 SECONDS = {"demo": 3, "cage": 3, "orbit": 3, "orbit-3u": 3, "object": 40}
-"""Time flown of each target that judges a flight; the object enters the field of view after half a minute."""
+"""Shortened duration of each `make` target; the object enters the field of view after half a minute."""
 
 
 def commands_of(target: str) -> list[str]:

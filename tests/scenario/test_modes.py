@@ -1,4 +1,4 @@
-"""Every mode and every way between modes, in lock-step: what moves the coils, and what never does."""
+"""Tests of each mode and each transition in lock-step, and of whether the coils are driven."""
 
 from __future__ import annotations
 
@@ -109,13 +109,14 @@ def test_a_slew_that_does_not_arrive_becomes_a_hold(tmp_path: Path) -> None:
 
 
 def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
-    """From 0.5 rad/s, by coils on x and z; the field is measured while they are off."""
+    """The body detumbles from 0.5 rad/s by coils x and z; the field is measured while they are off."""
     run = fly(commanded(11.0, initial="detumble"), tmp_path, section=released(-0.68, 0.5))
     assert modes_of(run) == [Mode.BOOT, Mode.DETUMBLE]
     truth = run["truth"]
     time = truth["time_ns"] * 1e-9
     rate = truth["rate"][:, 1]
-    # 0.096 A m^2 in 0.45 mT, on 0.6 of the time, take 0.025 rad/s each second, two coils 1.4 times that.
+    # One coil (0.096 A m^2 in 0.45 mT, on for 0.6 of the time) removes 0.025 rad/s per second, two coils 1.4
+    # times that.
     assert rate[time > 10.9].max() < 0.2
     windows = np.interp(np.arange(0.5, 11.0, 0.25), time, rate)
     assert np.diff(windows).max() < 2e-3
@@ -254,7 +255,7 @@ def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
 
 
 def keeper_of(folder: Path) -> StateKeeper:
-    """Return the state of a boot in `folder`, begun."""
+    """Return the state of a started boot in `folder`."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
     return StateKeeper(

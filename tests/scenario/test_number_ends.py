@@ -1,4 +1,4 @@
-"""No number of telemetry ends a flight: counters wrap, and what does not fit is counted and reported."""
+"""Tests that no telemetry number ends a run: counters wrap, and values out of range are reported."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 NEAR = (1 << 32) - 30
-"""A count that passes 32 bits within a second of control cycles."""
+"""Initial value of counters that exceed 32 bits within a second of control cycles."""
 FEW_LEFT = (1 << 32) - 3
-"""The same for what counts slower."""
+"""Initial value of slower counters that exceed 32 bits during the run."""
 SLEWS = 64_535
-"""Slews commanded before: the next one was numbered as an attitude that is only held."""
+"""Initial number of commanded slews, at the end of its range."""
 
 _OF_OBJECTS = {"sightings", "track"}
 """Packets of a flight with objects in its field."""
@@ -44,7 +44,7 @@ def whole(packet: Packet) -> list[Field]:
 
 
 def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
-    """Write each record once more for each of its integer fields, with that field past its end."""
+    """Write each record again for each integer field, with a value beyond the field's range."""
     driven: Driven = {}
     for name in ("record", "time"):
         plain = getattr(Recorder, name)
@@ -66,7 +66,7 @@ def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
 
 
 def assert_survived(run: Run, driven: Driven, written: set[str]) -> None:
-    """Each field was driven, none failed a task, and what did not fit was counted and reported."""
+    """No value out of range ended a task, and all such values were counted and reported."""
     due = {(p.name, f.name): f.wraps for p in PACKETS if p.name in written for f in whole(p)}
     assert {key: kept for key, kept in driven.items() if key[0] in written} == due
     assert "task-failed" not in event_names(run)

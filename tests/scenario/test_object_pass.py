@@ -1,7 +1,7 @@
-"""A KnightCube finds an object in its camera's frames, follows it, and does not lose it while it is blind.
+"""Tests that a KnightCube finds an object in its frames, follows it, and keeps it while the camera is blind.
 
-`config/orbit_object_1u.yaml`, its frames rendered, through vision, track, planner and coils. The truth that
-it is judged by is integrated here.
+`config/orbit_object_1u.yaml`, its frames rendered, through vision, track, planner and coils. The true motion
+of the object is integrated in this module.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.support.short_arcs import flow
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_object_1u.yaml"
 DURATION, BLIND, GAP = 75.0, 48.0, 10.0
-"""s: the flight, and when and how long the camera is off."""
+"""Duration (s) of the run, and start and duration (s) of the camera's outage."""
 HALF_FIELD, PIXEL = 10.0, np.radians(20.0) / 512
 BORESIGHT = np.array([0.0, -1.0, 0.0])
 
@@ -43,7 +43,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def _shown(run: Run, times: FloatArray) -> FloatArray:
-    """Return where the object is (n, 3) as a star at rest there would be seen, at mission times (n,) s."""
+    """Return the apparent directions (n, 3) of the object, like those of stars, at mission times (n,), s."""
     section = configuration.simulation_section(CONFIG.read_text(encoding="utf-8"), CONFIG.name, Simulation)
     assert section is not None
     start = section.objects[0].state
@@ -57,14 +57,14 @@ def _shown(run: Run, times: FloatArray) -> FloatArray:
     flown = solve_ivp(flow, span, first, "DOP853", rtol=1e-11, atol=1e-4, dense_output=True).sol
     state = flown(times + late).T
     way = state[:, :3] - own
-    # The light left a little earlier, while the Earth went on about the Sun.
+    # The light left the object earlier, and the camera moves with the Earth around the Sun.
     moved = state[:, 3:] + earth_velocity(begun)
     way = way - np.linalg.norm(way, axis=1, keepdims=True) / SPEED_OF_LIGHT * moved
     return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
 
 
 def _followed(run: Run) -> float:
-    """Return the mission time, s, at which the object was followed."""
+    """Return the mission time, s, at which the pursuit of the object began."""
     events = run["event"]
     (index,) = (k for k, name in enumerate(event_names(run)) if name == "object-followed")
     return float(events["time_ns"][index]) * 1e-9
@@ -89,7 +89,7 @@ def test_it_is_kept_in_the_field_and_followed_while_the_camera_is_off(flown: Run
     blind = (times[after] > BLIND) & (times[after] < BLIND + GAP)
     assert off[blind].max() < 4.0
     assert off[-1] < 4.0
-    # It is led, not waited for: the body turns with it.
+    # The body rotates with the object.
     turn = np.degrees(np.linalg.norm(truth["rate"][after][blind], axis=1))
     assert turn.min() > 0.3
 
@@ -105,7 +105,7 @@ def test_its_track_is_where_the_object_is_to_what_it_claims(flown: Run) -> None:
     claim = np.sqrt(0.5 * (xx + yy + zz))
     away = np.linalg.norm(track["direction"] - true, axis=1)
     assert claim.max() < 0.1 * PIXEL
-    # Of two degrees of freedom: 2 expected for the mean of the square over that of an axis.
+    # With two degrees of freedom, the expected mean of the normalised square is 2.
     assert np.mean((away / claim) ** 2) < 4.0
 
 

@@ -1,4 +1,4 @@
-"""Objects in flight: sighted among the stars, tracked, reported; and nothing is tracked in an empty sky."""
+"""Tests that objects in flight are sighted, tracked and reported, and that an empty sky gives no track."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_sky_without_objects_has_no_track(tmp_path: Path) -> None:
 
 
 def test_the_measured_track_is_read_back_from_its_message(tracked: Run, tmp_path: Path) -> None:
-    """A reader of the standard's own grammar finds the objects' places at their times."""
+    """An independent reader of the standard finds the directions of the objects at their times."""
     (path,) = write_tracking_data(tracked, tmp_path / "track.tdm")
     segments = path.read_text(encoding="ascii").split("META_START")
     assert len(segments) == 3
@@ -82,7 +82,7 @@ def test_the_measured_track_is_read_back_from_its_message(tracked: Run, tmp_path
 
 
 def _nearest_line(segment: str, zero: datetime) -> int:
-    """Return which of the objects a segment is of; all its data must be that object's."""
+    """Return the index of the object of a segment; all data of the segment must belong to it."""
     words = [row.split(" = ") for row in segment.splitlines() if " = " in row]
     header = {word[0]: word[1] for word in words if len(word[1].split()) == 1}
     assert (header["ANGLE_TYPE"], header["REFERENCE_FRAME"], header["TIME_SYSTEM"]) == (

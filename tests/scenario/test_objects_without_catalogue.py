@@ -1,4 +1,4 @@
-"""Objects without a star catalogue: tracked by the common motion of the stars, at rest and through a slew."""
+"""Tests that objects are tracked without a catalogue by the common motion of the stars."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_two_objects_are_tracked_through_a_slew_with_honest_claims(tmp_path: Pat
         claim = np.sqrt(0.5 * track["covariance"][:, :3].sum(axis=1))
         assert (away[own] < 3.5 * claim).all()
         assert claim.max() < 4.0 * _PIXEL, "the estimated attitude is known to some pixels"
-        # The rate is measured among the stars, so that the error of the attitude is not part of it.
+        # The rate is measured relative to the stars, so that it is free of the attitude error.
         rate = np.degrees(np.linalg.norm(track["rate"], axis=1))
         sigma = np.degrees(np.sqrt(0.5 * track["rate_covariance"][:, :3].sum(axis=1)))
         assert (np.abs(rate - _LINES[own].rate_deg) < 3.5 * sigma).all()

@@ -1,4 +1,4 @@
-"""A satellite in orbit flies the same loop: it detumbles by its magnetometer, rests, and is braked again."""
+"""Tests that a satellite in orbit detumbles by magnetometer, rests, and detumbles again."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from tests.scenario.orbit_flights import ORBIT, orbit_config, speed, world
 from tests.support.flights import event_names, fly
 
 SPEED, SLOW = 0.1745, 0.1
-"""At the release, and where braking ends, rad/s."""
+"""Rates (rad/s) at the release and at the end of detumbling."""
 SILENT, MUTE = 20.0, 1.0
-"""When the inertial unit falls silent, and for how long, s."""
+"""Start and duration (s) of the silence of the IMU."""
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Fly from 10 deg/s, with a silence of the unit while braking; a low limit ends the rest at once."""
+    """Run from 10 deg/s with a silent IMU during detumbling; a low limit ends the rest at once."""
     config = orbit_config(70.0, tumble_rate=0.01)
     section = configuration.replace(config.detumble, low_rate=SLOW, low_for=3.0)
     timeline = (CommandStep(at=1.0, mode="hold"), CommandStep(at=2.0, slew=0.1))

@@ -1,4 +1,4 @@
-"""A satellite in orbit acquires its attitude by its star camera, in a world unlike its belief."""
+"""Tests that a satellite acquires its attitude by star camera in a world that differs from its model."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_it_learns_the_biases_of_the_inertial_unit(flown: Run) -> None:
 
 
 def flown_bias(run: Run) -> np.ndarray:
-    """Return the mean of gyro less truth: the configured bias and one that the unit draws."""
+    """Return the mean gyro error: the configured bias plus the random bias of the IMU."""
     imu, truth = run["imu"], run["truth"]
     rates = [
         np.interp(imu["sample_time_ns"], truth["time_ns"], truth["rate"][:, axis].astype(float))

@@ -1,4 +1,4 @@
-"""A satellite in orbit that knows its attitude points to its target; its coils pause to measure the field."""
+"""Tests that a satellite with a known attitude points to its target, with coil pauses for the field."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tests.support.flights import event_names, fly
 DURATION, SUNWARD = 52.0, 47.0
 """s: the flight, and when the mode SUN is commanded."""
 SPEED = 0.001
-"""rad/s, the orbit's own: the body keeps what it has while the field lets the coils act."""
+"""Largest rate (rad/s), equal to the orbital rate."""
 WITHIN = 12.0
-"""deg: what a release away from the target and the rate leave at the end."""
+"""Largest pointing error (deg) at the end of the run."""
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_no_step_of_the_coils_falls_into_an_exposure_while_it_points(flown: Run)
     packets = flown["attitude"]
     times, dipoles = packets["time_ns"].astype(np.int64), packets["dipole"]
     changed = np.abs(np.diff(dipoles, axis=0)).max(axis=1) > 0.0
-    after = times[1:][changed]  # the first packets after steps, a tenth of a second apart
+    after = times[1:][changed]  # first packets after target steps; packets are 0.1 s apart
     frames = flown["streak"][flown["streak"]["exposure_start_ns"] > entered(flown, Mode.POINT) * 1e9]
     assert len(frames) >= 3
     assert len(after) > 30

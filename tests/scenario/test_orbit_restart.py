@@ -1,4 +1,4 @@
-"""A satellite that is killed starts again from what its filter had learned."""
+"""Tests that a killed satellite process restarts with the parameters that its filter had learned."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.scenario.orbit_flights import GYRO_BIAS, navigating, skyward
 from tests.support.flights import Rigged, event_names, fly
 
 KILLED, AGAIN = 40.0, 16.0
-"""s of the first flight after which it is killed, and of the second."""
+"""Durations (s) of the first run, which is killed, and of the second run."""
 LATER = "2026-03-20T12:10:00Z"
 
 
@@ -35,14 +35,14 @@ def _world(utc: str | None = None) -> Simulation:
 
 
 def _first_error(run: Run) -> float:
-    """Return by how much the first estimate of the gyro's bias is off, rad/s."""
+    """Return the error of the first estimate of the gyro bias, rad/s."""
     bias = run["navigation"]["gyro_bias"]
     known = bias[np.isfinite(bias[:, 0])]
     return float(np.linalg.norm(known[0] - GYRO_BIAS))
 
 
 def test_the_gyro_bias_is_known_at_once_after_a_kill(tmp_path: Path) -> None:
-    """What stands on the disk at an instant of a flight is what a kill leaves."""
+    """A kill leaves the files that are on the disk at that instant."""
     disk, left = tmp_path / "disk", tmp_path / "left"
 
     def kill(rigged: Rigged) -> None:

@@ -1,4 +1,4 @@
-"""A slew in the loop: handed over to pointing without a jump; a body that leaves its path is held still."""
+"""Tests that a slew passes to pointing without a jump, and that a body far off its path is damped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BROKEN = 22.0
 """Time (s) at which the coils x and z break. The remaining coil causes no torque about its own axis y, about
 which the slew rotates most."""
 PATIENCE = 15.0
-"""s that the body is held still before it is planned for though not slow: 180 in flight."""
+"""Time (s) of damping after which a path is planned even if the body is not slow; the default is 180 s."""
 
 
 def slewing(duration: float, *faults: FaultEntry) -> tuple[OrbitConfig, Simulation]:
@@ -139,7 +139,7 @@ def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Pat
 
 
 def test_while_it_is_held_still_its_coils_only_take_energy(crippled: Run) -> None:
-    """Along the path before they gave some, too."""
+    """Before the restart, star fixes were also available along the path."""
     lost = at(crippled, "astray")[0]
     around, truth = crippled["orbit_truth"], crippled["truth"]
     times, since = around["time_ns"] * 1e-9, truth["time_ns"] * 1e-9

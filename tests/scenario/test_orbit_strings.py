@@ -1,4 +1,4 @@
-"""Solar strings in the loop: with them the attitude is coarse without a camera, though one is dead."""
+"""Tests that solar strings, one of them dead, give a coarse attitude without a camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import fly
 
 DEAD = 6.0
-"""When a string gives no more current, s."""
+"""Time (s) from which a string gives no current."""
 
 
 @pytest.fixture(scope="module")

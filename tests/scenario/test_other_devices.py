@@ -1,4 +1,4 @@
-"""Devices other than those of the thesis fly: their drivers against emulated parts at the wire.
+"""Runs with devices other than those of the thesis: their drivers with emulated chips.
 
 The sensors of the first flight are read by CircuitPython's own drivers (extra `circuitpython`).
 """

@@ -1,4 +1,4 @@
-"""A bad plan is never flown: the last good one is, and then its end is held."""
+"""Tests that an invalid plan is not used: the last valid plan continues, and its end is held."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 17.5
 GOOD_PLANS = 2
-"""The second is made at 5 s and ends at 15 s."""
+"""The second plan is made at 5 s and ends at 15 s."""
 
 Spoil = Callable[[PlanJob, StepPlan], StepPlan]
 
@@ -89,7 +89,7 @@ def test_after_two_good_plans_only_bad_ones_come(
 def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil
 ) -> None:
-    """The first path leads to the target; holding its end is right then, and no alarm."""
+    """The first path ends at the target, so that holding its end is correct and gives no alarm."""
     use_planner(
         monkeypatch, lambda job: plan_job.run(job) if job.number == 1 else spoil(job, plan_job.run(job))
     )

@@ -1,4 +1,4 @@
-"""Flights with a battery that is far too small: loads shed in the loop, and their return after sunrise."""
+"""Tests of loads that the loop sheds for a much too small battery, and restores after sunrise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real time: the same loop on the machine's clock, the devices and the workers in processes of their own."""
+"""Tests in real time: the loop on the machine's clock, with devices and workers in separate processes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ground.telemetry import Run, read_run
 from tests.support.flights import CONFIG, event_names
 
 ROOT = CONFIG.parents[1]
-# One frame is asked for after 5 s: on a busy machine its worker needs some more.
+# A frame is required only after 5 s, because the worker is slower on a busy machine.
 DURATION = 12.0
 
 
@@ -42,7 +42,7 @@ def test_every_slot_was_run_or_counted(flown: Run) -> None:
     last = groups[groups["name"] == b"control"][-1]
     assert last["cycles"] + last["slips"] == round(DURATION * 40)
     assert len(flown["control"]) == last["cycles"]
-    # The bound is for a machine that does other things too; the bench holds a free one to more.
+    # The bound holds for a busy machine; the benchmark has a tighter bound for an idle machine.
     assert last["slips"] < 0.1 * DURATION * 40
 
 

@@ -1,4 +1,4 @@
-"""Frames of a slew through the whole loop: streaks of a fit length, no step of the coils within, all used."""
+"""Tests of frames during a slew: streak lengths are suitable, no coil step falls within an exposure."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.support import slew_frames
 from tests.support.flights import fly
 
 DURATION, BEGIN = 85.0, 6.0
-"""s: the flight ends while the body still turns faster from frame to frame."""
+"""Duration (s) of the run, which ends while the body still accelerates."""
 SEED = 3
 ABOUT = np.array([1.0, 0.0, 0.0])
 """Body axis of the slew: across the boresight, which is along -y."""
 STREAKS = 1.1
-"""px that a star moves in the usual exposure, from which on it is to streak."""
+"""Star motion (px) in the usual exposure above which stars must be streaked."""
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def _streaked(run: Run) -> tuple[BoolArray, FloatArray]:
-    """Return which frames (n,) are of a body fast enough, and how far (n,) px stars moved by the truth."""
+    """Return whether the body was fast enough in each frame (n,), and the true star motion (n,), px."""
     config, _ = slew_frames.flight("orbit", SEED, ABOUT)
     assert config.camera is not None
     to_camera = attitude_matrix(np.array(config.camera.mounting))
@@ -63,7 +63,7 @@ def test_streaks_of_a_slew_are_long_enough_to_tell_the_rate_and_no_longer(flown:
 def test_no_step_of_the_coils_falls_into_an_exposure_of_a_slew(flown: Run) -> None:
     packets = flown["attitude"]
     changed = np.abs(np.diff(packets["dipole"], axis=0)).max(axis=1) > 0.0
-    after = packets["time_ns"].astype(np.int64)[1:][changed]  # the first packets after steps
+    after = packets["time_ns"].astype(np.int64)[1:][changed]  # first packets after target steps
     frames = flown["streak"][flown["streak"]["exposure_start_ns"] > (BEGIN + 2.0) * 1e9]
     assert len(after) > 30
     for frame in frames:
@@ -76,7 +76,7 @@ def test_no_step_of_the_coils_falls_into_an_exposure_of_a_slew(flown: Run) -> No
 def test_their_rates_and_attitudes_enter_the_estimate(flown: Run) -> None:
     streaked, _ = _streaked(flown)
     frames, stars = flown["streak"][streaked], flown["stars"]
-    # Of crowded frames with streaks of 7 to 8 px one in ten or two has bright areas that agree on no motion.
+    # One or two of ten crowded frames with streaks of 7 to 8 px have bright areas without a common motion.
     assert np.mean([to_text(status) == "rate" for status in frames["status"]]) >= 0.8
     assert np.all(frames["accepted"][[to_text(status) == "rate" for status in frames["status"]]] == 1)
     of_streaks = np.isin(stars["sequence"], frames["sequence"])

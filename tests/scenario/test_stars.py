@@ -1,4 +1,4 @@
-"""The stars in flight: honest attitudes from real skies, whether the flight knows where it looks or not."""
+"""Tests of star attitudes in flight from real skies, with and without a known pointing direction."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 _LOST, _TRACKED = 0, 1
-# Of three degrees of freedom, passed by chance once in 1e5; twice the sigma left to streaks of 300 px.
+# Bounds of the normalised square with three degrees of freedom: exceeded by chance once in 1e5; four times
+# that for 300 px.
 _MOST_MISMATCH = 4.0 * 25.9
 
 
@@ -32,19 +33,19 @@ def errors(run: Run) -> tuple[FloatArray, FloatArray]:
 
 
 def mismatch(run: Run) -> FloatArray:
-    """Return the squared error of each star attitude over its covariance, of three degrees of freedom."""
+    """Return the normalised squared error of each star attitude (three degrees of freedom)."""
     error, covariance = errors(run)
     return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error))
 
 
 def assert_solved(run: Run) -> None:
-    """Every attitude came from identified stars and is right, as its covariance has it."""
+    """Each attitude comes from identified stars, and its error agrees with its covariance."""
     assert set(run["stars"]["status"].tolist()) == {b"solved"}
     assert mismatch(run).max() < _MOST_MISMATCH
 
 
 def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
-    """Have the inertial unit fall silent between two mission times; from before the flight if at none."""
+    """Make the IMU silent between two mission times, or from before the run if no times are given."""
     wire = rigged.lock.line.to_host
 
     def silence() -> None:
@@ -62,7 +63,7 @@ def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
 
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Fly the first 30 s: the release at 0.1 rad/s, streaks of 300 px, and rest on the first target."""
+    """Run the first 30 s: release at 0.1 rad/s, streaks of 300 px, and rest at the first target."""
     return fly(demo_config(30.0), tmp_path_factory.mktemp("stars"))
 
 
@@ -81,7 +82,10 @@ def test_every_frame_of_the_demonstration_gives_an_attitude_that_the_estimate_ta
 
 
 def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstration: Run) -> None:
-    """The mean square over the variance; about the thread, where alone the body is shaken, not too small."""
+    """The normalised mean square is checked.
+
+    About the thread, the only excited axis, also against a lower bound.
+    """
     error, covariance = errors(demonstration)
     about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])
     assert 0.05 < about_thread < 4.0
@@ -91,7 +95,7 @@ def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstratio
 
 
 def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
-    """Without the unit there is no estimate to predict an attitude or to take one."""
+    """Without the IMU there is no estimate that could predict or use an attitude."""
     run = fly(demo_config(8.0), tmp_path, lambda rigged: unit_silent(rigged, 0.0, 4.0))
     assert_solved(run)
     assert run["stars"]["tracked"].tolist() == [_LOST, _TRACKED]
@@ -99,11 +103,11 @@ def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: 
 
 
 def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_tracked(tmp_path: Path) -> None:
-    """Ten seconds of dark and of silence: the model alone no longer knows where the camera looks.
+    """After ten seconds without frames and IMU, the model cannot predict the camera's attitude.
 
-    The body, which swung freely meanwhile, is turned back as hard as the coil can: the unit speaks again
-    early enough that in the next exposure, of a second, the rate changes by less than half of itself. More
-    than that is beyond the fit of a motion.
+    The body, which has swung freely, returns with the full torque of the coil. The IMU resumes early enough
+    that the rate changes by less than half in the next exposure of one second. A larger rate change is beyond
+    the motion fit.
     """
 
     def prepare(rigged: Rigged) -> None:
@@ -123,7 +127,7 @@ def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_trac
 
 
 def test_a_camera_knocked_out_of_place_is_found_out_and_misleads_nobody(tmp_path: Path) -> None:
-    """Its stars are identified in an unexpected place, and their attitude is refused and reported."""
+    """The stars are identified in an unexpected direction; their attitude is refused and reported."""
 
     def knock(rigged: Rigged) -> None:
         camera = rigged.lock.hardware.camera

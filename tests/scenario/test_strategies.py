@@ -17,13 +17,13 @@ from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_
 
 
 def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> TestbedConfig:
-    """Return the demonstration with other steps and other guidance, without a camera."""
+    """Return the demonstration with the given steps and guidance, without a camera."""
     config = configuration.replace(demo_config(duration, camera=False), steps=steps)
     return configuration.replace(config, guidance=configuration.replace(config.guidance, **guidance))
 
 
 def true_angle(run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return mission time in s and the true turn about the thread in rad."""
+    """Return the mission times, s, and the true rotation about the thread, rad."""
     truth = run["truth"]
     return truth["time_ns"] * 1e-9, 2.0 * np.arcsin(truth["quaternion"][:, 1])
 
@@ -46,7 +46,10 @@ def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
 
 
 def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None:
-    """Twice the price is a horizon shorter by the fourth root of two; later plans keep the first goal."""
+    """A doubled time cost shortens the horizon by the fourth root of two.
+
+    Later plans keep the first goal time.
+    """
     steps = (Step(at=0.0, q2=0.2), Step(at=20.0, q2=0.1))
     horizons = []
     for price in (0.04, 0.08):

@@ -1,4 +1,4 @@
-"""Coils in a tumble whose inertia is not the configured one."""
+"""Tests of coil monitoring in a tumble with an inertia that differs from the configured one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.unlike_body import (
 )
 
 TWO_PERCENT_OFF = (0.0066, 0.0340, 0.0326)
-"""kg m^2; the configured 3U has 0.0066, 0.0333, 0.0333."""
+"""Moments of inertia (kg m^2); the configured 3U has 0.0066, 0.0333, 0.0333."""
 
 
 def _coils_and_sigma(flown: Run) -> tuple[FloatArray, FloatArray]:

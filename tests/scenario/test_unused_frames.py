@@ -1,4 +1,4 @@
-"""A frame in motion that gives neither a rate nor an attitude is an event."""
+"""Tests that a frame in motion without a rate or an attitude gives an event."""
 
 from __future__ import annotations
 

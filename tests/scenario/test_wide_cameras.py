@@ -1,4 +1,4 @@
-"""Wide cameras in the loop: lost in space without a star camera, Sun and limb make the attitude fine."""
+"""Tests that Sun and limb in horizon cameras give a fine attitude without a star camera."""
 
 from __future__ import annotations
 

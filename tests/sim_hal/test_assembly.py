@@ -1,4 +1,4 @@
-"""The assembled hardware: a free-falling inertial unit, and the coils' field at its magnetometer."""
+"""Tests of the assembled hardware: an IMU in free fall, and the coils' field at its magnetometer."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BIAS = (2e-6, -1e-6, 3e-6)
 def measured(
     imu: ImuNoise, seconds: float, world: str = "free_body", config: Config | None = None
 ) -> tuple[list[Vn100Sample], list[BodyMotion]]:
-    """Return what the unit sends at 40 Hz, and the true motion at each time."""
+    """Return the samples of the IMU at 40 Hz, and the true motion at each time."""
     body = FreeBodySection(release=TipOff(speed=0.02))
     section = reader.replace(demo_world(), world=world, free_body=body, imu=imu)
     lock = build_lockstep(config or demo_config(10.0, camera=False), section, None, SimClock())
@@ -54,7 +54,7 @@ def test_it_weighs_nothing_and_its_noise_is_the_data_sheets() -> None:
 
 def test_its_attitude_has_no_meaning_in_orbit_and_a_meaning_on_the_thread() -> None:
     def errors(world: str) -> FloatArray:
-        """Return the attitudes that the unit has more than the body (n, 4)."""
+        """Return the rotations (n, 4) from the body's to the IMU's attitude."""
         pairs = zip(*measured(ImuNoise(), 20.0, world), strict=True)
         more = [quaternion.multiply(quaternion.conjugate(t.quaternion), m.quaternion) for m, t in pairs]
         return np.array(more)
@@ -85,7 +85,7 @@ UNEQUAL: tuple[Vector, Vector, Vector] = ((5e-4, 1e-4, 0.0), (0.0, 4e-4, 0.0), (
 
 
 def gauss(coil_field: tuple[Vector, Vector, Vector], driven: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the field that the held unit measured last, gauss, and the coils' currents, A."""
+    """Return the last field measured by the IMU at rest, gauss, and the coil currents, A."""
     section = configuration.replace(demo_world(), coil_field=coil_field, current_noise=0.0)
     lock = build_lockstep(demo_config(10.0, camera=False), section, None, SimClock())
     seen: list[FloatArray] = []
@@ -96,7 +96,7 @@ def gauss(coil_field: tuple[Vector, Vector, Vector], driven: bool) -> tuple[Floa
 
     lock.hardware.unit.alter = note
     if driven:
-        # Awake, with auto-increment; then input A of x for half, B of z for a quarter of a period.
+        # Writes that wake the chip and drive input A of x for half, and B of z for a quarter of a period.
         lock.hardware.bus.write_i2c_block_data(0x40, 0x00, [0x20])
         lock.hardware.bus.write_i2c_block_data(0x40, 0x06, [0, 0, 0, 8])
         lock.hardware.bus.write_i2c_block_data(0x40, 0x1A, [0, 0, 0, 4])

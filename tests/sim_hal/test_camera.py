@@ -1,4 +1,4 @@
-"""The emulated camera by itself: triggers, read-out, and every fault on frames of known pixels."""
+"""Tests of the emulated camera: triggers, readout, and each fault on frames of known pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EXPOSURE_NS, READOUT_NS, SCAN_NS = 100 * MS, 50 * MS, 20 * MS
 
 
 class Bench:
-    """A camera on a clock set by hand; frame n has n in its first row and 10 n below."""
+    """A camera on a manual clock. Frame n has the value n in its first row and 10 n below."""
 
     def __init__(self) -> None:
         self.now_ns = 1000 * MS

@@ -1,4 +1,4 @@
-"""Simulated time jumps, and every event due on the way occurs in order."""
+"""Tests that simulated time jumps, and that each due event occurs in order."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_utc_is_the_label_of_the_start_plus_the_time_since() -> None:
 
 @pytest.mark.parametrize("clock", [SimClock(), SystemClock()])
 def test_a_job_that_raises_is_kept_as_an_error_and_runs_again(clock: SimClock | SystemClock) -> None:
-    """A thread that ends on an exception would leave its device, the coils above all, as it last was."""
+    """If a thread ended by an exception, its device, such as the coils, would keep its last state."""
     runs = list[int]()
 
     def job() -> None:

@@ -1,4 +1,4 @@
-"""From PWM outputs to coil currents: the bridge's truth table, the thesis's uncertainty, the supply."""
+"""Tests of coil currents from PWM outputs: the bridge's truth table, current errors, and the supply."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
         (FULL_OFF, FULL_ON, -FULL),  # L H: V_supply, CCW
         (FULL_OFF, FULL_OFF, 0.0),  # L L: 0 V
         ((0, 1024), FULL_OFF, FULL / 4),
-        ((0, 2048), (1024, 3072), 0.0),  # driven +, braking, driven -
-        ((0, 2048), (0, 1024), FULL / 4),  # braking while both are high
+        ((0, 2048), (1024, 3072), 0.0),  # states of the bridge: driven +, braking, driven -
+        ((0, 2048), (0, 1024), FULL / 4),  # both inputs high: braking
         ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # across the period's end
     ],
 )
@@ -97,7 +97,7 @@ def test_the_same_seed_gives_the_same_currents() -> None:
 
 
 def test_a_coil_whose_resistance_is_not_what_the_driver_believes() -> None:
-    """The driver's 0.1 A through 20 ohm instead of 23 is 0.115 A."""
+    """A duty for 0.1 A through 23 ohm gives 0.115 A through 20 ohm."""
     rig = Rig()
     truth = replace(THESIS, coils=(CoilWiring(0, 1, 20.0), *THESIS_COILS[1:]))
     circuit = CoilCircuit(rig.wire.chip, truth, np.random.default_rng(1), rig.clock.now_ns, uncertainty=0.0)

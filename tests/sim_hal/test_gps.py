@@ -1,4 +1,4 @@
-"""The solution of the emulated GPS receiver with and without satellites."""
+"""Tests of the emulated GPS receiver's solution with and without satellites."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated current monitor against the data sheet of the INA219 (TI SBOS448G)."""
+"""Tests of the emulated current monitor against the data sheet of the INA219 (TI SBOS448G)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_worked_example_of_the_data_sheet() -> None:
     part.write(0x05, 0x5000)
     part.clock.advance(2 * 532_000)
     assert part.read(0x01) == 0x07D0
-    assert part.read(0x02) == 0x5D98 | 0b10  # the table leaves the ready bit out
+    assert part.read(0x02) == 0x5D98 | 0b10  # the table of the data sheet omits the ready bit
     assert part.read(0x04) == 0x2710
     assert part.read(0x03) == 0x1766
     assert part.read(0x02) == 0x5D98  # reading Power has cleared it

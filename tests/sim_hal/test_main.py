@@ -1,4 +1,4 @@
-"""The options of `python -m sim_hal`: their names, values, defaults and limits."""
+"""Tests of the options of `python -m sim_hal`: names, values, defaults and limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The devices in orbit, read by the flight drivers in lock-step."""
+"""Tests of the devices in orbit, read by the flight drivers in lock-step."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_faults_reach_the_drivers(lock: LockStep) -> None:
         strings = opened_device("solar_strings", orbit_config(), rig, stack)
         assert strings is not None
         found = fixes(lock, rig, stack, 6)
-        # In a second the satellite moves by 7.1 km over the ground.
+        # The sub-satellite point moves by 7.1 km in a second.
         jumps = np.diff([fix.position for fix in found if fix.valid], axis=0)
         assert sorted(np.linalg.norm(jumps, axis=1))[-1] > 4e4
         assert "check its power" in strings.error()
@@ -238,7 +238,7 @@ def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironm
 PINHOLE = Pinhole.from_field_of_view(200, 200, math.radians(20.0))
 ABOVE = np.array([1.0, 0.0, 0.0])
 SIDES = np.array([0.0, -1.0, 0.0])
-"""The Sun over the side of the Earth that the camera does not face."""
+"""The Sun is above the side of the Earth that the camera does not see."""
 
 
 @pytest.mark.parametrize(
@@ -270,7 +270,7 @@ def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
     position = np.array(around.position)
     assert sunlit_ground_angle(position, ABOVE, to_camera[2]) == pytest.approx(math.radians(25.0), abs=1e-9)
     assert sunlit_ground_angle(position, -ABOVE, to_camera[2]) == math.pi
-    # With the Sun to the side, the ground is lit from 6 deg (0.1 rad) beyond the subsatellite point on.
+    # With the Sun at the horizon, the ground is lit from 6 deg (0.1 rad) beyond the sub-satellite point on.
     ground = EARTH_RADIUS * np.array([math.cos(0.1), math.sin(0.1), 0.0])
     away = ground - position
     expected = math.acos(away @ to_camera[2] / float(np.linalg.norm(away)))
@@ -280,7 +280,7 @@ def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
 
 
 def test_aberration_moves_the_stars_towards_the_velocity() -> None:
-    """20.5 arcsec at 29.8 km/s across, none along."""
+    """Aberration is 20.5 arcsec at 29.8 km/s across the line of sight, and zero along it."""
     attitude = quaternion.IDENTITY[None, :]
     moved = aberrated(attitude, np.array([29_800.0, 0.0, 0.0]))
     star = quaternion.attitude_matrix(moved)[0] @ [0.0, 0.0, 1.0]
@@ -308,7 +308,10 @@ def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
 
 
 def test_a_slow_start_shifts_no_device_in_time() -> None:
-    """In real time the clock runs on while the devices are built, here by half a second at each reading."""
+    """In real time the clock advances while the devices are built.
+
+    In this test by half a second per reading.
+    """
     clock = itertools.count(10 * SECOND_NS, SECOND_NS // 2)
     wires = EmulatedWires(clock.__next__, 1, orbit_config().coils.bus)
     hardware = assemble(orbit_config(), orbit_world(), clock.__next__, wires)

@@ -1,4 +1,4 @@
-"""The emulated PCA9685 against the NXP data sheet; each test states the rule it holds."""
+"""Tests of the emulated PCA9685 against the NXP data sheet; each test states its rule."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_equal_counts_are_noted_as_a_violation(bench: Bench) -> None:
 
 
 def test_sleep_stops_the_outputs_and_restart_brings_them_back(bench: Bench) -> None:
-    """Data sheet 7.3.1.1: RESTART is set by sleeping while a channel runs, and cleared by writing it."""
+    """RESTART is set by sleep while a channel runs, and cleared by a write (data sheet 7.3.1.1)."""
     bench.wake()
     bench.write(0x06, 0, 0, 0, 0x08)
     bench.write(0x00, 0x30)

@@ -1,4 +1,4 @@
-"""The section `simulation` of a configuration."""
+"""Tests of the section `simulation` of a configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulated unit by itself: its registers, its errors, its clock, its words."""
+"""Tests of the emulated VN-100: registers, errors, clock and messages."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_every_binary_field_of_a_vn100_can_be_had_and_agrees_with_the_others() -
     assert values["attitude.linear_accel_ned"] == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
     assert values["attitude.mag_ned"] == pytest.approx([4.5, 0.0, 0.0], abs=1e-5)
     yaw, pitch, roll = np.radians(values["common.yaw_pitch_roll"])
-    # 3-2-1: turns about z, then y, then x, each of the axes and not of the vector.
+    # Euler angles 3-2-1 rotate the axes about z, then y, then x.
     (cz, cy, cx), (sz, sy, sx) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     turn_z = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
     turn_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])

@@ -1,4 +1,4 @@
-"""The registers and commands of the emulated unit's attitude filter, as VectorNav's SDK 0.99 uses them."""
+"""Tests of the emulated VN-100's filter registers and commands as VectorNav's SDK 0.99 uses them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_factory_settings_of_the_filters_registers(register: int, default: str) 
 
 @pytest.mark.parametrize("register", [36, 38, 50, 51])
 def test_what_is_written_is_echoed_kept_and_saved(register: int) -> None:
-    """The texts are those of the SDK: every number with six decimals, a register's number with two digits."""
+    """The commands are those of the SDK: numbers with six decimals, and register numbers with two digits."""
     bench = Bench().quiet()
     length = {36: 9, 38: 9, 50: 3, 51: 3}[register]
     values = [f"{0.5 * k + 0.25:f}" for k in range(length)]
@@ -76,13 +76,13 @@ def test_tare_and_initial_heading_turn_the_attitude_about_the_vertical() -> None
     bench = Bench(NOISELESS).quiet()
     turning = angles(bench)
     assert command(bench, "TAR") == ("TAR",)
-    # The body turns on by 0.02 rad/s during two exchanges of 20 ms.
+    # The body rotates at 0.02 rad/s during two exchanges of 20 ms.
     assert angles(bench) == pytest.approx([0.0, *turning[1:]], abs=0.1)
     assert command(bench, "SIH", "+045.000") == ("SIH", "+045.000")
     assert angles(bench) == pytest.approx([45.0, *turning[1:]], abs=0.1)
     command(bench, "SIH", "-120", "30", "20")
     assert angles(bench, 239) == pytest.approx([-120.0, *turning[1:]], abs=0.1)
-    # A quaternion, scalar last, of 60 degrees about the vertical; VectorNav's turns body into NED.
+    # Quaternion (scalar last) of 60 deg about the vertical; VectorNav's quaternion rotates body into NED.
     command(bench, "SIH", 0, 0, 0.5, 0.866025)
     assert angles(bench, 240) == pytest.approx([60.0, *turning[1:]], abs=0.1)
     bench.exchange(build("RST"), 1.5)

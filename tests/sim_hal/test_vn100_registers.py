@@ -1,4 +1,4 @@
-"""The registers of the emulated VN-100: factory settings and valid values of VectorNav UM001 v2.43 ch. 5."""
+"""Tests of the emulated VN-100's registers: factory settings and valid values of UM001 v2.43 ch. 5."""
 
 from __future__ import annotations
 

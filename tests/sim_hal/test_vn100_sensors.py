@@ -1,4 +1,4 @@
-"""The messages and the noise of the emulated VN-100 against VectorNav UM001 v2.43 ch. 4 and 5."""
+"""Tests of messages and noise of the emulated VN-100 against VectorNav UM001 v2.43 ch. 4 and 5."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What measures rather than checks: campaigns, benches, mutants, pictures."""
+"""Studies that measure performance: campaigns, benchmarks, mutation tests, and plots."""

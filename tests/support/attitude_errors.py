@@ -1,4 +1,4 @@
-"""How far an attitude or a rate is from the truth, in the thesis's measures (Sease 3.28, 3.29)."""
+"""Errors of attitudes and rates in the measures of the thesis (Sease 3.28, 3.29)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugat
 
 
 def field_fraction(rate: FloatArray, exposure: float, field_of_view: float) -> float:
-    """Return the turn during the exposure as a part of the field of view, rad (3.28)."""
+    """Return the rotation during the exposure, relative to the field of view (3.28)."""
     return float(np.linalg.norm(rate)) * exposure / field_of_view
 
 
@@ -21,8 +21,9 @@ def error_in_pixels(angle: float, resolution: int, field_of_view: float) -> floa
 def attitude_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
     """Return the errors (whole, across) of an attitude (4,), rad.
 
-    Whole is the angle of the turn from truth to estimate; across is the angle between the two boresights,
-    free of the turn about the boresight, which a narrow field knows some ten times worse.
+    The total error is the rotation angle from truth to estimate. The error across is the angle between the
+    two boresights, without the rotation about the boresight, which is about ten times less accurate in a
+    narrow field.
     """
     difference = multiply(estimate, conjugate(truth))
     boresight = attitude_matrix(difference)[:, 2]

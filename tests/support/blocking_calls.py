@@ -30,7 +30,7 @@ FIRST, LAST = 40, 200
 
 
 class BlockingCalls:
-    """Collects the calls that may block, of the thread in which it is started."""
+    """Collects the calls that may block in the thread in which it is started."""
 
     def __init__(self) -> None:
         self.found: set[tuple[str, str]] = set()

@@ -1,4 +1,4 @@
-"""Chromium by playwright, as Debian installs it; counts what the page complains of and whom it asks."""
+"""Debian's Chromium controlled by playwright, which counts errors of the page and its requests."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ HOST = "127.0.0.1"
 
 @dataclass  # without slots: playwright marks the object whose methods it calls
 class Page:
-    """An open page. `complaints` of its console; `strangers`: addresses beyond loopback that were asked."""
+    """An open page. `complaints` of its console; `strangers`: requested addresses beyond loopback."""
 
     page: Any
     complaints: list[str] = field(default_factory=list)
     strangers: list[str] = field(default_factory=list)
 
     def heard(self, said: Any) -> None:
-        """Keep an error or a warning of the browser's console."""
+        """Record an error or a warning of the browser's console."""
         if said.type in ("error", "warning"):
             self.complaints.append(said.text)
 
     def failed(self, error: Any) -> None:
-        """Keep an error that no script caught."""
+        """Record an uncaught error."""
         self.complaints.append(str(error))
 
     def asked(self, request: Any) -> None:
-        """Keep a request that leaves the machine."""
+        """Record a request that leaves the machine."""
         if urlsplit(request.url).hostname not in (HOST, None):
             self.strangers.append(request.url)
 
@@ -51,7 +51,7 @@ class Page:
 
     @property
     def shown(self) -> tuple[float, str]:
-        """The time that is shown, s, and the values of all packets at that time."""
+        """The displayed time, s, and the values of all packets at that time."""
         self.page.evaluate("document.getElementById('all').open = true")
         self.page.wait_for_timeout(300)
         both = "[document.body.dataset.time, document.getElementById('packets').textContent]"
@@ -83,7 +83,7 @@ class Page:
 
 
 def missing() -> str:
-    """Return what is missing for a browser, empty when nothing is."""
+    """Return the missing packages of a browser, or an empty text."""
     try:
         import playwright.sync_api  # noqa: F401, PLC0415 - an extra of the tests
     except ModuleNotFoundError:

@@ -52,7 +52,7 @@ def frame_of(
 
 
 def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) -> FloatArray:
-    """Return the least covariance (2, 2) px^2 of a star's place, its light, sky and point spread unknown.
+    """Return the Cramer-Rao bound (2, 2), px^2, of a star position with unknown flux, sky and point spread.
 
     Poisson and read noise, rounding; pixels whose mean is saturated give no information.
     """
@@ -107,7 +107,7 @@ def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: i
 
 
 def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the numbers of the stars found (k,) and of the detections (k,) they are."""
+    """Return the indices of the found stars (k,) and of their detections (k,)."""
     if not len(found):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     apart = np.linalg.norm(places[:, None] - found.points, axis=-1)

@@ -1,4 +1,4 @@
-"""An ephemeris without a field model or a Sun of its own: a circular polar orbit, made by hand."""
+"""An artificial ephemeris of a circular polar orbit with a dipole field and a fixed Sun."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ JULIAN_DATE = 2_461_367.5
 RADIUS = 6_878_000.0
 RATE = np.sqrt(GRAVITATIONAL_PARAMETER / RADIUS**3)
 STRENGTH = 2.6e-5
-"""T, of a dipole's field on its equator at that height."""
+"""Field (T) of a dipole on its equator at the orbit's height."""
 
 
 def circular(duration: float, step: float = 10.0) -> Ephemeris:

@@ -1,6 +1,6 @@
 """An independent optimum of a single-axis slew: direct collocation in theta, and its own interior point.
 
-It shares nothing with the planner: states are theta and omega, not q2; the discretisation is the trapezoidal
+It is independent of the planner: states are theta and omega, not q2; the discretisation is the trapezoidal
 rule on some hundreds of intervals, not a polynomial; the solver is a primal-dual interior point method on the
 banded optimality system, not SLSQP. Its error is of second order in the step.
 """
@@ -43,7 +43,7 @@ class Optimum:
 
 
 def solve(slew: Slew, intervals: int = 400, tolerance: float = 1e-9, iterations: int = 80) -> Optimum | None:
-    """Return the optimum; None when the iteration is lost, as when no trajectory keeps the limit."""
+    """Return the optimum; None if the iteration fails, for example because no trajectory keeps the limit."""
     point = _InteriorPoint(slew, intervals)
     for _ in range(iterations):
         if point.residual() < tolerance and point.barrier <= 1e-9:
@@ -130,7 +130,7 @@ class _InteriorPoint:
         return float(max(np.abs(gradient).max(), np.abs(self._defects()).max(), np.abs(gaps).max()))
 
     def step(self) -> bool:
-        """Take one Newton step of the perturbed conditions; False when it leads nowhere."""
+        """Take one Newton step of the perturbed conditions; False if the step fails."""
         rhs = np.zeros((self.n, 5))
         rhs[:, :3] = -self._gradient()
         rhs[:, 2] += self.barrier / (1 + self.u) - self.barrier / (1 - self.u)
@@ -152,7 +152,7 @@ class _InteriorPoint:
         self.upper = self.upper + dual * d_upper
         if self.residual() < 10 * self.barrier:
             self.barrier = max(1e-10, min(0.2 * self.barrier, self.barrier**1.5))
-        # Crushed against its bound or turned past the singularity: the iteration is lost.
+        # The iteration fails if a variable reaches its bound or passes the singularity.
         return bool(np.abs(self.u).max() < 1.0 - 1e-13 and np.abs(self.theta).max() < 1.6)
 
     def _matrix(self) -> FloatArray:

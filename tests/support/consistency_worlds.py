@@ -25,17 +25,17 @@ DIPOLE = 80 * 0.0081
 TESTBED_FIELD: FloatArray = np.array([0.0, 0.0, -4.5e-4])
 ORBIT_FIELD = 4.5e-5
 FIELD_TURN = 2.2e-3
-"""rad/s: the field along a low polar orbit turns twice in a revolution."""
+"""Rate (rad/s) of the field along a low polar orbit, which makes two rotations per orbit."""
 CURRENT_BOUND = 3.5e-3
 GAIN_SIGMA = 0.1
-"""Of the coils' torque over its nominal value: field, area and inertia are not better known."""
+"""Standard deviation of the coils' torque relative to its nominal value."""
 MOST_STIFFNESS, MOST_DAMPING = 2e-5, 4e-6
-"""N m/rad and N m s/rad of the thread."""
+"""Largest stiffness (N m/rad) and damping (N m s/rad) of the thread."""
 
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """A torque that walks at random, over the inertia: rad/s^2 at the start, rad/s^2 per sqrt(s)."""
+    """Random walk of torque over inertia: initial value (rad/s^2), and growth (rad/s^2 per sqrt(s))."""
 
     start: float
     walk: float
@@ -54,16 +54,16 @@ KNOWN_PLANT = FilterSettings(
     gate_sigma=5.0,
     history_ns=6_000_000_000,
 )
-"""The filter's settings where nothing of the plant is estimated."""
+"""Filter settings without estimation of plant parameters."""
 
 DRAUGHT = Push(1e-3, 5e-5)
-"""Of the air about the testbed: 1e-6 N m."""
+"""Disturbance torque of the air around the testbed: 1e-6 N m."""
 DRAG = Push(1e-4, 1e-5)
-"""Of the free body: 1e-7 N m of drag and residual dipole."""
+"""Disturbance torque of the free body: 1e-7 N m of drag and residual dipole."""
 
 
 class World(Protocol):
-    """What the campaign asks of the truth."""
+    """Interface of a true world for the campaign."""
 
     suspended: bool
     attitude: FloatArray
@@ -82,9 +82,9 @@ class World(Protocol):
 
 
 class SuspendedWorld:
-    """sim_hal's testbed on a thread that the filter knows nothing of, in a draught.
+    """sim_hal's testbed on a thread that is unknown to the filter, with a torque of the air.
 
-    The draught acts as the coil current that would give its torque: the testbed has no other handle.
+    The torque of the air is simulated by the coil current with the same torque.
     """
 
     suspended = True
@@ -139,7 +139,7 @@ class SuspendedWorld:
 
 
 class FreeWorld:
-    """A body that turns about all axes, pushed by a torque that walks at random."""
+    """A body that rotates about all axes under a torque with a random walk."""
 
     suspended = False
 
@@ -154,7 +154,7 @@ class FreeWorld:
         self.disturbance = rng.normal(0.0, DRAG.start, 3)
 
     def field(self) -> FloatArray:
-        """Return a field that turns in a plane."""
+        """Return a field that rotates in a plane."""
         angle = FIELD_TURN * self._time
         along = np.array([np.cos(angle), np.sin(angle), 0.0])
         return np.asarray(ORBIT_FIELD * (self._field_axes @ along))
@@ -164,7 +164,7 @@ class FreeWorld:
         self._currents = _actual(currents, self._rng)
 
     def advance(self, span_ns: int) -> None:
-        """Let time pass, in one step of Runge-Kutta; the torque walks afterwards."""
+        """Integrate by one Runge-Kutta step, and then update the random walk of the torque."""
         dt = span_ns * 1e-9
         field = self.field()
         x = np.concatenate([self.attitude, self.rate])
@@ -193,7 +193,7 @@ class FreeWorld:
 
 
 def _actual(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return what the coils carry: off by a uniform draw where they are driven at all."""
+    """Return the coil currents, with a uniform random error if they are driven."""
     noise = rng.uniform(-CURRENT_BOUND, CURRENT_BOUND, 3)
     return np.asarray(np.where(currents != 0.0, currents + noise, 0.0))
 

@@ -63,14 +63,14 @@ def offer(
     refusals: tuple[type[Exception], ...] = (),
     reseal: Callable[[bytes], bytes] | None = None,
 ) -> None:
-    """Have a reader read an example, damaged or whole.
+    """Let a reader read an example, damaged or undamaged.
 
     Args:
         chance: from `chances`.
         examples: contents that the reader accepts.
-        read: reads, and asserts what it promises; its second argument says that nothing is damaged.
+        read: function that reads and checks the result; its second argument is true for undamaged data.
         refusals: the reader's own errors; a whole example must be accepted.
-        reseal: makes checksums right again, so that the code behind them is reached.
+        reseal: function that corrects checksums, so that damaged data pass the checksum test.
     """
     files = dict(chance.choice(examples))
     whole = chance.random() < 0.05

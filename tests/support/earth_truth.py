@@ -32,7 +32,7 @@ class LimbTruth:
 
 
 def sun_direction(scene: EarthScene) -> FloatArray:
-    """Return the unit vector (3,) in camera axes from the camera to the Sun, seen or not."""
+    """Return the unit vector (3,) from the camera to the Sun, camera axes, visible or not."""
     return towards_sun(scene)[0]
 
 

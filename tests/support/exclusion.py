@@ -24,7 +24,7 @@ def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY
 def sun_in_field(
     boresight: FloatArray, position: FloatArray, sun: FloatArray, half_angle: float, buffer: float = 0.0
 ) -> BoolArray:
-    """Return at which `boresight` (m, 3) the Sun's disc is within `half_angle` + `buffer` rad (2.16, 2.17).
+    """Return for each `boresight` (m, 3) whether the Sun is within `half_angle` + `buffer` rad (2.16, 2.17).
 
     `position` (m, 3) is the camera's, `sun` (m, 3) the Sun's; `buffer` is for stray light past the baffle.
     """

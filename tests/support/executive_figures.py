@@ -1,4 +1,4 @@
-"""What the bench `executive` makes of a flight: figures of its logs and of looks at its processes."""
+"""Figures of the benchmark `executive` from the logs of a flight and samples of its processes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Looks at the flight's processes; memory in bytes that others share with them."""
+    """Samples of the flight's processes; memory in bytes, with shared memory divided among its users."""
 
     looks: list[Look]
     shared_with_others: float
@@ -60,7 +60,7 @@ class Watched:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """One flight's figures, and how late it and the bare loop beside it were."""
+    """Figures of one flight, and the lateness of its cycles and of the bare loop beside it."""
 
     figures: Figures
     flight: Grid
@@ -70,7 +70,7 @@ class Flown:
 def evaluate(
     folder: Path, devices: Path, wakes: Path, began: Began, watched: Watched, warm_up: float
 ) -> Flown:
-    """Return what a flight in `folder` showed, its devices' truth in `devices`."""
+    """Return the figures of the flight in `folder` with the devices' truth in `devices`."""
     truth = CoilTruth(folder, devices)
     run = truth.run
     start = run["run"][0]
@@ -119,7 +119,7 @@ def evaluate(
 
 
 def _scheduling(run: Run) -> str:
-    """Return what the flight says it obtained."""
+    """Return the real-time privileges that the flight reports."""
     events = run["event"]
     texts = [to_text(event["text"]) for event in events if event["name"].startswith(b"real-time")]
     return texts[0] if texts else "nothing asked"
@@ -171,7 +171,7 @@ def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
 
 
 def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
-    """Return the slope per hour and its interval; NaN where the span is too short to judge it.
+    """Return the slope per hour and its interval; NaN if the interval is too short.
 
     Pages come and go by tenths of a MiB: over a minute that alone is tens of MiB/h.
     """
@@ -197,7 +197,7 @@ def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[An
 def _share(looks: list[Look], name: str) -> float:
     """Return the share of a core that a process took; a replaced process counts with its successors."""
     spent = np.diff([look.processor[name] for look in looks])
-    if len(looks) < 2:  # it was seen once, and had ended
+    if len(looks) < 2:  # the process was sampled once and had then ended
         return 0.0
     return float(spent[spent > 0.0].sum()) / (looks[-1].time - looks[0].time)
 
@@ -205,8 +205,8 @@ def _share(looks: list[Look], name: str) -> float:
 def misses(figures: Figures) -> list[str]:
     """Return the names of the figures that exceed their limits.
 
-    Of the slope its interval decides: it misses when all of that lies above. A slope that is not known in so
-    short a flight is not judged.
+    Of the slope its interval decides: it misses when all of that lies above. The slope of a short flight is
+        unknown and is not judged.
     """
     found = [name for name, limit in ASKED.items() if not _slope(name) and not figures[name] <= limit]
     steep = figures["memory_slope_interval"][0] > ASKED["memory_slope_mib_per_hour"]
@@ -218,7 +218,7 @@ def _slope(name: str) -> bool:
 
 
 def table(figures: Figures, name: str) -> str:
-    """Return the table: what was asked, what was measured."""
+    """Return the table of required and measured figures."""
     late, bare, spent = figures["lateness_s"], figures["lateness_of_bare_loop_s"], figures["execution_s"]
     wrong = misses(figures)
     rows = [

@@ -31,7 +31,7 @@ FRAME_PERIOD, FRAME_EXPOSURE, FRAME_LATE = 2.0, 0.2, 1.0
 
 @dataclass(frozen=True)
 class Rigged:
-    """A flight about to begin: `at` schedules an action at a mission time in s."""
+    """A prepared run: `at` schedules an action at a mission time, s."""
 
     lock: LockStep
     loop: FlightLoop
@@ -71,7 +71,7 @@ def demo_world() -> Simulation:
 
 
 def thesis_config(duration: float) -> TestbedConfig:
-    """Return the demonstration as the thesis flies it: receding horizon, its tracker; no camera."""
+    """Return the demonstration with the receding horizon and the tracker of the thesis, without camera."""
     config = demo_config(duration, camera=False)
     guidance = configuration.replace(config.guidance, strategy="receding", current_share=1.0)
     control = configuration.replace(config.control, tracker="thesis", state_weight=20.0)
@@ -88,11 +88,11 @@ def fly(
     section: Simulation | None = None,
     absent: Callable[[LockStep], None] | None = None,
 ) -> Run:
-    """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults.
+    """Run a configuration in lock-step, and return its logs; `prepare` may schedule faults.
 
-    `section` is the world to fly in, with its own seed; by default the demonstration's. `absent` takes
-    devices away before they are opened; the flight is a patient one then.
-    However the flight ended, the coils are at zero when the devices have been closed.
+    `section` describes the world and its seed; by default the demonstration's. `absent` removes
+    devices before they are opened; the run then waits for devices. However the flight ended, the coils are at
+    zero when the devices have been closed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     section = section or configuration.replace(demo_world(), seed=seed)
@@ -126,7 +126,7 @@ def event_names(run: Run) -> list[str]:
 
 
 def config_for(mode: str, camera: bool, duration: float = DURATION) -> Config:
-    """Return half a minute of the demonstration in a mode; with a camera a small and quick one."""
+    """Return half a minute of the demonstration in a mode, optionally with a small and fast camera."""
     config = demo_config(duration)
     eye = None
     if camera and config.camera is not None:

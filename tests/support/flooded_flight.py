@@ -1,4 +1,4 @@
-"""A flight of the demonstration in real time, a flood of datagrams at it, and how late its cycles were."""
+"""A real-time flight of the demonstration under a flood of datagrams, and the lateness of its cycles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WARM_UP_S = 5.0
 
 @contextmanager
 def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `python -m flight WORDS`, and end it at the end."""
+    """Run `python -m flight WORDS`, and end the process on exit."""
     line = [sys.executable, "-m", "flight", *map(str, words)]
     with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
@@ -45,7 +45,7 @@ def free_port() -> int:
 
 
 def wait_for(path: Path) -> None:
-    """Wait until a file is there. Raises TimeoutError."""
+    """Wait until a file exists. Raises TimeoutError."""
     until = time.monotonic() + _START_S
     while not path.exists():
         if time.monotonic() > until:
@@ -56,7 +56,7 @@ def wait_for(path: Path) -> None:
 def flood(
     port: int, datagrams: Sequence[bytes], a_second: int, ended: threading.Event, sent: list[int]
 ) -> None:
-    """Send drawn datagrams, `a_second` of them, until `ended`; note how many in each burst."""
+    """Send `a_second` random datagrams per second until `ended`, and record the number in each burst."""
     draw = np.random.default_rng(1)
     burst = round(a_second * _BURST_S)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:

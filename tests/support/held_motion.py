@@ -1,4 +1,4 @@
-"""The table of the pointing law along a given motion, without the planner's search for that motion."""
+"""Gains of the pointing law along a given motion, without the planner's search for a motion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def table_along(
     """Return the table that holds a given motion (n + 1,) without other torques than the motion's own.
 
     `field` (n + 1, 3) T and `position` (n + 1, 3) m, ICRS; `inertia` (3, 3) kg m^2. The gains near the end
-    have less preview.
+    are computed from a shorter prediction.
     """
     count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
     state, dipole = step_costs(weights, dt)

@@ -1,4 +1,4 @@
-"""Lateness of a loop on a grid of time, slots that it lost, and which of them the machine took from it."""
+"""Lateness and lost slots of a periodic loop, and the slots that were lost because of the machine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Grid:
 
     @property
     def lost(self) -> npt.NDArray[np.bool_]:
-        """Slots that the loop came half a period late for, or more (`flight.loop.executive`)."""
+        """Slots that the loop reached at least half a period late (`flight.loop.executive`)."""
         return np.asarray(2.0 * self.lateness >= self.period_ns * 1e-9)
 
     def figures(self) -> dict[str, float]:
@@ -31,7 +31,7 @@ class Grid:
 
 
 def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
-    """Return how late each of `count` slots from `first` on was served, by the first start after it was due.
+    """Return the lateness of `count` slots from `first` on, by the first start after each due time.
 
     `starts_ns` are monotonic and in order; slots after the last start are infinitely late.
     """
@@ -44,7 +44,7 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 
 
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
-    """Return which slots the bare loop lost, itself or one of their neighbours.
+    """Return the slots that the bare loop lost, including their neighbours.
 
     Neighbours count because a stall need not begin and end for both loops within the same slot: one of them
     may still be at work, the other asleep.

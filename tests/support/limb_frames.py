@@ -1,4 +1,4 @@
-"""Frames of the Earth's limb, and what a satellite knows when it takes them."""
+"""Frames of the Earth's limb, and the prior knowledge of the satellite."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def random_air(generator: np.random.Generator) -> Atmosphere:
 
 
 def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> HorizonKnowledge:
-    """Return what a satellite in that scene would know, its coarse sensors' errors drawn."""
+    """Return the prior knowledge of a satellite in the scene, with random errors of its coarse sensors."""
     sun, field = scene.sun / np.linalg.norm(scene.sun), random_direction(generator)
     sensed = tuple(
         SensedDirection(misread(scene.camera_matrix @ true, sigma, generator), true, sigma)
@@ -66,6 +66,6 @@ def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> Horiz
 
 
 def misread(direction: FloatArray, sigma: float, generator: np.random.Generator) -> FloatArray:
-    """Return a direction (3,) as a coarse sensor of `sigma` rad an axis shows it."""
+    """Return a direction (3,) measured by a coarse sensor with an error of `sigma` rad per axis."""
     error = from_rotation_vector(sigma * generator.standard_normal(3))
     return np.asarray(attitude_matrix(error) @ direction)

@@ -1,4 +1,4 @@
-"""An attacker between ground and satellite who has seen every frame and knows everything except the keys."""
+"""An attacker between ground and satellite who knows every frame and everything except the keys."""
 
 from __future__ import annotations
 

@@ -143,13 +143,13 @@ def _obey(words: Sequence[str]) -> int:
 
 
 def _typed() -> list[str]:
-    """Return the words after the program's name that a shell asks to complete, or none in a usual run."""
+    """Return the command-line words that a shell requests to complete, or none in a normal run."""
     line = os.environ.get("COMP_LINE", "") if "_ARGCOMPLETE" in os.environ else ""
     return line.split()[1:]
 
 
 def _complete(parser: argparse.ArgumentParser) -> None:
-    """Answer a shell that asks for completions, and end the process; return at once in a usual run."""
+    """Print the completions that a shell requests, and end the process; return at once in a normal run."""
     if "_ARGCOMPLETE" not in os.environ:
         return
     try:

@@ -53,8 +53,8 @@ _LEAST_FIXES, _SEQUENCES, _LONGEST_GAP = 5, 4, 200.0
 time (s) between two fixes of one sequence.
 """
 FIRST_FIXES, TIGHT = 3, 1e4
-"""Number of consistent fixes that begin an orbit without elements, and largest standard deviation (m) of
-elements by which a single fix begins an orbit.
+"""Number of consistent fixes that start an orbit without elements, and largest standard deviation (m) of
+elements with which a single fix starts an orbit.
 """
 UNCONFIRMED_SIGMA = 1e6
 """Standard deviation (m) of a position that follows from a few fixes without elements."""
@@ -129,7 +129,7 @@ class FixSequence:
         return self._is_refuted
 
     def is_over(self, fix: GpsFix) -> bool:
-        """Return whether a new fix comes too late, or most fixes disagree, so that the sequence has ended."""
+        """Return whether a sequence has ended because a new fix comes too late or most fixes disagree."""
         gap = abs(fix.julian_date - self._newest.julian_date) * DAY
         return gap > _LONGEST_GAP or self._offered > 2 * (self.joined + _LEAST_FIXES)
 
@@ -199,7 +199,8 @@ class EstimatedEnvironment:
         self._fixed_ns = 0
         self._near: Ephemeris | None = None
         self._near_sigma = 0.0
-        # Field, pressures of air and light, and visible fraction of the Sun at the times of the prediction.
+        # Magnetic field, pressures of air and sunlight, and visible fraction of the Sun at the predicted
+        # times.
         self._near_table: FloatArray = np.zeros((0, 10))
         self.refused = 0
         self.refusal = ""
@@ -333,7 +334,7 @@ class EstimatedEnvironment:
         return replace(state, sigma=math.hypot(sigma, state.sigma))
 
     def _recent(self, date: float) -> GpsFix | None:
-        """Return the newest fix that was used, or None if it is too old; few fixes become old sooner."""
+        """Return the newest used fix, or None if it is too old. The age limit is shorter after few fixes."""
         fix = self._fix
         if fix is None:
             return None
@@ -399,7 +400,7 @@ class EstimatedEnvironment:
         return False
 
     def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
-        """Return whether a sequence begins or continues an orbit that only a few fixes describe."""
+        """Return whether a sequence begins an orbit, or continues an orbit based on few fixes."""
         first = FIRST_FIXES if self._elements is None else 1
         known = self._elements is None or self._is_tight(sequence.first.julian_date)
         if not known or self._is_doubted or sequence.refuted or sequence.joined < first:
@@ -437,7 +438,7 @@ class EstimatedEnvironment:
         return False
 
     def _agrees_with_elements(self, fix: GpsFix) -> bool:
-        """Return whether a fix agrees with the elements; refuted elements contradict nothing."""
+        """Return whether a fix agrees with the elements; refuted elements are not compared."""
         elements = self._elements
         return elements is None or self._enlarged > 1.0 or _agree(elements, fix, LEAST_GATE)
 

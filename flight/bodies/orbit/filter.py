@@ -535,7 +535,7 @@ class OrbitFilter:
         self._replay.renew_coils(covariance)
 
     def renew_magnetometer(self) -> None:
-        """Reset bias and matrix of the magnetometer, because another one is read from now on."""
+        """Reset bias and matrix of the magnetometer, because a different magnetometer is read from now on."""
         self._close()
         self._by_field.restart()
         self._replay.renew_magnetometer()
@@ -681,7 +681,7 @@ class OrbitFilter:
         return self._dipoles.at_rest_since() is None
 
     def _close(self) -> None:
-        """End the step under way at its newest reading, and process it."""
+        """End the present step at its newest reading, and process the step."""
         gathered = self._open
         if gathered is None or gathered.end_ns == gathered.begin_ns:
             return

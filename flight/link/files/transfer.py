@@ -6,7 +6,7 @@ repeated EOFs.
 
 A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next
 protocol data unit (PDU) whenever one can be sent. Replies are sent first, followed by PDUs of the open
-transfers in round-robin order. An entity never blocks and gets the time from its caller. State that survives
+transfers in round-robin order. An entity never blocks; its caller passes the time. State that survives
 a restart of the process is kept in the store.
 """
 

@@ -231,7 +231,7 @@ class Filing:
     ) -> Iterator[str | None]:
         """Copy a received file in steps, check the SHA-256 of the copied bytes and select the copy.
 
-        The received file may change meanwhile, but the selected file is the one that was checked. Yields None
+        The received file may change during the check, but the selected file is the checked copy. Yields None
         after each step, and at the end the problem or an empty text.
         """
         digest = hashlib.sha256()

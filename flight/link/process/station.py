@@ -567,7 +567,7 @@ class Station:
 
     @property
     def obeyed(self) -> int:
-        """Number of commands that were accepted and obeyed."""
+        """Number of commands that were accepted and executed."""
         return self._gate.admitted - self._refused_commands
 
     def report_problem(self, name: str, text: str) -> None:

@@ -165,7 +165,8 @@ class LqTracker:
             v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
         else:
-            # The coil can provide the deceleration `braking` (rad/s^2) all the way to the angle of the path.
+            # The coil can provide the deceleration `braking` (rad/s^2) until the angle of the path is
+            # reached.
             authority = max(min(math.cos(angle), math.cos(wanted.angle)), 0.0)
             taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
             braking = max(

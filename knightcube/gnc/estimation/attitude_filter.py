@@ -11,13 +11,13 @@ torques from the estimated disturbance, because these torques depend on the angl
 
 The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
 broken, the model predicts an acceleration that does not occur. The innovations of the gyro then exceed their
-covariance within one to a few samples, which they do not in a healthy flight. After such innovations, the
-filter treats the coil currents as unknown and follows the gyro. The currents of the last half second are also
-treated as unknown. A change of the rate that is too large for any coil current is not evidence against the
-commands, because the gyro may be faulty. The commands are trusted again when the rate follows the commands.
-The model z = b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate
-that the commands should cause. The response g must be determined well, be 1 within its uncertainty, and leave
-white residuals. The commands are therefore never trusted again while the coils are not driven. If the gyro is
+covariance within a few samples. In a healthy flight they do not. After such innovations, the filter treats
+the coil currents as unknown and follows the gyro. The currents of the last half second are also treated as
+unknown. A change of the rate that is too large for any coil current is not evidence against the commands,
+because the gyro may be faulty. The commands are trusted again when the rate follows the commands. The model z
+= b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate that the
+commands should cause. The response g must be determined well, be 1 within its uncertainty, and leave white
+residuals. The commands are therefore never trusted again while the coils are not driven. If the gyro is
 noisier than assumed, the check widens its limits and does not raise an alarm.
 """
 

@@ -92,7 +92,7 @@ class StructureMap:
         """The mask (rows, columns) of the structure's pixels, or None without structure.
 
         Learned blocks are widened by one block, because blocks at the rim of the structure also show the
-        scene. A learned block counts only next to another one.
+        scene. A learned block counts only if an adjacent block is also learned.
         """
         learned = self.quiet >= _QUIET_FRAMES
         learned &= _neighbours(learned) >= 2

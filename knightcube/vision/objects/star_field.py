@@ -67,7 +67,7 @@ class StarField:
     def locate(self, found: FieldPoints, predicted: FloatArray, sigma: float) -> LocatedFrame:
         """Return the attitude of a frame among the stars, and which of its points are stars.
 
-        If fewer than three points are stars of the field, the frame changes nothing and its points count as
+        If fewer than three points are stars of the field, the field is not updated, and the points count as
         stars. After three such frames in a row, the field begins again.
 
         Args:

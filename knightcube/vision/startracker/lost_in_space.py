@@ -657,8 +657,8 @@ def _candidates(
 ) -> _Chosen:
     """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
 
-    A match that shares two pairs of an observed star and a guide star with the pairs `tried` (k, 2) is left
-    out. The third returned value is `tried` with the pairs of the new candidates.
+    Matches that share two pairs of an observed star and a guide star with the pairs `tried` (k, 2) are
+    omitted. The third returned value is `tried` with the pairs of the new candidates.
     """
     return _choose(
         np.ascontiguousarray(observed.direction),
@@ -801,11 +801,11 @@ def _counted_votes(
 
 @loop_helper
 def _most_voted(votes: IntArray, wanted: int) -> IntArray:
-    """Return the indices (`wanted`,) of the matches with the most votes, of equal ones the first."""
+    """Return the indices (`wanted`,) of the matches with the most votes; of equal matches, the first ones."""
     highest = 0
     for k in range(len(votes)):
         highest = max(highest, votes[k])
-    # The place of the first match with v votes among the sorted matches is `begin[v]`.
+    # The index of the first match with v votes among the sorted matches is `begin[v]`.
     begin = np.zeros(highest + 2, dtype=np.int64)
     for k in range(len(votes)):
         begin[votes[k]] += 1

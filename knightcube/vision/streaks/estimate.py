@@ -175,7 +175,7 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
 def _likelier(
     camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
 ) -> StreakFit | None:
-    """Return a fit, from a scan of the whole frame, that explains more chi-square than the fit `done`.
+    """Return a fit from a scan of the whole frame that explains more of the chi-square than the fit `done`.
 
     Returns None if the scan finds no better fit, if the frame has few blended stars, or if the fit `done`
     already explains enough chi-square.

@@ -112,7 +112,7 @@ class CameraMotion:
 
     @property
     def accelerates(self) -> bool:
-        """Whether the angular rate changes in another way than by a vibration."""
+        """Whether the angular rate changes for a reason other than a vibration."""
         return bool(self.acceleration.any() or self.higher_terms.any())
 
     @property

@@ -2,9 +2,9 @@
 
 A vibration displaces the stars across their paths and changes their speed, and thereby the intensity, along
 their paths. The residuals of a fit without vibration show both as functions of time. The vibration is
-modelled as a sum of few sinusoids of the camera's rotation vector. The first value of a frequency is the one
-that decreases chi-square most. Gauss-Newton steps improve frequencies and amplitudes, and between these steps
-the motion and the stars are fitted again.
+modelled as a sum of few sinusoids of the camera's rotation vector. The first value of each frequency
+decreases chi-square most. Gauss-Newton steps improve frequencies and amplitudes, and between these steps the
+motion and the stars are fitted again.
 
 In one time bin, the residuals depend linearly on 12 numbers: the rotation vector, its time derivative, and
 the rotation vectors at the start and the end of the exposure, which move the ends of the streaks.

@@ -25,7 +25,7 @@ from tests.support.flights import TEXT
 SERVING = {"console", "files", "gateway", "link", "watch", "camera"}
 """Commands that serve, or wait for something, until they are ended."""
 SLOW = {"index", "identify", "samples", "run"}
-"""Commands that compute for seconds, or fly."""
+"""Commands that compute for seconds or simulate a run."""
 NAMES = sorted({**cli.COMMANDS, **GROUND_COMMANDS}.keys() - SERVING - SLOW)
 PATHS = (
     "good.yaml", "bad.yaml", "notes.txt", "run", "empty", "nowhere/run", "nowhere.png", ".", "..",
@@ -56,7 +56,7 @@ WORDS = (
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Work in a folder with a run, a configuration and files that are neither."""
+    """Change to a folder with a run, a configuration and unrelated files."""
     place = tmp_path_factory.mktemp("typed")
     make_run(place / "run", Recipe(duration=5.0, planned=5.0, hold=2.0, rate_hz=10.0))
     (place / "good.yaml").write_text(TEXT, encoding="utf-8")
@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def words_of(chance: Random, name: str) -> list[str]:
-    """Return a command line by the command's own options, with values that often cannot be."""
+    """Return a command line with options of the command and often invalid values."""
     parser = cli._parser([name])
     [commands] = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
     words = [name]
@@ -97,7 +97,7 @@ def words_of(chance: Random, name: str) -> list[str]:
 
 
 def refused(*_: Any) -> list[Path]:
-    """Refuse to draw a picture, which would take most of the time."""
+    """Refuse to draw a plot, which would take most of the time."""
     raise UsageError("no pictures are drawn in this test")
 
 

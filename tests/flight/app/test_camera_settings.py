@@ -20,7 +20,7 @@ S = 1_000_000_000
 
 
 def body(streak_estimator: Any = None) -> Any:
-    """Return a body whose functions are marks."""
+    """Return a body whose functions are distinct dummy objects."""
     estimation = SimpleNamespace(angular_acceleration_psd="psd", velocity="velocity", knowledge="knowledge")
     control = SimpleNamespace(follows_objects="follows", exposure_start="calm")
     return cast(

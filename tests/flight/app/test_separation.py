@@ -11,7 +11,7 @@ SECOND = 1_000_000_000
 
 
 def left(inhibit: SeparationInhibit, folder: Path, seconds: float = 100.0) -> float:
-    """Return the time (s) that is left, 0 after the inhibit."""
+    """Return the remaining time (s) of the inhibit, or 0 after its end."""
     try:
         inhibit.check(folder, seconds)
     except InhibitedError as error:
@@ -25,7 +25,7 @@ def test_time_without_power_does_not_count_and_a_restart_begins_nothing_again(tm
         inhibit = SeparationInhibit(clock)
         clock.advance(30 * SECOND)
         assert left(inhibit, tmp_path / "state") == expected
-        clock.advance(500 * SECOND)  # not counted: the power fails before the next check
+        clock.advance(500 * SECOND)  # this time is not counted, because the power fails before the next check
     clock = ManualClock()  # years later
     assert left(SeparationInhibit(clock), tmp_path / "state") == 0.0
 

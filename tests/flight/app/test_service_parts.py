@@ -23,7 +23,7 @@ MS = 1_000_000
 
 
 def loop(said: list[str]) -> Any:
-    """Return a loop that keeps the reasons for which it is stopped."""
+    """Return a loop that stores the reasons of its stops."""
     return cast(Any, SimpleNamespace(stop=said.append))
 
 
@@ -155,7 +155,7 @@ def test_garbage_is_collected_from_the_second_call_on(monkeypatch: pytest.Monkey
 
 
 class Bench:
-    """A supervision whose guardian and service manager are stand-ins."""
+    """A supervision with test doubles of guardian and service manager."""
 
     def __init__(self) -> None:
         self.now = 1_000 * MS

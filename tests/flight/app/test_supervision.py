@@ -12,7 +12,7 @@ from tests.manual_clock import ManualClock
 
 
 class Watchers:
-    """Guardian and service manager in one; note the calls."""
+    """Test double of guardian and service manager that records the calls."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
@@ -33,7 +33,7 @@ class Watchers:
 
 
 class Events(Recorder):
-    """Keeps the events instead of writing them."""
+    """Keeps the events in a list instead of writing them."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, str]] = []

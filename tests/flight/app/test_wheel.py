@@ -57,7 +57,7 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _installed(home: Path, wheels: list[Path], packages: Path) -> Path:
-    """Return a new virtual environment with these wheels, and the packages of a folder beside them."""
+    """Return a new virtual environment with the given wheels and the packages of a folder."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True, timeout=30)
     python = home / "bin" / "python"
     install = [*PIP, "--python", python, "install", "--no-compile", *ALONE, *wheels]
@@ -70,12 +70,12 @@ def _installed(home: Path, wheels: list[Path], packages: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def environment(wheels: Path) -> Path:
-    """Return a virtual environment of both wheels; other packages are those of this environment."""
+    """Return a virtual environment of both wheels and the other packages of the test environment."""
     return _installed(wheels / "venv", sorted(wheels.glob("*.whl")), Path(sysconfig.get_path("purelib")))
 
 
 def _type(environment: Path, folder: Path, *words: str) -> str:
-    """Type a command in a folder; return its output."""
+    """Run a command in a folder and return its output."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     program = environment / "bin" / words[0]
     done = subprocess.run(

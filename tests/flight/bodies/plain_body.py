@@ -21,7 +21,7 @@ STIFFNESS, DAMPING = 4e-4, 1e-3
 
 
 class PlainTracker:
-    """Torque against turn and rate, in three axes; the dipole normal to the field that makes it."""
+    """The torque opposes rotation and rate about three axes, made by a dipole normal to the field."""
 
     def __init__(self, field: FloatArray, limit: float, dipole_per_ampere: float) -> None:
         self._field, self._limit, self._dipole_per_ampere = field, limit, dipole_per_ampere

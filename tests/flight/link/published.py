@@ -1,6 +1,6 @@
 """Published tables of events, commands, directives and parameters.
 
-Ground stations, archives and documents use these numbers. A row changes here only when the interface changes.
+Ground stations, archives and documents use these numbers. A row may change only if the interface changes.
 """
 
 from __future__ import annotations

@@ -49,8 +49,14 @@ def noisy(data: bytes, bits: list[int]) -> bytes:
 @pytest.mark.parametrize(
     ("kind", "begin"),
     [
-        ("short", "FF480EC09A0D70BC8E2C93ADA7B746CE5A977DCC"),  # CCSDS 131.0-B-5, 10.4.2: its first 40 bits
-        ("command", "FF399E5A68E906F56C892FA1315E08C052A8BBAE"),  # CCSDS 231.0-B-4, 6.4.2: its first 40 bits
+        (
+            "short",
+            "FF480EC09A0D70BC8E2C93ADA7B746CE5A977DCC",
+        ),  # first 40 bits, CCSDS 131.0-B-5
+        (
+            "command",
+            "FF399E5A68E906F56C892FA1315E08C052A8BBAE",
+        ),  # first 40 bits, CCSDS 231.0-B-4
     ],
 )
 def test_a_sequence_begins_as_published_and_repeats_after_255_bits(kind: str, begin: str) -> None:

@@ -111,7 +111,7 @@ def test_a_damaged_telecommand_is_refused_or_can_be_obeyed(chance: Random) -> No
 def test_units_damaged_on_the_way_make_no_other_file(
     tmp_path_factory: pytest.TempPathFactory, chance: Random
 ) -> None:
-    """Both ends send a file each; units are damaged, lost, repeated and put out of order."""
+    """Each end sends a file; data units are damaged, lost, repeated and reordered."""
     place = tmp_path_factory.mktemp("units")
     fill(place / "files", CONTENTS)
     other = {SATELLITE: GROUND, GROUND: SATELLITE}

@@ -32,7 +32,7 @@ def opened(keys: Path) -> Vault:
 
 
 def refusal(at: Vault, frame: bytes) -> Refusal | None:
-    """Return why a frame is refused."""
+    """Return the reason for which a frame is refused."""
     try:
         gate(at).admit(frame)
     except RefusedError as error:

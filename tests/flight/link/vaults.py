@@ -18,7 +18,7 @@ SPACECRAFT = 0x1A5
 
 
 def vault(folder: Path, keys: dict[int, bytes]) -> Vault:
-    """Return a new vault with these keys."""
+    """Return a new vault with the given keys."""
     folder.mkdir()
     made = Vault(folder)
     for spi, key in keys.items():
@@ -34,7 +34,7 @@ def parse(frame: bytes) -> tuple[bytes, bytes]:
 
 
 def gate(at: Vault) -> Gate:
-    """Return the satellite's gate of commands."""
+    """Return the satellite's gate, which authenticates command frames."""
     return Gate(at, COMMAND_SPIS, parse, TELECOMMAND_MASK)
 
 

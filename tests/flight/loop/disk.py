@@ -15,7 +15,7 @@ Names = dict[Path, int]
 
 
 class PowerLostError(BaseException):
-    """The machine is off. No OSError: software never sees it."""
+    """The machine is off. Simulated power loss. It is not an OSError, so that no software can catch it."""
 
 
 @dataclass
@@ -28,8 +28,9 @@ class _Inode:
 class Disk(LinuxFiles):
     """A file system: content is safe after sync, names after sync_folder, everything else is open.
 
-    `calls` counts the calls that change something. Before call number `stop_before` the power fails, or, when
-    `failure` is an errno, that call and all after it fail with it. `forget` names a call that does nothing.
+    `calls` counts the calls that change something. The power fails before call number `stop_before`. If
+    `failure` is an errno, that call and all later calls fail with this errno instead. `forget` names a call
+    that does nothing.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class Disk(LinuxFiles):
         self._open: dict[int, int] = {}
         self._names: Names = {}
         self._steps: list[Names] = [{}]
-        """The names that power loss may find: the durable ones, and those after each change since."""
+        """Possible file names after a power loss: the durable names, and those after each later change."""
 
     def start(self, stop_before: int | None, failure: int = 0) -> None:
         """Reset the count of calls, and set the call that fails or stops."""

@@ -23,7 +23,7 @@ def target(name: str) -> Any:
 
 
 class OneAngle:
-    """Targets of the body: the numbers of the last estimate are set by the test."""
+    """Targets of the body; the test sets the values of the last estimate."""
 
     def __init__(self) -> None:
         self.rate, self.off, self.holdable = 0.0, 0.0, True
@@ -33,7 +33,7 @@ class OneAngle:
         return target("configured")
 
     def commanded(self, wanted: object, number: int) -> Any:
-        """Return the target of a command; "far" cannot be flown."""
+        """Return the target of a command; the target "far" is refused."""
         if wanted == "far":
             raise UsageError("too far")
         return target(f"{wanted} as number {number}")
@@ -57,7 +57,7 @@ class OneAngle:
 
 @dataclass
 class ModeBench:
-    """The mode control with records of what it asks for; `step` runs a cycle a second later."""
+    """The mode control with records of its requests; `step` runs a cycle a second later."""
 
     modes: frozenset[Mode] = TESTBED
     settings: Modes = field(default_factory=Modes)
@@ -113,7 +113,7 @@ class ModeBench:
         accurate: bool = True,
         seconds: float = 1.0,
     ) -> Mode:
-        """Run one cycle; the estimate's numbers are those of `targets`."""
+        """Run one cycle with the estimate of `targets`."""
         self.now_ns += round(seconds * SECOND_NS)
         estimate = cast(Any, object()) if known else None
         return self.control.step(estimate, rate, overdue, answers, self.now_ns, accurate)

@@ -9,7 +9,7 @@ from flight.loop.state import Learned, StoredState, UncleanShutdown
 
 
 def state_of(number: int) -> StoredState:
-    """Return a state with something in every field."""
+    """Return a state with a value in each field."""
     learned = Learned.of(np.array([1e-4, -2e-4, number * 1e-5]), np.diag([1e-8, 1e-8, 2e-8]))
     crash = UncleanShutdown(number, 10.0 * number, "2026-01-01T00:00:00Z")
     return StoredState(

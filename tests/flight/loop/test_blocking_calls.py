@@ -31,7 +31,7 @@ ALLOWED = {
     "hal/drivers/ina219.py:Ina219.error": ("_thread.", _LOCK),
     "hal/drivers/ina219.py:Ina219.latest": ("_thread.", _LOCK),
 }
-"""Functions of the product that may wait on the control thread, the beginning of the call, and why."""
+"""Functions that may wait on the control thread, the start of the call, and the reason."""
 
 
 def test_the_control_thread_waits_nowhere_else() -> None:

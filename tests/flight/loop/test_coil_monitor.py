@@ -39,7 +39,7 @@ BOUNDS = Bounds((FULL, FULL, FULL), 3.5e-3, 0.2, 1.5e-3)
     [
         ("coil-x: open", {"OPEN", "UNCERTAIN"}, 3.5),
         ("coil-x: shorted", {"SHORTED"}, 4.0),
-        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # beyond the range of the monitor
+        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # current beyond the range of the monitor
         ("bridge-x: a-low", {"A_LOW", "UNCERTAIN"}, 3.5),
         ("bridge-x: a-high", {"HIGH"}, 4.0),
         ("bridge-y: a-high", {"HIGH"}, 3.0),
@@ -131,7 +131,7 @@ def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
 
 
 def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple[CoilMonitor, FloatArray]:
-    """Return a watch whose motion missed the torque of coil z at 4 mA, and the currents (k, 3), A, flown.
+    """Return a coil monitor that missed the torque of coil z at 4 mA, and the currents (k, 3), A.
 
     A coil of gain 0 is open. If `silent`, the current monitor gives no readings after the suspicion begins.
     """
@@ -150,7 +150,7 @@ def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple
 
 
 def test_coils_that_draw_their_currents_in_the_probes_are_not_isolated_for_missing_torque() -> None:
-    """No axis is guilty by elimination: the coil may lack torque for another reason."""
+    """No axis is judged by elimination, because the torque may be missing for another reason."""
     watch, flown = _probed_for_missing_torque(np.ones(3))
     assert watch.verdicts == ()
     alone = np.flatnonzero(np.abs(flown).max(axis=1) > 0.03)
@@ -208,7 +208,7 @@ def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None
 
 
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
-    """15 % is copper at 60 degrees C; the commands of all three axes change."""
+    """A deviation of 15 % is that of copper at 60 degrees C; the commands of all three axes change."""
     seen = observe(hold(TARGET, noise=0.005, others=0.04), 20.0, gain=(0.87, 1.1, 1.0))
     assert seen.found == []
     assert seen.suspicious == 0
@@ -229,7 +229,7 @@ def test_an_axis_that_is_never_driven_is_not_judged() -> None:
 
 @pytest.mark.parametrize("fault", ["bridge-y: a-high", "bridge-y: b-high"])
 def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> None:
-    """With either leg, both ends of the coil are high. Only the broken coil carries a current."""
+    """With either leg, both ends of the coil are high. Only the broken coil carries current."""
     seen = observe(hold(0.0), 10.0, [f"{fault} @ {FAULT_AT}"])
     assert seen.watch.braked == {1}
     time, carried = seen.times, np.abs(seen.carried)
@@ -240,7 +240,7 @@ def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> 
 
 
 def test_braking_that_does_not_help_is_ended() -> None:
-    """Too much current that does not fall: a wrong monitor, or a leg stuck low under a brake."""
+    """A current that stays too large is due to a wrong monitor, or to a leg stuck low under a brake."""
     leg = StuckLeg(0.04)
     at_rest = Supplied(0.148, -0.002, 0.002, (0, 1, 2), False)
     asked = []
@@ -269,7 +269,7 @@ def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_
 
 
 def _looks(leg: StuckLeg, stuck: Iterable[int], count: int = 40) -> list[int | None]:
-    """Return the results of ADC samples without commands, while each stuck axis that is not braked draws."""
+    """Return results of ADC samples at zero commands, while each stuck axis without brake draws current."""
     drawing = set(stuck)
     found = []
     for _ in range(count):
@@ -360,7 +360,10 @@ def reading(time: float, current: float) -> PowerReading:
 
 
 def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_carries_nothing() -> None:
-    """Under an opposing command a stuck leg draws no supply current, like an open coil: rest decides."""
+    """Under an opposing command, a stuck leg draws no supply current, like an open coil.
+
+    Zero commands distinguish them.
+    """
     drawn = supply_currents(np.array([[-FULL]]), np.array([[FULL]]))
     assert drawn[0, PLACE[CoilFault.A_HIGH]] == pytest.approx(0.0)
     leg = StuckLeg(0.04)
@@ -379,12 +382,12 @@ def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_ca
 
 
 def windows(time: float, _: ImuReading) -> FloatArray:
-    """Return B-dot's currents for a fast rotation: off and fully on, four times a second."""
+    """Return the currents of B-dot for a fast rotation: off and fully on, four times a second."""
     return np.array([0.0 if time % 0.25 < 0.1 else FULL, 0.0, 0.0])
 
 
 def test_a_leg_stuck_high_that_drives_in_the_pauses_of_the_command_is_found() -> None:
-    """The current in the pauses equals that between them: no conversion can distinguish the two."""
+    """No ADC sample can distinguish the equal currents in the pauses and between them."""
     seen = observe(windows, FAULT_AT + 7.0, [f"bridge-x: b-high @ {FAULT_AT}"])
     assert [(axis, name) for _, axis, name in seen.found] == [("x", "HIGH")]
     assert seen.watch.braked == {0}
@@ -399,7 +402,7 @@ def test_a_check_at_rest_does_not_raise_suspicion() -> None:
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
-    """Without readings, a rest must still end."""
+    """A rest of the coils must end even without readings."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     rested = []
     for cycle in range(160):
@@ -414,7 +417,7 @@ def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
 
 
 def wander(rng: np.random.Generator, samples: int) -> FloatArray:
-    """Return commands (k, 3) A like those of a flight: slow, with steps, often zero on two axes."""
+    """Return typical commands (k, 3), A: slow, with steps, and often zero on two axes."""
     time = np.arange(samples) * 0.025
     commands = np.zeros((samples, 3))
     for axis in range(3):
@@ -430,8 +433,9 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
     """2,388 readings as made by the driver, seed 11: none is suspected.
 
     Each with a gain within 15 %, an error within the thesis's 3.5 mA on every driven coil in every cycle, and
-    the monitor's steps; single conversions miss the chopped current by 18 %. With none in N the rate of
-    suspicions is below 3 / N at 95 %; of them only those that leave one axis would become a verdict.
+    the monitor's steps; single conversions miss the chopped current by 18 %. Without a suspicion in N
+    readings, the rate of suspicions is below 3 / N at 95 % confidence. Only suspicions of a single axis
+    become a verdict.
     """
     rng = np.random.default_rng(11)
     suspected = readings = 0
@@ -441,7 +445,8 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
         errors = rng.uniform(-3.5e-3, 3.5e-3, commands.shape) * driven
         supply = np.abs(rng.uniform(0.85, 1.15) * commands + errors).sum(axis=1)
         in_a_row = 0
-        # A conversion is the mean of three cycles, one ends every eight; a reading's mean is of five.
+        # An ADC sample is the mean over three PWM cycles; one ends every eight cycles, and a reading is the
+        # mean of five.
         conversions = np.array([supply[end - 3 : end].mean() for end in range(8, len(supply), 8)])
         chopped = conversions * rng.uniform(0.82, 1.18, len(conversions))
         for last in range(5, len(conversions)):
@@ -496,7 +501,7 @@ def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_
     watch._evidence.add([_alone(1, 0.04 if probed else 0.0)])
     watch._evidence.begin_segment()
     watch._evidence.add([_alone(0, 0.0)])
-    for _ in range(1 if probed else 2):  # the second time, another coil has been probed as well
+    for _ in range(1 if probed else 2):  # the second time, a different coil has also been probed
         watch._conclude(0, CoilFault.OPEN, 0)
     assert bool(watch.verdicts) is probed
     assert bool(watch.monitor_doubted) is not probed

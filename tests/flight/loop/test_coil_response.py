@@ -29,11 +29,11 @@ STAND_EVERY = 176
 """Cycles from one stall of the loop to the next: 4.4 s."""
 STANDS = 36
 STALE = 12
-"""Cycles after which the coil driver, or the guardian, zeroes a command."""
+"""Number of cycles after which the coil driver, or the guardian, zeroes a command."""
 
 
 def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list[float], int]:
-    """Drive coil x with a loop that stalls now and then; its samples arrive in a burst after each stall.
+    """Drive coil x with a loop that stalls repeatedly; the samples arrive in a burst after each stall.
 
     Meanwhile the driver zeroes the coils, and reports when; or a guardian does without a report, unless the
     loop is `informed` that the currents of that time are unknown.
@@ -84,7 +84,7 @@ def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() 
 
 
 class Orbiting:
-    """A tumbling 1U in 37 uT with coils on and off; at the magnetometer their field is twice the Earth's."""
+    """A tumbling 1U in 37 uT with coils on and off, whose field at the magnetometer is twice the Earth's."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class Orbiting:
         self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
 
     def fly(self, seconds: float, weak: bool = False) -> None:
-        """Fly with coils that pause for 0.2 s of each second; `weak`: currents that no monitor can judge."""
+        """Simulate coils that pause for 0.2 s of each second; `weak`: currents that no monitor can judge."""
         begun, self._cycles = self._cycles, self._cycles + round(40 * seconds)
         for cycle in range(begun, self._cycles):
             now_ns, within, time = cycle * TICK_NS, cycle % 40, cycle / 40
@@ -173,7 +173,7 @@ PYRAMID = 0.4 * np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 
 
 @pytest.mark.parametrize("reversed_coil", [None, 0, 3])
 def test_of_four_coils_the_reversed_one_is_found(reversed_coil: int | None) -> None:
-    """The four currents always make a dipole together, so that they depend on each other."""
+    """The four currents always form one dipole together, so that they depend on each other."""
     signs = np.where(np.arange(4) == reversed_coil, -1.0, 1.0)
     flown = Orbiting(signs, dipoles=PYRAMID)
     flown.fly(60.0)
@@ -197,7 +197,7 @@ def test_a_coil_that_makes_no_torque_is_found_at_currents_too_small_for_the_moni
 
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
-    """In the second case rather the gyro or the field is false."""
+    """In the second case, a false gyro or field is more likely."""
     body = Orbiting(np.full(3, gain), speed=0.02)
     body.fly(120.0, weak=True)
     assert body.watch.suspicion == ""
@@ -316,7 +316,7 @@ def test_a_gain_that_misaligned_coils_can_explain_is_not_used(gain: float, found
 def test_a_gain_that_changed_within_the_bins_is_not_used(
     newest: float, found: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The mean over a coil's fault is the gain of neither state."""
+    """The mean gain over an interval with a fault is neither the gain before nor after the fault."""
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     alone, never = (False, True, False), (False, False, False)
     fits = {
@@ -341,7 +341,10 @@ def test_a_coil_assumed_too_weak_gets_its_gain_back() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_coils_within_their_accuracy_on_an_unlike_body_are_flown_as_described(seed: int) -> None:
-    """The gains are 20 % off, and the moments 10 %, which no fit of the coils alone could tell apart."""
+    """The gains have errors of 20 %, and the moments of inertia 10 %.
+
+    A fit of the coils alone cannot separate them.
+    """
     noise = np.random.default_rng(seed)
     body = Orbiting(1.0 + 0.2 * noise.choice([-1.0, 1.0], 3))
     body.moments = MOMENTS * (1.0 + 0.1 * noise.uniform(-1.0, 1.0, 3))
@@ -414,7 +417,7 @@ def test_before_the_first_fit_no_gain_is_claimed() -> None:
 
 
 class Motion:
-    """A fit whose answers are set by hand."""
+    """A test double of the fit with preset results."""
 
     def __init__(self, share: float | None, healthy: bool) -> None:
         self.share, self.healthy = share, healthy

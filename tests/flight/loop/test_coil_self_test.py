@@ -35,7 +35,7 @@ def _fly(
     usable: BoolArray = ALL,
     begin: float = 0.0,
 ) -> FloatArray:
-    """Return the currents (n, 3), A, of a flight from `begin` s on, NaN without a test."""
+    """Return the currents (n, 3), A, of a run from `begin` s on; NaN without a test."""
     flown = []
     for cycle in range(round(begin * 40), round((begin + seconds) * 40)):
         asked = np.zeros(3) if wanted is None else wanted

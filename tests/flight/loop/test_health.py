@@ -98,7 +98,7 @@ def test_what_the_board_does_not_have_is_neither_good_nor_bad() -> None:
 
 
 class TwoClocks:
-    """Monotonic time and UTC, each set by hand."""
+    """A clock whose monotonic time and UTC the test sets."""
 
     def __init__(self) -> None:
         self.monotonic_ns, self.wall_ns = 0, 1_700_000_000_000_000_000
@@ -140,7 +140,7 @@ def test_the_board_shows_of_this_very_process(tmp_path: Path) -> None:
 def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_nothing(tmp_path: Path) -> None:
     process = tmp_path / "proc" / str(os.getpid())
     (process / "task" / "1").mkdir(parents=True)
-    # A name with spaces and brackets in it; utime 250, stime 50 ticks (proc(5)).
+    # The process name contains spaces and brackets; utime is 250 and stime 50 ticks (proc(5)).
     (process / "stat").write_text(f"{os.getpid()} (a ) b) S " + " ".join(["0"] * 10) + " 250 50 " + "0 " * 30)
     (process / "statm").write_text("1000 512 100 1 0 200 0")
     (process / "smaps_rollup").write_text("Rss: 9000 kB\nPss:   4096 kB\nPss_Dirty: 1 kB\n")
@@ -224,7 +224,7 @@ def test_a_step_of_more_than_half_a_second_is_reported(step_ns: int, seen: bool)
 
 
 def group(name: str, period_ns: int = 25_000_000) -> Any:
-    """Return a rate group as far as health asks it."""
+    """Return a test double of a rate group for the health task."""
     return SimpleNamespace(
         name=name, period_ns=period_ns, completed=0, cycles=7, slips=2, overruns=1,
         mean_execution_ns=3_000_000.0, max_execution_ns=9_000_000,
@@ -276,7 +276,7 @@ def test_a_job_on_a_ticker_fails_when_it_raises_or_stands_still() -> None:
 
 
 class Observed:
-    """The observer of performance with records of what it does."""
+    """The performance observer with records of its actions."""
 
     def __init__(self) -> None:
         self.offs = 0

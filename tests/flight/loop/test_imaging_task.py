@@ -44,7 +44,7 @@ COVARIANCE = np.diag([4e-6, 9e-6, 1e-6, 1e-4, 4e-4, 2.5e-5])
 
 
 class Bench:
-    """An imaging task whose surroundings record what they receive."""
+    """An imaging task with test doubles that record the received calls."""
 
     def __init__(self, **changes: Any) -> None:
         self.frames: list[Frame | Exception] = []
@@ -115,7 +115,7 @@ class Bench:
 
     @staticmethod
     def past(at: int) -> Any:
-        """Return the estimate of a body that turns about x at 0.01 rad/s."""
+        """Return the estimate of a body that rotates about x at 0.01 rad/s."""
         quaternion = from_rotation_vector(np.array([0.01 * at * 1e-9, 0.0, 0.0]))
         return SimpleNamespace(quaternion=quaternion, rate=np.array([0.01, 0.0, 0.0]), covariance=COVARIANCE)
 
@@ -571,14 +571,14 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     bench.finish(FrameFound(motion(), None, lens=better), 12 * S)
     values = bench.only(LENS)
     assert (values["frames"], values["contradictions"], values["sequence"]) == (3, 0, 1)
-    assert values["centre"] == [160.0, 120.0]  # half a pixel beside the image centre (159.5, 119.5)
+    assert values["centre"] == [160.0, 120.0]  # half a pixel from the image centre (159.5, 119.5)
     assert np.allclose(values["sigma"], better.sigma[[0, 1, 2, 3, 4, 9, 10]])
     stored = bench.task.learned()["lens"]
     assert np.array_equal(stored.arrays()[0], better.learned[0])
     bench.take(2, 15 * S, 16 * S)
     assert bench.jobs[-1].lens == (better, 5.0)
     bench.finish(FrameFound(motion(), None, lens=better), 17 * S)
-    bench.only(LENS)  # a frame that taught nothing is not recorded
+    bench.only(LENS)  # a frame without a result is not recorded
     assert events.LENS_CHANGED not in bench.reports
     bench.take(3, 35 * S, 36 * S)
     assert bench.jobs[-1].lens == (better, 25.0), "the lens may have changed since the last frame that taught"

@@ -19,7 +19,7 @@ FAST, LOW, LOW_FOR = 0.02, 0.008, 3.0
 
 
 class Watched:
-    """The watch with what it began, a step each second."""
+    """The mode control with records of its actions, run once a second."""
 
     def __init__(self) -> None:
         self.watch = AttitudeWatch(
@@ -83,7 +83,7 @@ def test_a_latched_fault_bars_both_also_what_has_begun(watched: Watched) -> None
 def test_an_attitude_that_is_lost_for_long_enough_ends_pointing(watched: Watched) -> None:
     watch = watched.watch
     for second in range(20):
-        known = second < 5 or second == 7  # known again for an instant, which restarts the timeout
+        known = second < 5 or second == 7  # restarts the timeout
         trigger = watch.trigger(Mode.POINT, known, second * SECOND_NS)
         assert (trigger is Trigger.LOST) is (second >= 12), second
     assert watch.trigger(Mode.ACQUIRE, False, 30 * SECOND_NS) is None

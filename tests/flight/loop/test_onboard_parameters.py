@@ -19,7 +19,7 @@ MINUTE_NS = 60_000_000_000
 
 
 class Board:
-    """The parameters with a keeper and a recorder that remember what they are given."""
+    """The parameters with test doubles of keeper and recorder that store the passed values."""
 
     def __init__(self, table: KeptTable | None = None, keeps: bool = True) -> None:
         self.noted: list[KeptTable] = []
@@ -45,7 +45,7 @@ class Board:
         }
 
     def load(self, now_ns: int = 5, **changes: float) -> str:
-        """Load a table with changes instead of the one in force."""
+        """Load a table that differs from the active table by the given changes."""
         return self.parameters.load(self.values(**changes), self.records[-1]["crc"], now_ns)
 
 

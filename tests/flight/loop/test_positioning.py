@@ -70,7 +70,7 @@ class Bench:
         self._now_ns = 0
 
     def run(self, seconds: int, **changes: object) -> None:
-        """Run once a second; `changes` are values of the counters from now on."""
+        """Run once a second; `changes` are the values of the counters from the present time on."""
         self.receiver.counters = replace(self.receiver.counters, **changes)  # type: ignore[arg-type]
         for _ in range(seconds):
             self._now_ns += SECOND_NS

@@ -38,7 +38,7 @@ TRUTH = PowerTruth(
 )
 SUNRISE, END = 320.0, 620.0
 FULL_COILS = 0.45
-"""Current (A) of the coils at their limits, from 5 V."""
+"""Supply current (A) of the coils at their limits, at 5 V."""
 
 
 class Satellite:
@@ -151,7 +151,7 @@ def test_the_estimated_charge_follows_a_battery_unlike_the_described_one(orbit: 
 
 
 def test_battery_bus_and_panels_balance(orbit: Satellite) -> None:
-    """The panel along y is in shadow, the other one receives the cosine 0.6."""
+    """The panel along y is in shadow; the other panel receives the fraction 0.6 (cosine)."""
     lit = [one for one in orbit.true if one["solar_power"] > 0.0]
     assert lit[0]["solar_power"] == pytest.approx(9.0 * 0.6)
     for one in orbit.true[5::50]:

@@ -17,7 +17,7 @@ S = 1_000_000_000
 
 
 class Bench:
-    """A task whose signs are counters that a test raises."""
+    """A load-shedding task whose signs of overload are counters set by the test."""
 
     def __init__(self) -> None:
         self.frames = self.cycles = 0

@@ -112,7 +112,7 @@ def test_a_table_that_a_crash_left_unproven_gives_way_to_the_one_before() -> Non
         state = begin_boot(StoredState(running=not clean, table=table), LABEL)
         assert state.table.values == {"modes.known_for": flown}
         assert state.table.loads == 2
-    # The one that gave way is not tried a second time, and the one before it stays after a second crash.
+    # The rejected table is not tried again, and the former table stays after a second crash.
     again = begin_boot(begin_boot(StoredState(running=True, table=new), LABEL), LABEL)
     assert again.table.values == new.before
 
@@ -135,12 +135,12 @@ def test_the_count_is_that_of_the_crashes_in_the_window(
 
 
 BOOT, SETTLED, AGAIN = 0, 600, 640
-"""Cycles: the end of the first boot, and the end of the second, a second after its start."""
+"""Cycle numbers of the end of the first boot, and of the end of the second boot, a second after its start."""
 CHANGED = 0.3
 
 
 def booted(flown: Flight, begin: int, end: int, learned: dict[str, Learned]) -> Estimate:
-    """Return the estimate of a boot that flies some cycles of a flight."""
+    """Return the estimate of a boot that runs some cycles of a run."""
     prior, problems = start_from(learned, slow_prior(SUSPENDED, SETTINGS), CHANGED)
     assert not problems
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS, prior)
@@ -157,7 +157,10 @@ def error(estimate: Estimate, flown: Flight) -> FloatArray:
 
 
 def test_the_second_boot_knows_the_plant_better_after_a_second_than_the_first_did() -> None:
-    """Four plants; rms of each parameter. In the first boot's 15 s the damping is hardly observable."""
+    """The errors are rms values over four plants.
+
+    In the first boot's 15 s the damping is hardly observable.
+    """
     begun, begun_again = [], []
     for seed in range(4):
         flown = fly(seed, AGAIN, suspended=True)
@@ -242,7 +245,7 @@ def test_a_plant_that_is_configured_otherwise_is_another_one() -> None:
 
 def test_a_flight_begins_where_the_last_one_ended_and_from_nothing_with_a_lost_state(tmp_path: Path) -> None:
     def torsion_after(seconds: float, folder: Path, run: str) -> tuple[float, float, list[str]]:
-        """Fly; return the stored torsion of the thread, its sigma, and the events."""
+        """Simulate a run, and return the stored torsion of the thread, its sigma, and the events."""
         config = flights.demo_config(seconds, camera=False)
         config = configuration.replace(config, state=configuration.replace(config.state, folder=str(folder)))
         names = flights.event_names(flights.fly(config, tmp_path / run))

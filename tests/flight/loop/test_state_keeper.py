@@ -68,7 +68,7 @@ def test_a_table_outlives_a_clean_end_and_a_new_one_no_crash() -> None:
 
 
 def on_disk(disk: Disk) -> StoredState:
-    """Return what another process would read."""
+    """Return the state that another process would read."""
     return StateStore(FOLDER, lambda *_: None, disk).load()
 
 
@@ -84,7 +84,7 @@ def test_running_is_on_disk_before_anything_flies_and_gone_after_a_clean_end() -
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -> None:
-    """Whether the process was killed, or closed the keeper on its way out of an exception."""
+    """Cases: the process was killed, or an exception ended it, which closed the keeper."""
     disk, clock = Disk(), ManualClock()
     first = keeper_on(disk, clock)
     first.note("hold")
@@ -298,7 +298,7 @@ def test_a_state_that_vanished_or_is_older_than_a_run_counts_as_an_unclean_stop(
 
 
 def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before(tmp_path: Path) -> None:
-    """Two short flights; the process of the second finds that the one before was killed."""
+    """After two short runs, the second process detects that the first process was killed."""
     path = write_config(tmp_path)
     with path.open("a", encoding="utf-8") as file:
         file.write(f"\nstate: {{folder: {tmp_path / 'state'}}}\n")

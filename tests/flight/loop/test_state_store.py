@@ -65,7 +65,7 @@ def calls_of_one_write(bite: int) -> int:
 
 @pytest.mark.parametrize("bite", [1 << 30, 100])
 def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int) -> None:
-    """Every call of the write, and for each every content and name that the disk may then have."""
+    """All calls of the write are tested, with all possible contents and names of the disk after each call."""
     calls, found = calls_of_one_write(bite), 0
     assert calls >= 10
     for stop in range(calls + 1):
@@ -88,7 +88,7 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
 
 @pytest.mark.parametrize("forgotten", ["sync", "sync_folder"])
 def test_the_model_of_power_loss_finds_a_write_that_forgets_to_sync(forgotten: str) -> None:
-    """The test above can fail: without either sync the disk may hold an old state, or none."""
+    """Without one of the two syncs, the disk may contain an old state or none, so the test above can fail."""
     disk = Disk(forget=forgotten)
     _stored(disk, Reports()).store(state_of(3))
     states = [StateStore(FOLDER, Reports(), after).load() for after in disk.after_power_loss()]
@@ -295,7 +295,7 @@ print(midway)
 
 
 def test_two_hundred_kills_at_random_moments_leave_the_old_state_or_the_new(tmp_path: Path) -> None:
-    """SIGKILL, 200 times, while writing: the state read back is the last written or the one in progress."""
+    """After each of 200 SIGKILLs during a write, the state is the last state or the one in progress."""
     seed = 20260115
     done = subprocess.run(
         [sys.executable, "-c", WRITER, str(tmp_path), "200", str(seed)],

@@ -28,7 +28,7 @@ MS = 1_000_000
 
 
 def worker(name: str, function: Callable[[Any], Any]) -> Worker:
-    # Short where the timeout itself is tested; starting takes seconds on a shared machine.
+    # Timeouts: a short one for tests of the timeout itself, and a long one because a start takes seconds.
     patience = 1500 if function is hang else 20_000
     return Worker(name, function, latency_ns=50 * MS, timeout_ns=patience * MS)
 
@@ -216,7 +216,7 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
         assert flight.stderr is not None
         orphan = int(flight.stdout.readline())
         flight.kill()
-        # The worker inherited standard error: its end is that of the last process which had it.
+        # The worker inherits standard error, so that its end shows the end of the last process.
         assert flight.stderr.read() == ""
     assert not lives(orphan)
 

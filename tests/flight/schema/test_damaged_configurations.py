@@ -31,7 +31,7 @@ FACTORS = (-1, 0, 2, 10, 1e-3, 1e3, 1e9, 0.999)
 
 
 def spoil(chance: Random, node: Any) -> None:
-    """Change one value somewhere below a node."""
+    """Change one random value below a node."""
     while True:
         key = chance.choice(list(node) if isinstance(node, dict) else list(range(len(node))))
         below = node[key]

@@ -56,10 +56,10 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "Vn100Settings": (devices.InertialUnitSection,),
     "HorizonCameraSettings": (devices.WideCamera,),
 }
-"""The sections that a flight fills each settings class from."""
+"""Configuration sections from which a flight fills each settings class."""
 
 FILLED = {"DetectionSettings"}
-"""None stands for a value that is measured from the frame; a flight fills in the camera's."""
+"""None means that the value is measured from the frame; a flight replaces it by the camera's value."""
 
 OTHERS = {
     "ClassicalSettings": "the thesis's star tracker, for comparison",
@@ -79,13 +79,13 @@ OTHERS = {
 
 def _modules(package: ModuleType) -> Iterator[ModuleType]:
     for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        # Basilisk is an extra that no flight needs; its world takes its values from the configuration.
+        # Basilisk is an optional extra; its world reads its values from the configuration.
         if not found.name.endswith("__main__") and ".basilisk" not in found.name:
             yield importlib.import_module(found.name)
 
 
 def _settings() -> dict[str, type]:
-    """Return every settings class of what flies and what it flies against, by name."""
+    """Return the settings classes of flight software and simulator by name."""
     return {
         name: kind
         for package in (knightcube, flight, hal, sim_hal)
@@ -102,7 +102,7 @@ def _default(field: dataclasses.Field[object]) -> object:
 
 
 def _disagreements(kind: type, section: type[msgspec.Struct]) -> list[str]:
-    """Return the values that both give a default, and not the same; times in ns count as those in s.
+    """Return the values with two different defaults, where times in ns are compared with times in s.
 
     A section without a value of its own (None) leaves it to the settings class.
     """
@@ -146,6 +146,6 @@ def test_a_default_that_differs_is_found() -> None:
 
 
 def test_the_defaults_are_the_published_ones() -> None:
-    """A configuration without these keys flies with them, so a change is a change of the interface."""
+    """Configurations may omit these keys, so that a change of a default changes the interface."""
     published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
     assert json.loads(json.dumps(defaults_of(devices, orbit, sections, testbed))) == published

@@ -37,7 +37,7 @@ from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 FILES = sorted(path for path in FOLDER.rglob("*.yaml") if "\nextends:" not in path.read_text("utf-8"))
-"""The files that stand alone, because the other reader does not know `extends`."""
+"""Files without `extends`, which the independent reader does not know."""
 
 _PLAIN = st.sampled_from(
     """true True FALSE yes no on off null ~ none x y N -x- a:b 12:30 1:30:00 1.2.3
@@ -125,7 +125,7 @@ def _plainly_composed(text: str) -> tuple[_Loader, Any]:
 
 @given(st.data())
 def test_both_parsers_read_the_same_in_a_damaged_file(data: st.DataObject) -> None:
-    """Whatever libyaml alone would accept is left to PyYAML's parser, which refuses it."""
+    """Texts that only libyaml would accept are passed to PyYAML's parser, which refuses them."""
     text = FILES[data.draw(st.integers(0, len(FILES) - 1))].read_text("utf-8")
     begin = data.draw(st.integers(0, len(text) - 1))
     text = text[begin : begin + 300].partition("\n")[2]

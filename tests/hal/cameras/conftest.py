@@ -14,7 +14,7 @@ from tests.manual_clock import ManualClock
 
 @pytest.fixture
 def clock() -> ManualClock:
-    """Return a clock that stands still until it is moved."""
+    """Return a manual clock."""
     return ManualClock()
 
 

@@ -1,7 +1,7 @@
-"""The kernel's side of /dev/videoN, replaced: a free-running camera that answers the ioctls of V4L2.
+"""Replacement of the kernel's /dev/videoN: a free-running camera that answers the ioctls of V4L2.
 
-Its buffers lie in a memfd, which the binding really maps; the rules of the queue are those of the kernel
-(Linux Media userspace API, "Streaming I/O (Memory Mapping)"): a call out of order gets the errno given there.
+The buffers are in a memfd that the binding maps. The queue has the kernel's rules (Linux Media userspace API,
+"Streaming I/O (Memory Mapping)"), and calls out of order get the errno stated there.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MILLISECOND_NS = 1_000_000
 
 @dataclass(slots=True)
 class Knob:
-    """A control: its bounds and its value."""
+    """A camera control: its bounds and its value."""
 
     minimum: int
     maximum: int
@@ -39,21 +39,22 @@ class IoctlCamera:
     """A callable that replaces fcntl.ioctl.
 
     Attributes:
-        sizes: of the formats that it has, {fourcc: (columns, rows)}.
+        sizes: image sizes of the formats, {fourcc: (columns, rows)}.
         padding: bytes after each row.
-        shortest_ns: time from frame to frame, longer where the exposure is.
-        readout_ns: from the end of an exposure to the frame's end.
-        lag: frames from a control's change to the first that has it.
-        stamp_source, clock_flag, stamp_offset_ns: what the stamps claim, and by how much they lie.
-        stamps_packets: stamps are of the first packet whatever they claim, as those of uvcvideo.
-        spoil, shorten: numbers of frames that come flagged, or with half their bytes.
+        shortest_ns: shortest interval of frames, ns; long exposures lengthen it.
+        readout_ns: time from the end of an exposure to the end of the frame, ns.
+        lag: number of frames until a changed control takes effect.
+        stamp_source, clock_flag, stamp_offset_ns: claimed source and clock of the time stamps, and their
+            error.
+        stamps_packets: whether time stamps are those of the first packet, as with uvcvideo.
+        spoil, shorten: numbers of frames with an error flag, or with half their bytes.
         frozen: the sequence number stands still.
         belies_exposure: frames come at `shortest_ns` however long they should be exposed.
-        stopped: no more frames come.
-        absurd: stamps of single frames, by their numbers.
-        raw: what each frame holds instead of a pattern, and how many bytes of it are used.
-        held_ns: by how much frames come late.
-        draws: frames have a pattern, each another; else what lay there.
+        stopped: whether the camera has stopped sending frames.
+        absurd: wrong time stamps of single frames, by frame number.
+        raw: content of each frame instead of a pattern, and its number of used bytes.
+        held_ns: delay of the frames, ns.
+        draws: whether each frame has its own pattern; otherwise the buffer keeps its old content.
     """
 
     def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
@@ -89,13 +90,13 @@ class IoctlCamera:
         self.plug()
 
     def plug(self) -> None:
-        """Be there, just switched on."""
+        """Plug in and switch on the camera."""
         self.plugged = True
         self.path.symlink_to(f"/proc/self/fd/{self._memory}")
         self._forget()
 
     def unplug(self) -> None:
-        """Be gone: every call fails, and so does opening."""
+        """Unplug the camera: each call and each opening fails."""
         self.plugged = False
         self.path.unlink()
 
@@ -109,10 +110,10 @@ class IoctlCamera:
         self._streaming = False
         self._free: deque[int] = deque()
         self._filled: deque[v4l2.Buffer] = deque()
-        self._pending: list[tuple[int, int]] = []  # frames until it holds, exposure
+        self._pending: list[tuple[int, int]] = []  # delay (frames), exposure
 
     def __call__(self, _: int, request: int, argument: Any) -> int:
-        """Answer one ioctl as the kernel would; raises OSError as it would."""
+        """Answer one ioctl like the kernel. Raises OSError like the kernel."""
         if not self.plugged:
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
         answers: dict[int, Callable[[Any], None]] = {
@@ -151,7 +152,7 @@ class IoctlCamera:
 
     def _querycap(self, answer: v4l2.Capability) -> None:
         answer.driver, answer.card = self.driver, self.card
-        answer.capabilities = self.capabilities | 0x2 | v4l2.CAP_DEVICE_CAPS  # the whole device's: output too
+        answer.capabilities = self.capabilities | 0x2 | v4l2.CAP_DEVICE_CAPS  # output too
         answer.device_caps = self.capabilities
 
     def _enum_fmt(self, answer: v4l2.FormatDescription) -> None:
@@ -222,13 +223,13 @@ class IoctlCamera:
         knob = self.knobs[argument.id]
         _require(knob.minimum <= argument.value <= knob.maximum, errno.ERANGE)
         if argument.id == v4l2.EXPOSURE_ABSOLUTE:
-            # As UVC does: an automatic camera does not let its exposure be set.
+            # Like UVC, a camera with automatic exposure refuses a set exposure.
             _require(self.knobs[v4l2.EXPOSURE_AUTO].value == v4l2.EXPOSURE_MANUAL, errno.EACCES)
             self._pending.append((self.lag, argument.value))
         knob.value = argument.value
 
     def _run(self) -> None:
-        """Finish every frame whose end has come; without a free buffer a frame is lost."""
+        """Finish each frame whose end is due; without a free buffer a frame is lost."""
         while self._streaming and not self.stopped:
             exposure_ns = self._exposure * v4l2.EXPOSURE_UNIT_NS
             start_ns = self._next_ns

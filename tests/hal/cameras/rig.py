@@ -1,4 +1,4 @@
-"""Frame sources for tests, each on a clock that can be waited on."""
+"""Frame sources for tests, each with a clock that supports waiting."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SETTLED_NS = 400_000_000
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A frame source, its clock, and how it is unplugged, None where it cannot be."""
+    """A frame source, its clock, and the function that unplugs it, or None."""
 
     source: FrameSource
     clock: Clock
@@ -44,7 +44,7 @@ class Rig:
         self.clock.sleep_until_ns(self.clock.now_ns() + span_ns)
 
     def frame_within(self, span_ns: int) -> Frame | None:
-        """Return the first frame to come, None when none does."""
+        """Return the next frame, or None if none arrives."""
         deadline_ns = self.clock.now_ns() + span_ns
         while self.clock.now_ns() < deadline_ns:
             frame = self.source.poll()
@@ -63,7 +63,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class VideoRig:
-    """A V4L2 camera over the double."""
+    """A V4L2 camera that uses the test double of the kernel."""
 
     rig: Rig
     camera: ServedCamera
@@ -72,7 +72,7 @@ class VideoRig:
 
 
 class _World:
-    """Lets an emulated camera live along with a clock."""
+    """Runs an emulated camera with a clock."""
 
     def __init__(self, camera: EmulatedCamera) -> None:
         self._camera = camera
@@ -87,7 +87,7 @@ class _World:
 
 
 def emulated_rig() -> Rig:
-    """Return the simulated camera, its pictures flat."""
+    """Return the emulated camera with uniform images."""
     clock = ManualClock()
 
     def expose(sequence: int, _times: FloatArray, _attitudes: FloatArray, _tracks: object) -> Future[Image]:
@@ -106,7 +106,7 @@ def emulated_rig() -> Rig:
 
 
 def video_rig(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> VideoRig:
-    """Return the V4L2 driver over the double; `changes` are of its settings."""
+    """Return the V4L2 driver that uses the test double; `changes` are changed settings."""
     wanted: dict[str, object] = {
         "path": str(kernel.path),
         "columns": 64,
@@ -130,8 +130,8 @@ def settled(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> Video
 
 
 def require_aravis() -> None:
-    """Skip where Aravis cannot be reached from this Python."""
-    with warnings.catch_warnings(action="ignore"):  # what PyGObject's importer warns of is its own affair
+    """Skip the test if Aravis is not available in this Python."""
+    with warnings.catch_warnings(action="ignore"):  # warnings of PyGObject's importer are ignored
         try:
             aravis_camera.library("Fake_1")
         except Refused as error:
@@ -155,9 +155,9 @@ def aravis_rig(**changes: object) -> Rig:
 
 
 def kernel_in(folder: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
-    """Replace the kernel's V4L2 by a double."""
+    """Replace the kernel's V4L2 by a test double."""
     kernel = IoctlCamera(folder, clock.now_ns)
     monkeypatch.setattr("hal.drivers.v4l2_camera.ioctl", kernel)
-    # Whatever this machine's kernel says of a driver that the double is not.
+    # Text of the machine's kernel on a driver that is not the test double.
     monkeypatch.setattr("hal.drivers.v4l2_camera.UVC_STAMPS", folder / "hwtimestamps")
     return kernel

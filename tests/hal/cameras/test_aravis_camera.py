@@ -1,4 +1,4 @@
-"""The GenICam driver against Aravis' own Fake camera; what it says when Aravis is missing, without it."""
+"""Tests of the GenICam driver with Aravis' Fake camera, and of its message if Aravis is missing."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_camera_whose_control_is_lost_is_reported_and_opened_again() -> None:
 def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None:
     clock = SystemClock()
     deadline_ns = clock.now_ns() + 500 * MILLISECOND_NS
-    while clock.now_ns() < deadline_ns:  # the Fake runs free: frames do come
+    while clock.now_ns() < deadline_ns:  # the Fake camera runs freely, so frames arrive
         assert fake.collect() is None
         clock.sleep_until_ns(clock.now_ns() + 10 * MILLISECOND_NS)
     fake.expose(EXPOSURE_NS, clock.now_ns())
@@ -103,7 +103,7 @@ def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None
 
 def test_a_python_without_aravis_gets_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    monkeypatch.setitem(sys.modules, "gi", None)  # as where it is not installed
+    monkeypatch.setitem(sys.modules, "gi", None)  # as if Aravis were not installed
     camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), SystemClock())
     with pytest.raises(
         Refused, match=r"apt install gir1.2-aravis-0.8.*pip install 'knightcube-flight\[genicam\]'"

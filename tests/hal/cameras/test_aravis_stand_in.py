@@ -1,4 +1,4 @@
-"""The Aravis driver on a stand-in for the library: set-up, exposures and the frames that it accepts."""
+"""Tests of the Aravis driver with a test double of the library: set-up, exposures, accepted frames."""
 
 from __future__ import annotations
 

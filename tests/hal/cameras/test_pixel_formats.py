@@ -1,4 +1,4 @@
-"""Pixel formats as the kernel's documentation lays them out, byte by byte."""
+"""Tests of pixel formats against the byte layouts in the kernel's documentation."""
 
 from __future__ import annotations
 

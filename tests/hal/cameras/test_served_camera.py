@@ -1,4 +1,4 @@
-"""A camera served beside the control loop: the loop never waits for it, and its numbers only grow."""
+"""Tests of a camera served by a separate process: the loop never waits, and frame numbers increase."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WAIT_S = 5.0
 
 
 class SlowCamera:
-    """A camera whose every exposure hangs until it is let go."""
+    """A camera whose exposures hang until they are released."""
 
     def __init__(self) -> None:
         self.name = "slow"
@@ -50,7 +50,7 @@ def test_neither_trigger_nor_poll_waits_for_a_camera_that_hangs() -> None:
     camera = ServedCamera(device, clock)
     camera.trigger(1_000_000)
     assert device.begun.wait(WAIT_S)
-    # The job is inside the camera now: were a lock held meanwhile, these would stand still for good.
+    # The job is now inside the camera. If it held a lock, the following calls would block forever.
     camera.trigger(2_000_000)
     assert camera.poll() is None
     device.go.set()

@@ -1,4 +1,4 @@
-"""The kernel's structures have the kernel's sizes, and its requests the kernel's codes."""
+"""Tests that structures and request codes equal those of the kernel's videodev2.h."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flight.schema.reader import PIXEL_BITS
 from hal.drivers import v4l2_camera as v4l2
 from hal.drivers.pixel_formats import PIXEL_FORMATS, fourcc, fourcc_name
 
-# Of linux/videodev2.h on x86-64.
+# Values of linux/videodev2.h on x86-64.
 CODES = {
     "QUERYCAP": 0x80685600,
     "ENUM_FMT": 0xC0405602,

@@ -1,1 +1,1 @@
-"""The I2C bus and all that hangs on it: coils, PWM chip, current monitor."""
+"""Tests of the I2C bus and its devices: coils, PWM chip and current monitor."""

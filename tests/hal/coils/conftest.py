@@ -1,4 +1,4 @@
-"""The same rig on both buses: the emulated one in memory, and smbus2 over replaced ioctls."""
+"""Fixtures of one rig on two buses: the emulated bus in memory, and smbus2 with replaced ioctls."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.manual_clock import ManualClock
 
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> IoctlWire:
-    """Replace the kernel's I2C by an emulated bus; any file that opens is then an adapter."""
+    """Replace the kernel's I2C by an emulated bus. Each file that opens is then an adapter."""
     wire = Wire(ManualClock(), THESIS, uncertainty=0.0)
     return _replace_ioctl(monkeypatch, wire)
 

@@ -1,4 +1,4 @@
-"""The kernel's side of /dev/i2c-N, replaced: the ioctls that smbus2 makes, answered by an emulated bus."""
+"""Replacement of the kernel's /dev/i2c-N: an emulated bus answers the ioctls of smbus2."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class IoctlWire:
 
     Attributes:
         wire: the emulated bus that answers.
-        settings: (request, value) of every time-out and retry setting made, in order.
+        settings: requests and values of all timeout and retry settings, in order.
         functions: the adapter's functionality mask.
-        slave_error: errno that choosing an address raises, 0 for none.
+        slave_error: errno raised by selecting an address, or 0.
     """
 
     def __init__(self, wire: EmulatedI2cBus) -> None:

@@ -1,4 +1,4 @@
-"""The coils' whole chain on one emulated bus: driver, PWM chip, bridges, coils, current monitor."""
+"""The complete coil chain on one emulated bus: driver, PWM chip, bridges, coils and current monitor."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ UNEQUAL = dataclasses.replace(
 
 
 class Wire:
-    """What hangs on the bus, and the bus itself as the parts' side sees it."""
+    """The devices on the bus, and the emulated bus."""
 
     def __init__(self, clock: Clock, settings: CoilSettings, uncertainty: float, seed: int = 1) -> None:
         self.chip = EmulatedPca9685(PCA, clock.now_ns)
@@ -45,7 +45,10 @@ class Wire:
 
 
 class Rig:
-    """Driver and wire on a manual clock, the coils started; `bus` takes the place of the emulated bus."""
+    """Coil driver and bus on a manual clock, with started coils.
+
+    `bus` replaces the emulated bus.
+    """
 
     def __init__(
         self,
@@ -64,11 +67,11 @@ class Rig:
 
     @property
     def duties(self) -> list[float]:
-        """The duty of every channel of the chip."""
+        """The duty cycle of each channel of the chip."""
         return [self.wire.chip.duty(channel) for channel in range(16)]
 
     def currents(self) -> list[float]:
-        """Return what the coils carry, A."""
+        """Return the coil currents, A."""
         return [float(current) for current in self.wire.circuit.currents()]
 
     def command(self, *currents: float) -> None:
@@ -77,5 +80,5 @@ class Rig:
 
 
 def limited_to(current_limit: float, settings: CoilSettings = UNEQUAL) -> CoilSettings:
-    """Return settings with another current limit."""
+    """Return settings with the given current limit."""
     return dataclasses.replace(settings, current_limit=current_limit)

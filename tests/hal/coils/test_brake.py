@@ -1,4 +1,4 @@
-"""A bridge with a leg stuck high: what it does to its coil, and what holds the coil at zero all the same."""
+"""Tests of a bridge with a leg stuck high: the coil's current, and the commands that keep it at zero."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def stuck(condition: CoilCondition = CoilCondition.A_HIGH) -> Rig:
 def test_a_leg_stuck_high_drives_its_coil_at_zero_and_a_brake_ends_it(
     condition: CoilCondition, sign: float
 ) -> None:
-    """Which leg it is need not be known: both inputs are high."""
+    """The brake sets both inputs high, so that the stuck leg need not be known."""
     rig = stuck(condition)
     rig.command(0.0, 0.0, 0.0)
     assert rig.currents() == pytest.approx([0.0, sign * FULL, 0.0])
@@ -50,7 +50,7 @@ def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig
 
 
 def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
-    """Why no bridge is braked on a guess alone: the current is looked at, and the brake taken back."""
+    """A bridge is not braked on suspicion alone: the current is checked, and the brake is released."""
     rig = stuck(CoilCondition.A_LOW)
     assert rig.currents() == [0.0, 0.0, 0.0]
     rig.coils.brake(Y)
@@ -86,7 +86,7 @@ def test_close_leaves_a_stuck_leg_braked() -> None:
 
 
 def test_a_brown_out_lifts_a_brake_for_half_a_second_at_most() -> None:
-    """The chip forgets, so the leg drives its coil until the set-up is looked at again."""
+    """The chip loses its registers, so that the leg drives its coil until the next check of the set-up."""
     rig = stuck()
     rig.coils.brake(Y)
     rig.wire.chip.brown_out()

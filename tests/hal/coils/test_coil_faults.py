@@ -1,4 +1,4 @@
-"""The torque coils on a bus and a chip that fail: tried again, counted, at zero when in doubt."""
+"""Tests of the torque coils with a failing bus and chip: retries, counters, and zero current in doubt."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def test_a_passing_fault_is_retried_and_counted(rig: Rig, fault: str) -> None:
 
 
 def test_a_write_that_fails_for_good_ends_at_zero_and_says_why(rig: Rig) -> None:
-    """Three tries cut off after ten bytes: coil x has its new value, coil y none; then zero gets through."""
+    """Three attempts are cut after ten bytes: coil x has its new value and coil y does not.
+
+    Then zero is written.
+    """
     rig.coils.start()
     rig.command(0.1, 0.1, 0.1)
     rig.wire.bus.nack(PCA, times=3, after=10)
@@ -60,7 +63,7 @@ def test_a_dead_chip_keeps_its_error_until_it_is_back_and_then_obeys(rig: Rig) -
 
 
 def test_a_dead_chip_is_asked_once_a_period_and_with_zero(rig: Rig) -> None:
-    """On a hung bus each question costs a time-out: the job must not spend its time on many."""
+    """On a hung bus each transaction takes a timeout, so that the job must make few transactions."""
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)
     rig.wire.bus.nack(PCA, times=None)
@@ -81,7 +84,7 @@ def test_a_job_that_is_late_for_close_writes_nothing(rig: Rig) -> None:
 
 @pytest.mark.parametrize("action", ["off", "close"])
 def test_zero_asked_for_just_before_a_write_is_not_undone_by_it(action: str) -> None:
-    """As a signal handler does it, in the middle of the thread that writes."""
+    """The call comes as from a signal handler that interrupts the writing thread."""
 
     class Interrupted(EmulatedI2cBus):
         signal: Callable[[], None] | None = None
@@ -146,7 +149,7 @@ def test_a_brown_out_is_mended_within_a_second_and_counted(rig: Rig) -> None:
 
 
 def test_bits_flipped_in_a_zero_do_not_outlast_one_period(rig: Rig) -> None:
-    """I2C has no checksum: full OFF of coil x's input A arrives as a duty of a half."""
+    """I2C has no checksum: the full-OFF value of coil x's input A is changed into a duty cycle of a half."""
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)
     rig.wire.bus.flip_bits(PCA, index=3, mask=0x18)

@@ -1,4 +1,4 @@
-"""The torque coils, from the driver to the current in the wire: right when all is well, zero on any doubt."""
+"""Tests of the torque coils from driver to current: correct values, and zero in case of doubt."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ USUAL = st.floats(-0.25, 0.25)
 def test_the_world_feels_what_was_commanded_within_half_a_count(
     command: tuple[float, float, float], limit: float
 ) -> None:
-    """Coils of unequal resistance, one of them wired backwards."""
+    """Coils of unequal resistance; one coil is connected with reversed polarity."""
     rig = Rig(limited_to(limit))
     rig.coils.start()
     rig.command(*command)
@@ -52,7 +52,7 @@ def test_the_world_feels_what_was_commanded_within_half_a_count(
 
 
 def test_six_coils_carry_their_own_currents_through_the_chip_and_brake_alone() -> None:
-    """The fifth coil is wired backwards and the sixth uses channels of its own."""
+    """The fifth coil has reversed polarity and the sixth has its own channels."""
     coils = [CoilWiring(2 * k, 2 * k + 1, 20.0 + k, sign=-1 if k == 4 else 1) for k in range(5)]
     rig = Rig(replace(THESIS, coils=(*coils, CoilWiring(15, 12, 30.0))))
     rig.coils.start()
@@ -94,7 +94,7 @@ def test_both_inputs_are_low_at_zero_and_the_idle_one_otherwise(rig: Rig) -> Non
 
 
 def test_start_leaves_a_running_chip_at_zero(rig: Rig) -> None:
-    """A process that died left its coils driven."""
+    """A process has died while its coils were driven."""
     rig.pca.configure()
     rig.pca.write_channels(0, [(0, 3000), (0, 4096)])
     assert rig.currents()[0] != 0.0

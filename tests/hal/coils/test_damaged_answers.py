@@ -1,4 +1,4 @@
-"""I2C parts that answer anything or nothing; GPS fixes of wrong content whose checksum is right."""
+"""Tests with GPS fixes that have wrong contents and valid checksums."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.damaged import Files, assert_one_line, chances, offer
 
 
 class Nonsense:
-    """A bus whose parts keep some of the written bytes, answer anything else, or fail."""
+    """A bus whose devices keep some of the written bytes, answer with random data, or fail."""
 
     def __init__(self, chance: Random) -> None:
         self._chance = chance

@@ -1,4 +1,4 @@
-"""DRV8830 bridges: the mean current, brakes, brown-outs, and the writes that stop them."""
+"""Tests of DRV8830 bridges: mean current, brakes, brown-outs, and the writes that stop them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Current to PWM counts: Table 5.2, limits, resolution."""
+"""Tests of the conversion from current to PWM counts: Table 5.2, limits and resolution."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_no_counts_are_ever_equal_and_both_inputs_are_never_driven_at_once() -> 
 
 
 def test_full_drive_is_the_thesis_maximum_current() -> None:
-    """3.4 V over 23 ohm is 0.1478 A, the thesis's 0.148 A (ch. 5)."""
+    """3.4 V across 23 ohm give 0.1478 A; the thesis states 0.148 A (ch. 5)."""
     assert largest_counts(STEP, 0.148) == 4096
     assert mean_current(4096, STEP) == pytest.approx(3.4 / 23.0, rel=1e-15)
 

@@ -1,4 +1,4 @@
-"""smbus2, unchanged, makes every transfer on the emulated bus through an adapter's ioctls."""
+"""Tests that unchanged smbus2 makes each kind of transfer on the emulated bus through ioctls."""
 
 from __future__ import annotations
 

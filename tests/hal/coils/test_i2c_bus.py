@@ -85,7 +85,7 @@ def test_a_time_out_of_nothing_is_refused(kernel: IoctlWire) -> None:
 
 
 def test_the_descriptor_is_reopened_after_the_line_failed_but_not_after_a_nack(kernel: IoctlWire) -> None:
-    """Each opening shows as one setting of the time-out."""
+    """Each opening is counted by its setting of the timeout."""
     bus = LinuxI2cBus("/dev/null")
     with pytest.raises(OSError, match="no acknowledge"):
         bus.read_byte_data(0x22, 0x00)
@@ -103,7 +103,7 @@ def test_no_descriptor_leaks_when_opening_fails() -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(5):
         with pytest.raises(NotResponding, match="not a usable I2C bus"):
-            LinuxI2cBus("/dev/null")  # the real kernel: no I2C adapter
+            LinuxI2cBus("/dev/null")  # the real kernel reports that the file is not an I2C adapter
     assert len(os.listdir("/proc/self/fd")) == before
 
 
@@ -134,7 +134,7 @@ def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path
 def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_else(
     kernel: IoctlWire, tmp_path: Path
 ) -> None:
-    """The guardian's and a check's openings are not exclusive: they are never kept out."""
+    """Guardian and `check` open the bus without exclusive access, so that they are never refused."""
     node = tmp_path / "i2c"
     node.touch()
     first = LinuxI2cBus(str(node), exclusive=True)
@@ -165,7 +165,7 @@ def test_adapters_are_read_from_sysfs(tmp_path: Path) -> None:
 
 
 def test_a_transaction_that_never_ends_does_not_hold_the_others_for_ever(kernel: IoctlWire) -> None:
-    """An adapter ignores its time-out: the next caller still gets an error, and the bus can be closed."""
+    """If an adapter ignores its timeout, the next caller gets an error, and the bus can be closed."""
     entered, leave = threading.Event(), threading.Event()
 
     class Stuck(IoctlWire):

@@ -1,4 +1,4 @@
-"""On the real clock, with the job on its own thread: commands never wait for the bus, zero always comes."""
+"""Tests in real time with the job on its own thread: commands never wait for the bus, and zero arrives."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_command_reaches_the_coils_and_falls_to_zero_when_no_other_comes() -> 
 
 
 def test_a_command_does_not_wait_for_a_hung_bus() -> None:
-    """Each transaction hangs for 0.5 s; 20 commands take less than one of them."""
+    """Each transaction hangs for 0.5 s; 20 commands take less time than one transaction."""
     coils, wire = started()
     release = threading.Event()
 

@@ -1,4 +1,4 @@
-"""A GPS receiver in orbit on a serial line in memory, and the driver on its other end."""
+"""An emulated GPS receiver in orbit and its driver, joined by a serial line in memory."""
 
 from __future__ import annotations
 

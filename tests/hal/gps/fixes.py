@@ -1,4 +1,4 @@
-"""Position fixes that several tests of the GPS receiver share."""
+"""Position fixes for several tests of the GPS receiver."""
 
 from __future__ import annotations
 

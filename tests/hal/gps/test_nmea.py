@@ -1,4 +1,4 @@
-"""The driver of NMEA receivers: sentences of a real receiver, damaged ones, and the emulated receiver's."""
+"""Tests of the NMEA driver with sentences of a real receiver, damaged sentences, and the emulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The GPS receiver in orbit: driver, emulator and line, and another author's client on a pseudo-terminal."""
+"""Tests of the GPS receiver in orbit with driver, emulator and line, and of an independent client."""
 
 from __future__ import annotations
 
@@ -25,14 +25,17 @@ from tests.hal.gps.fixes import PVT
 
 
 def test_a_fix_is_where_the_satellite_was_at_the_epoch() -> None:
-    """To the centimetres of the protocol's 1e-7 deg; flight carries the fix on to any other time."""
+    """Positions agree to centimetres, the resolution of the protocol.
+
+    The flight software propagates fixes.
+    """
     gps = bench()
     reading = [reading for reading in gps.fly(12.0) if reading.valid][-1]
     fix = GpsFix(UNIX_EPOCH + reading.utc_ns * 1e-9 / DAY, reading.position, reading.velocity)
     gps.body.advance_to(gps.clock.now_ns())
     around = gps.body.surroundings()
     state = fix.at(UNIX_EPOCH + gps.body.utc_ns() * 1e-9 / DAY)
-    # A Julian date resolves 40 us, 0.3 m along the orbit.
+    # The resolution of a Julian date is 40 us, or 0.3 m along the orbit.
     np.testing.assert_allclose(state.position, around.position, atol=1.0)
     np.testing.assert_allclose(state.velocity, around.velocity, atol=5e-3)
     assert reading.utc_ns % SECOND_NS == 0

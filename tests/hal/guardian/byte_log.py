@@ -1,6 +1,7 @@
 """A bus that logs the bytes written to it, opened by a guardian as `tests.hal.guardian.byte_log:open_bus`.
 
-Light, for the guardian must stay so. While FILE.broken exists the bus fails as a silent part does.
+The module has few imports, because the guardian must stay small. While FILE.broken exists, the bus fails like
+a silent device.
 """
 
 from __future__ import annotations

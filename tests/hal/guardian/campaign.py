@@ -1,4 +1,4 @@
-"""One flight that is hurt in every way in turn: how long the coils carried current after each act."""
+"""Stops, hangs and kills one flight process in several ways, and measures how long current still flows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _CALM_S = 1.2
 
 @dataclass(frozen=True)
 class Hurt:
-    """One act. Times in s, the current in A; `recovered` counts from the act's end, None after a death."""
+    """One act.
+
+    Times are in s and the current in A; `recovered` counts from the end of the act; None if the process died.
+    """
 
     act: str
     current: float
@@ -27,7 +30,7 @@ class Hurt:
 
 @dataclass(frozen=True)
 class Campaign:
-    """All acts, the flight's truth and events, and the guardians that were on watch in turn."""
+    """All acts, the truth and events of the run, and the successive guardians."""
 
     hurts: list[Hurt]
     truth: CoilTruth
@@ -37,7 +40,10 @@ class Campaign:
 
 
 def hurt_in_every_way(folder: Path) -> Campaign:
-    """Stop, hang (two ways) and let go; kill and stop the guardian; kill the flight. About ten seconds."""
+    """Stop and hang the flight process (two ways), kill and stop the guardian, and kill the flight process.
+
+    About ten seconds.
+    """
     times: list[tuple[str, int, int | None]] = []
     guardians: list[int] = []
     lost_ns: list[int] = []
@@ -54,7 +60,7 @@ def hurt_in_every_way(folder: Path) -> Campaign:
             time.sleep(HANG_S + _CALM_S)
             times.append((name, begin_ns, begin_ns + round(HANG_S * 1e9)))
         flight.wait_until_driven()
-        # What the guardian is for: without it the devices go on driving the coil.
+        # Without a guardian, the devices continue to drive the coil.
         os.kill(flight.guardian(), signal.SIGSTOP)
         begin_ns = flight.do(signal.SIGSTOP)
         time.sleep(STOPPED_S)
@@ -86,7 +92,7 @@ def _measured(truth: CoilTruth, name: str, begin_ns: int, end_ns: int | None) ->
 
 
 def _end_devices(children: list[int]) -> None:
-    """End the emulated devices, which would wait for another flight, and wait until their log is whole."""
+    """End the emulated devices, and wait until their log is complete."""
     for child in children:
         command = Path(f"/proc/{child}/cmdline")
         if command.exists() and b"sim_hal" in command.read_bytes():

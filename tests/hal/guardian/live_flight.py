@@ -1,4 +1,4 @@
-"""A flight in real time on emulated devices in a process of their own: to be stopped, hung and killed.
+"""A real-time flight process with emulated devices, which tests stop, hang and kill.
 
 The truth log of the devices has the coils' currents; the service manager's end of the notification
 socket shows when the flight was ready.
@@ -29,7 +29,7 @@ HANG_S = 1.0
 DRIVEN_A = 1e-3
 
 SLEEPS, SPINS = signal.SIGUSR1, signal.SIGUSR2
-"""Signals that hang the control thread: other threads go on; or none does, the interpreter being held."""
+"""Signals that hang the control thread alone, or all threads by holding the interpreter's lock."""
 
 FLIGHT = f"""
 import ctypes, os, signal, time
@@ -43,7 +43,7 @@ _MAIN = "raise SystemExit(main())"
 
 
 def write_config(folder: Path) -> Path:
-    """Write the step demonstration without its camera: quick to start, the coils in use all the time."""
+    """Write the step demonstration without camera, which starts fast and drives the coils all the time."""
     text = CONFIG.read_text(encoding="utf-8")
     before, _, rest = text.partition("\ncamera:")
     path = folder / "flight.yaml"
@@ -54,7 +54,7 @@ def write_config(folder: Path) -> Path:
 
 
 class LiveFlight:
-    """One running flight process and what hangs on it."""
+    """One running flight process with its devices and sockets."""
 
     def __init__(
         self,
@@ -89,7 +89,7 @@ class LiveFlight:
         )
 
     def wait_for(self, word: str, patience: float = 30.0) -> int:
-        """Wait until the service manager receives `word`; return the monotonic time in ns."""
+        """Wait until the service manager receives `word`, and return the monotonic time, ns."""
         deadline = time.monotonic() + patience
         while (left := deadline - time.monotonic()) > 0.0 and self.process.poll() is None:
             if select.select([self._notifications], [], [], min(left, 0.2))[0]:
@@ -99,7 +99,7 @@ class LiveFlight:
         raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
 
     def wait_until_driven(self, patience: float = 30.0) -> None:
-        """Wait until the truth ends with a quarter of a second of current, however busy the machine."""
+        """Wait until the truth ends with a quarter of a second of coil current, without a timeout."""
         deadline = time.monotonic() + patience
         begun = 0
         while time.monotonic() < deadline:
@@ -112,7 +112,7 @@ class LiveFlight:
         raise AssertionError(f"the coil was not driven within {patience:g} s: {self.end()}")
 
     def do(self, number: signal.Signals) -> int:
-        """Send the flight process a signal; return when, in monotonic ns."""
+        """Send a signal to the flight process, and return its monotonic time, ns."""
         self.process.send_signal(number)
         return time.monotonic_ns()
 
@@ -124,12 +124,12 @@ class LiveFlight:
         raise AssertionError("no guardian is on watch")
 
     def children(self) -> list[int]:
-        """Return the living children of the flight process."""
+        """Return the running child processes of the flight process."""
         tasks = Path(f"/proc/{self.process.pid}/task").glob("*/children")
         return [int(child) for task in tasks for child in task.read_text().split()]
 
     def end(self) -> str:
-        """Stop the flight by SIGTERM; return what it wrote on standard error."""
+        """Stop the flight process by SIGTERM, and return its standard error."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
             self.process.terminate()
@@ -142,7 +142,7 @@ class LiveFlight:
 
 @contextmanager
 def devices_running(folder: Path) -> Iterator[Path]:
-    """Serve the emulated devices as a board has its own: there before the flight; their truth in `folder`."""
+    """Serve emulated devices that exist before the flight process, with their truth in `folder`."""
     facts = folder / "facts.json"
     words = [sys.executable, "-m", "sim_hal", "serve", str(write_config(folder))]
     words += ["--folder", str(folder), "--facts", str(facts)]
@@ -176,7 +176,7 @@ class CoilTruth:
             path.rename(folder / path.name)
         self.run: Run = read_run(folder)
         start = self.run["run"][0]
-        # Both clocks now: the run's label gives mission time zero in UTC only.
+        # Both clocks are read at the same time, because the run states mission time zero in UTC only.
         epoch_ns = int(start["utc_ns"]) - (time.time_ns() - time.monotonic_ns())
         truth = self.run["truth"]
         self.time_ns: npt.NDArray[np.int64] = truth["time_ns"].astype(np.int64) + epoch_ns
@@ -184,15 +184,15 @@ class CoilTruth:
         self.epoch_ns = epoch_ns
 
     def before(self, act_ns: int) -> float:
-        """Return the largest current in A shortly before an act came.
+        """Return the largest current, A, shortly before an act.
 
-        A flight takes it off for a cycle or two when a reading is late, as on a machine that is busy.
+        On a busy machine, the flight switches the current off for a cycle or two if a reading is late.
         """
         shortly = (self.time_ns > act_ns - 250_000_000) & (self.time_ns <= act_ns)
         return float(np.abs(self.current[shortly]).max(initial=0.0))
 
     def zero_after(self, act_ns: int, until_ns: int) -> float:
-        """Return how long after an act, in s, the coil was at zero and stayed there until `until_ns`."""
+        """Return the time, s, from an act until the current was zero and stayed zero until `until_ns`."""
         inside = (self.time_ns >= act_ns) & (self.time_ns <= until_ns)
         driven = np.flatnonzero(inside & (self.current != 0.0))
         first = int(driven[-1]) + 1 if len(driven) else int(np.flatnonzero(inside)[0])
@@ -201,7 +201,7 @@ class CoilTruth:
         return float(self.time_ns[first] - act_ns) * 1e-9
 
     def driven_after(self, act_ns: int) -> float:
-        """Return how long after an act, in s, a coil was first driven."""
+        """Return the time, s, from an act until a coil was driven."""
         any_current = np.any(self.run["truth"]["current"] != 0.0, axis=1)
         driven = np.flatnonzero((self.time_ns >= act_ns) & any_current)
         return float(self.time_ns[driven[0]] - act_ns) * 1e-9 if len(driven) else float("inf")

@@ -1,4 +1,4 @@
-"""What state a process is in, and waiting for it without a limit that a busy machine would miss."""
+"""Reads the state of a process, and waits for it without a timeout that a busy machine would exceed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def state(process: int) -> str:
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds. Raises AssertionError where it does not come."""
+    """Wait until a condition holds. Raises AssertionError if the condition is not met."""
     deadline = time.monotonic() + _PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, "it did not come"

@@ -1,4 +1,4 @@
-"""However the flight process ends, the coils are at zero within half a second."""
+"""Tests that the coils are at zero within half a second of any end of the flight process."""
 
 from __future__ import annotations
 

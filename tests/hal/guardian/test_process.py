@@ -1,4 +1,4 @@
-"""The guardian as a process: its writes to the bus, its reports, its memory."""
+"""Tests of the guardian process: its writes to the bus, its reports, and its memory."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def guardian(log: Path) -> Iterator[GuardianLine]:
 
 
 def zeros(log: Path) -> list[int]:
-    """Return when zero was said, in monotonic ns."""
+    """Return the monotonic time, ns, at which zero was commanded."""
     lines = [line.split() for line in log.read_text(encoding="ascii").splitlines()]
     assert all(line[1:] == [str(ADDRESS), str(ALL_LED_OFF_H), str(FULL)] for line in lines)
     return [int(line[0]) for line in lines]
 
 
 def beat_for(guardian: GuardianLine, seconds: float) -> int:
-    """Beat at 40 Hz; return when the last beat was."""
+    """Send heartbeats at 40 Hz, and return the time of the last one."""
     end_ns = time.monotonic_ns() + round(seconds * 1e9)
     while time.monotonic_ns() < end_ns:
         guardian.beat()
@@ -54,7 +54,7 @@ def beat_for(guardian: GuardianLine, seconds: float) -> int:
 
 
 def news_until(guardian: GuardianLine, wanted: GuardianNews, patience: float = 10.0) -> list[GuardianNews]:
-    """Return the news up to the wanted one."""
+    """Return the reports up to the given one."""
     news: list[GuardianNews] = []
     deadline = time.monotonic() + patience
     while wanted not in news:
@@ -135,7 +135,7 @@ def test_a_killed_guardian_is_replaced_and_reported(guardian: GuardianLine) -> N
 def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
     guardian: GuardianLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No descriptor is left for its line: whoever tends it goes on."""
+    """If no file descriptor is free for the guardian's line, its supervisor continues."""
 
     def no_line(*_: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))

@@ -1,4 +1,4 @@
-"""Real-time privileges: asked for, and reported as they were obtained."""
+"""Tests that real-time privileges are requested, and reported as obtained."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_kernel_reports_locked_memory_or_the_refusal_is_explained() -> None:
-    """Locking on fault leaves untouched address space out: a gigabyte that is only reserved costs nothing."""
+    """With locking on page fault, reserved address space that is not used takes no memory."""
     script = (
         "import mmap; from hal.buses import linux_process\n"
         "said = linux_process.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"

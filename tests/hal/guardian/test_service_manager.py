@@ -1,4 +1,4 @@
-"""sd_notify(3): what goes over the socket, and that nothing can hold a flight up."""
+"""Tests of sd_notify(3) messages, which must never block a flight process."""
 
 from __future__ import annotations
 

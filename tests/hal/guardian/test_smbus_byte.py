@@ -1,4 +1,4 @@
-"""One byte over the kernel's SMBus call, against smbus2's own layout of it."""
+"""Tests of the transfer of a byte by the kernel's SMBus call against the layout of smbus2."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.buses import smbus_byte
 
 
 class Kernel:
-    """Takes the place of ioctl(2): notes each call, and what the pointer in it points at."""
+    """Replacement of ioctl(2) that records each call and the data that its pointer refers to."""
 
     def __init__(self, failing: int = 0) -> None:
         self.calls: list[tuple[int, object]] = []

@@ -1,4 +1,4 @@
-"""When zero is said, on a clock that is moved by hand."""
+"""Tests of the times at which the guardian commands zero, on a manual clock."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The VN-100 end to end: bytes, driver, emulator, line."""
+"""Tests of the VN-100: bytes, driver, emulator and serial line."""

@@ -1,4 +1,4 @@
-"""A driver and an emulated unit on one line in simulated time."""
+"""A driver and an emulated VN-100 on one serial line in simulated time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def at_rest(time_ns: int) -> BodyMotion:
 
 
 def turning(time_ns: int) -> BodyMotion:
-    """Turn through q2 = 0 at 0.1 rad/s."""
+    """Rotate through q2 = 0 at 0.1 rad/s."""
     return about_thread(time_ns, 0.1 * (time_ns * 1e-9 - 2.0), 0.1, 4.5e-4)
 
 

@@ -1,4 +1,4 @@
-"""An emulated VN-100 that several tests question."""
+"""An emulated VN-100 for several tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim_hal.worlds.world import about_thread
 
 
 class Bench:
-    """A unit on a line, and a host that only looks at bytes."""
+    """An emulated VN-100 on a serial line, and a host that reads bytes."""
 
     def __init__(self, unit: Vn100EmulatorSettings | None = None) -> None:
         rng = np.random.default_rng(2)
@@ -27,7 +27,7 @@ class Bench:
         self.parser = StreamParser()
 
     def run(self, seconds: float) -> list[BinaryPacket | AsciiLine]:
-        """Return all that the unit says meanwhile."""
+        """Return all bytes that the VN-100 sends in a time."""
         self.now_ns += round(seconds * 1e9)
         self.unit.advance(self.now_ns)
         return [item for at, data in self.line.host.receive() for item in self.parser.feed(at, data)]

@@ -1,4 +1,4 @@
-"""Packets, sentences, checksums: against VectorNav's own."""
+"""Tests of packets, sentences and checksums against VectorNav's examples."""
 
 from __future__ import annotations
 
@@ -173,20 +173,20 @@ def test_error_answers_are_read_as_hexadecimal() -> None:
 
 @pytest.mark.parametrize("line", AT_REST)
 def test_the_units_quaternion_is_ours_from_ned_to_body(line: bytes) -> None:
-    """Two real units at rest, tilted by 2 and 1 degrees: turned into NED, their specific force is 1 g up."""
+    """For two real VN-100s at rest, tilted by 2 and 1 deg, the specific force in NED axes is 1 g upwards."""
     (item,) = StreamParser().feed(0, line)
     assert isinstance(item, AsciiLine)
     fields = [float(text) for text in item.sentence.fields if text[0] in "+-"]
     matrix, accel = attitude_matrix(np.array(fields[:4])), np.array(fields[7:10])
     force = matrix.T @ accel
     assert force == pytest.approx([0.0, 0.0, -9.8], abs=0.13)
-    # Level to 0.03 m/s^2, where the inverse rotation would leave the tilt twice over.
+    # The result is level to 0.03 m/s^2; the inverse rotation would double the tilt.
     assert np.hypot(*force[:2]) < 0.03
     assert np.hypot(*(matrix @ accel)[:2]) > 0.15
 
 
 def test_the_testbeds_constant_rotation_is_that_of_its_definition() -> None:
-    """Its y is down, the field along its -z, north the direction of the field."""
+    """Sensor y points down, and the field, which defines north, is along sensor -z."""
     matrix = attitude_matrix(NED_TO_TESTBED)
     assert matrix == pytest.approx(np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]]), abs=1e-15)
     north, east, down = np.eye(3)

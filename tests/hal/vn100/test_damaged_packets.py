@@ -1,4 +1,4 @@
-"""VN-100 packets with impossible values or damage, in pieces of any size, through parser and driver."""
+"""Tests of parser and driver with damaged VN-100 packets and impossible values, in random portions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ScriptedPort:
 
 
 def impossible(chance: Random) -> bytes:
-    """Return a packet with an impossible number and a right checksum."""
+    """Return a packet with an impossible number and a correct checksum."""
     body = bytearray(GOOD[1:-2])
     start = chance.randrange(8, len(body) - 4)
     body[start : start + 4] = chance.choice(IMPOSSIBLE)

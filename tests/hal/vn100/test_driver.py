@@ -1,4 +1,4 @@
-"""The driver against the emulated unit, in simulated time."""
+"""Tests of the driver with the emulated VN-100 in simulated time."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_ascii_output_gives_the_same_without_device_time() -> None:
 
 
 def test_the_unit_may_be_found_in_any_state() -> None:
-    """Other outputs running, and half a command in its buffer from a host that died."""
+    """The VN-100 sends other outputs, and half a command of a dead host is in its buffer."""
     bench = bench_line()
     bench.line.host.send(b"\r\n" + build("WRG", 76, 1, 40, "01", "0729"))
     bench.clock.sleep_until_ns(100_000_000)
@@ -178,7 +178,7 @@ def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
     readings = bench.run(1.0)
     assert bench.unit.registers.read(6) == ("14",)
     assert len(readings) > 45
-    # Packets wait behind the VNYMR lines: here the sample's time is the unit's own.
+    # Packets are delayed by VNYMR lines, so the time of the sample is compared with the device clock.
     sampled_ns = readings[-1].device_time_ns - QUIET.uptime_ns
     assert readings[-1].quaternion == pytest.approx(turning(sampled_ns).quaternion, abs=2 * FLOAT32)
 
@@ -284,7 +284,7 @@ def test_faults_on_the_wire_cost_readings_but_never_falsify_one(
     bench.line.to_host.faults = faults
     readings = bench.run(2.0)
     after = bench.driver.link()
-    # At most one packet was under way when the fault set in.
+    # At most one packet was in transmission when the fault began.
     assert least <= len(readings) <= most + 1
     for reading in readings:
         truth = turning(reading.time_ns - faults.delay_ns)
@@ -316,7 +316,7 @@ def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
     silent = Vn100(bench.line.host, bench.clock, replace(MISSION, configure=False))
     bench = replace(bench, driver=silent)
     bench.line.host.send(build("RST"))
-    assert len(bench.run(3.0)) <= 1  # it boots, then sends VNYMR lines, which are not readings
+    assert len(bench.run(3.0)) <= 1  # the VN-100 boots and then sends VNYMR lines, which are not readings
     assert silent.link().last_byte_ns > bench.clock.now_ns() - 50_000_000
     silent_to_unit = bench.unit.registers.read(6)
     assert silent_to_unit == ("14",)

@@ -1,4 +1,4 @@
-"""A unit that sends what nobody asked for is asked and set right at its baud rate, on the wire."""
+"""Tests that a VN-100 with unexpected output is detected and configured at its baud rate."""
 
 from __future__ import annotations
 

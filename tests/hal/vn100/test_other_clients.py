@@ -1,4 +1,4 @@
-"""Clients of other people, unchanged, speak to the emulated unit over its pseudo-terminal."""
+"""Tests that unchanged independent clients work with the emulated VN-100 over a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ vectornav = pytest.importorskip("vectornav", reason="vectornav-vn200, another's 
 
 @pytest.fixture
 def client() -> Iterator[Any]:
-    """Yield a polling client of VectorNav units, connected to a unit that stands still."""
+    """Yield a polling VectorNav client that is connected to a VN-100 at rest."""
     process = subprocess.Popen(
         [sys.executable, "-m", "sim_hal", "emulate", "vn100", "--rate-deg-s", "0", "--json"],
         stdout=subprocess.PIPE,

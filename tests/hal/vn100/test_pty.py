@@ -1,4 +1,4 @@
-"""The emulator on a pseudo-terminal, spoken to through real pyserial."""
+"""Tests of the emulator on a pseudo-terminal with pyserial."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.
     slope = np.polyfit(times * 1e-9, angles, 1)[0]
     # 60 angles with an error of 2 mrad over 1.5 s give the rate to 0.6 mrad/s.
     assert slope == pytest.approx(np.radians(3.0), abs=3e-3)
-    assert driver.link().discarded_bytes < 200  # what was half across when the port was opened
+    assert driver.link().discarded_bytes < 200  # message that was partly sent when the port was opened
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=5) == 0
 
@@ -200,14 +200,14 @@ def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_r
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
     assert port._write_timeout < 1.0 / CONTROL_RATE_HZ
     with pytest.raises(NotResponding, match="the output queue is full"):
-        port.send(bytes(1 << 20))  # nobody reads the other end
+        port.send(bytes(1 << 20))  # no process reads the other end
     os.close(near)
     port.close()
     os.close(far)
 
 
 class InterruptedClock(SystemClock):
-    """A clock of a thread that is interrupted for a second between any two readings of the time."""
+    """A clock that advances by a second at each reading, like that of an interrupted thread."""
 
     def __init__(self) -> None:
         super().__init__()

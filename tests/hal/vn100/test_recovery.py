@@ -1,4 +1,4 @@
-"""A unit lost in flight is found and set up again within two seconds, and no poll ever waits."""
+"""Tests that a lost VN-100 is found and configured again within two seconds, without blocking polls."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def bench() -> BenchLine:
 
 
 def poll(bench: BenchLine) -> list[ImuReading]:
-    """Poll once at the next cycle; a port that is gone gives nothing. Simulated time must not pass in it."""
+    """Poll once at the next cycle; a missing port gives no readings.
+
+    Simulated time must not advance during a poll.
+    """
     bench.clock.sleep_until_ns(bench.clock.now_ns() + PERIOD_NS)
     before_ns = bench.clock.now_ns()
     try:
@@ -38,7 +41,7 @@ def poll(bench: BenchLine) -> list[ImuReading]:
 
 
 def seconds_until_readings(bench: BenchLine, limit: float = 5.0) -> float:
-    """Return how long it takes until readings come cycle after cycle."""
+    """Return the time until a reading arrives in each cycle."""
     begin_ns = bench.clock.now_ns()
     in_a_row = 0
     while (bench.clock.now_ns() - begin_ns) * 1e-9 < limit:
@@ -50,7 +53,7 @@ def seconds_until_readings(bench: BenchLine, limit: float = 5.0) -> float:
 
 def reset(bench: BenchLine) -> None:
     bench.line.host.send(build("RST"))
-    bench.run(1.0)  # its start: the fault is over when it speaks
+    bench.run(1.0)  # start of the VN-100: the fault has ended when it sends
 
 
 def lose_power(bench: BenchLine) -> None:
@@ -135,7 +138,7 @@ def test_readings_come_again_within_two_seconds_after_the_fault(
 
 
 def test_a_unit_that_was_reset_on_saved_binary_output_is_set_up_too(bench: BenchLine) -> None:
-    """Its packets come again by themselves, unfiltered: only its clock shows the restart."""
+    """The packets resume without a command, so that only the device clock shows the restart."""
     bench.unit.registers.save()
     bench.unit.registers.write(85, ("0", "4", "4", "4", "0", "0", "3", "3", "3", "0"))
     bench.unit.registers.save()

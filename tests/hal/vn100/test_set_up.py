@@ -1,4 +1,4 @@
-"""The dialogue that sets up a VN-100, question by question, against VectorNav UM001 v2.43 ch. 5."""
+"""Tests of the commands that configure a VN-100 against VectorNav UM001 v2.43, chapter 5."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ASCII = ["RRG 1", "WRG 6 0", "WRG 44 0 1 5", "WRG 85 20 20 20 4 0 3 3 3 3 0", "W
 
 
 def converse(settings: Vn100Settings, answers: Mapping[str, tuple[str, ...]] | None = None) -> list[str]:
-    """Return the questions of the dialogue; without an answer of its own each one is echoed."""
+    """Return the commands of the set-up; commands without a given answer are echoed."""
     dialogue = set_up(settings)
     asked: list[str] = []
     question = next(dialogue)
@@ -90,7 +90,7 @@ def test_an_answer_belongs_to_its_command_and_register() -> None:
 
 
 def test_only_errors_of_the_line_are_worth_another_try() -> None:
-    """UM001 Table 18: fault, overflow, checksum, watchdog and full buffers; -1 is an unreadable code."""
+    """The error codes are those of UM001 Table 18; -1 is an unreadable code."""
     assert {-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF} == PASSING_ERRORS
     assert BAUD_RATES == (115200, 230400, 921600, 460800, 57600, 38400, 19200, 9600)
 

@@ -1,1 +1,1 @@
-"""Tests of the flight application's pure mathematics."""
+"""Tests of attitude, Earth and star catalogue computations."""

@@ -1,4 +1,4 @@
-"""Public functions of Sun, field, eclipse and orbit against independent computations."""
+"""Tests of public functions of Sun, field, eclipse and orbit against independent computations."""
 
 from __future__ import annotations
 

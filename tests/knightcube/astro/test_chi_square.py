@@ -1,4 +1,4 @@
-"""The chi-square's bound, against scipy's."""
+"""Tests of the chi-square bound against scipy."""
 
 from __future__ import annotations
 

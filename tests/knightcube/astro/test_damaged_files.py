@@ -1,4 +1,4 @@
-"""Damaged two-line elements and damaged tables of stars."""
+"""Tests with damaged two-line elements and damaged star tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plane across a direction."""
+"""Tests of the tangent plane of a direction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inertia tensors: principal axes next to the body axes, and which tensors no body can have."""
+"""Tests of inertia tensors: principal axes near the body axes, and impossible tensors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_diagonal_tensor_keeps_its_moments_exactly() -> None:
             "row 1, column 2 is 0.1, and row 2, column 1 is -0.1",
         ),
         (np.array([[2.0, 3.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 2.0]]), "all must be positive"),
-        # Its diagonal satisfies the triangle inequality, its principal moments 0.2, 2, 3.8 do not.
+        # The diagonal satisfies the triangle inequality, but the principal moments 0.2, 2 and 3.8 do not.
         (np.array([[2.0, 1.8, 0.0], [1.8, 2.0, 0.0], [0.0, 0.0, 2.0]]), "moments 0.2, 2, 3.8: the largest"),
     ],
 )

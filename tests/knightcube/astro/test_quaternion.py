@@ -46,7 +46,7 @@ def test_attitude_matrix_is_a_proper_rotation(q: FloatArray) -> None:
 
 @given(UNIT_QUATERNIONS)
 def test_attitude_matrix_is_the_transpose_of_scipys(q: FloatArray) -> None:
-    """Scipy rotates the vector, A(q) rotates the frame: the same four numbers give the transpose."""
+    """Scipy rotates vectors and A(q) rotates frames, so the same quaternion gives the transposed matrix."""
     assert _close(quaternion.attitude_matrix(q), Rotation.from_quat(q).as_matrix().T)
 
 
@@ -110,7 +110,10 @@ def test_rotation_vector_round_trip(axis: FloatArray, angle: float) -> None:
 
 @given(UNIT_QUATERNIONS)
 def test_rotation_vector_agrees_with_scipy(q: FloatArray) -> None:
-    """It is the same in both conventions: the sense is in the matrix. At pi both signs are right."""
+    """The quaternion is the same in both conventions; only the matrix differs.
+
+    At a rotation of pi, both signs are correct.
+    """
     vector = quaternion.to_rotation_vector(q)
     assume(np.linalg.norm(vector) < np.pi - 1e-6)
     assert _close(vector, Rotation.from_quat(q).as_rotvec(), 1e-9)
@@ -145,7 +148,7 @@ def test_derivative_is_the_limit_of_small_turns(q: FloatArray, rate: FloatArray)
 def test_a_fixed_star_moves_with_minus_omega_cross_v(
     q: FloatArray, rate: FloatArray, star: FloatArray
 ) -> None:
-    """The conventions' definition of the rate's sign, on the derivative alone."""
+    """The sign of the rate is tested by the derivative alone."""
     h = 1e-6
     ahead = quaternion.normalise(q + h * quaternion.derivative(q, rate))
     behind = quaternion.normalise(q - h * quaternion.derivative(q, rate))
@@ -162,7 +165,7 @@ def test_angle_between_is_the_angle_turned(q: FloatArray, axis: FloatArray, angl
 
 @given(st.floats(1e-12, 1e-6))
 def test_angle_between_is_accurate_near_zero(angle: float) -> None:
-    """An arc cosine of the dot product would lose everything below 1e-8."""
+    """An arc cosine of the dot product would not resolve angles below 1e-8."""
     q = quaternion.about_axis_y(angle)
     assert quaternion.angle_between(q, quaternion.IDENTITY) == pytest.approx(angle, rel=1e-9)
 
@@ -177,7 +180,7 @@ def test_turns_about_axis_y_round_trip(angle: float) -> None:
 
 @given(ANGLES, st.floats(0.0, 6.28), st.floats(0.0, 1.5))
 def test_the_twist_about_y_leaves_out_a_tilt(angle: float, azimuth: float, tilt: float) -> None:
-    """A tilt of the thread, a turn about a horizontal axis, does not change the twist about it."""
+    """A tilt of the thread (a rotation about a horizontal axis) does not change the twist."""
     swing = quaternion.from_rotation_vector(tilt * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)]))
     q = quaternion.multiply(swing, quaternion.about_axis_y(angle))
     assert quaternion.angle_about_axis_y(q) == pytest.approx(angle, abs=1e-9)

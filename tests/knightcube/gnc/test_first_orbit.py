@@ -1,4 +1,4 @@
-"""First orbits of made-up passes, compared with trajectories that scipy integrates."""
+"""Tests of initial orbits of artificial passes against trajectories integrated by scipy."""
 
 from __future__ import annotations
 

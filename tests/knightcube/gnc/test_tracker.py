@@ -1,4 +1,4 @@
-"""Tracks of objects by bearings alone: honest errors, several objects, loss of sight, no false tracks."""
+"""Tests of bearings-only tracks: uncertainty, several objects, loss of sight, and no false tracks."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Tests of the methods kept for comparison."""
+"""Tests of the reference methods that are kept for comparison."""

@@ -1,4 +1,4 @@
-"""The adaptive controller: its reference model, what it learns, and what it must not learn.
+"""Tests of the PID controller: poles, bumpless start, and integral under saturation.
 
 The PID controller: its poles, its bumpless start, its integral under saturation.
 """

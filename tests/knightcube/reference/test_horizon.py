@@ -1,4 +1,4 @@
-"""The paper's own methods: its worked example to its digits, the Graphic and the Vector Method."""
+"""Tests of the Graphic and the Vector Method with the worked example of their paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Image matching finds the attitude of exact stars, and that of Wahba's problem from noisy ones."""
+"""Tests that image matching finds exact attitudes, and Wahba's solution for noisy stars."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The classical methods give the results of the record, to five digits, on small problems."""
+"""Tests that the reference methods equal the record on small problems to five digits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Separate attitudes of cameras and magnetometer, and their fusion, on directions with known errors."""
+"""Tests of attitudes of cameras and magnetometer, and their fusion, with known direction errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each classical method on star lists of a synthetic sky: it finds the stars, and refuses random points."""
+"""Tests that each reference method finds the stars of a synthetic sky and refuses random points."""
 
 from __future__ import annotations
 

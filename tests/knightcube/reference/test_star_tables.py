@@ -1,4 +1,4 @@
-"""The k-vector against a search through all keys, and the pair table against all pairs."""
+"""Tests of the k-vector and the pair table against exhaustive searches."""
 
 from __future__ import annotations
 

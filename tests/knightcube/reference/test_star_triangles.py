@@ -1,4 +1,4 @@
-"""Area, polar moment and their variances: against closed forms, integration and Monte Carlo."""
+"""Tests of area, polar moment and their variances against closed forms, integration and Monte Carlo."""
 
 from __future__ import annotations
 

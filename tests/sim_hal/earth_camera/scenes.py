@@ -1,4 +1,4 @@
-"""Scenes for tests and campaigns: low orbits at random, with horizon or Sun where they are wanted."""
+"""Scenes for tests and campaigns: random low orbits, with horizon or Sun in view on request."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tests.support.earth_truth import limb_directions, limb_truth, sun_point
 View = Literal["sunlit", "terminator", "dark", "any"]
 
 LOW, HIGH = 200e3, 2000e3
-"""m above the equator's radius: the altitudes that are asked for."""
+"""Range of altitudes (m) above the equatorial radius."""
 DAY, NIGHT = 0.1, -0.1
-"""Solar cosines beyond which a limb point is plainly lit, and plainly not."""
+"""Cosines of the Sun's zenith distance above and below which a limb point is clearly lit or dark."""
 _MOST_DRAWS = 20_000
 _LEAST_POINTS = 60
-"""Points, of 720 around the Earth, that must be on the detector for the horizon to be in view."""
+"""Number of limb points, of 720, that must be on the detector for the horizon to be in view."""
 
 
 def random_direction(generator: np.random.Generator) -> FloatArray:
@@ -33,7 +33,7 @@ def random_direction(generator: np.random.Generator) -> FloatArray:
 
 
 def pointing(boresight: FloatArray, down: FloatArray) -> FloatArray:
-    """Return the attitude (4,) of which +z is `boresight` (3,) and +y, rows down, nearest to `down` (3,)."""
+    """Return the attitude (4,) with +z along `boresight` (3,) and +y (image down) nearest to `down` (3,)."""
     across = np.cross(down, boresight)
     across = across / np.linalg.norm(across)
     return quaternion.from_matrix(np.stack([across, np.cross(boresight, across), boresight]))
@@ -42,7 +42,7 @@ def pointing(boresight: FloatArray, down: FloatArray) -> FloatArray:
 def limb_scene(
     altitude: float = 600e3, *, zenith: FloatArray, sun: FloatArray, dip: float = 0.0, texture: int = 0
 ) -> EarthScene:
-    """Return a scene above `zenith` (3,) with the Sun towards `sun` (3,), the limb level in the middle.
+    """Return a scene above `zenith` (3,), the Sun towards `sun` (3,), and a horizontal limb in the centre.
 
     `dip` rad turns the boresight below the limb's middle; the azimuth is the Sun's, or the pole's
     when the Sun is overhead.
@@ -68,8 +68,8 @@ def random_scene(
 ) -> EarthScene:
     """Return a scene with the horizon in view, everything else at random.
 
-    `view` asks of the limb on the detector: all of it in daylight, some in day and some in night, all in
-    night, or any. `accept` may refuse a scene for reasons of its own. Raises RuntimeError when none is found.
+    `view` states the limb on the detector: all in daylight, partly in day and night, all in night, or any.
+        `accept` may refuse a scene. Raises RuntimeError when none is found.
     """
     for _ in range(_MOST_DRAWS):
         scene = _draw(generator, model, altitudes)
@@ -93,9 +93,9 @@ def random_sun_scene(
     altitudes: tuple[float, float] = (LOW, HIGH),
     margin: float = 0.0,
 ) -> EarthScene:
-    """Return a scene whose whole Sun stands at a random pixel, `margin` px or more inside the edge.
+    """Return a scene with the whole Sun at a random pixel, at least `margin` px inside the edge.
 
-    A negative margin lets it stand outside by so much. Raises RuntimeError when none is found.
+    With a negative margin, the Sun may be outside by this amount. Raises RuntimeError when none is found.
     """
     for _ in range(_MOST_DRAWS):
         size = np.array([model.columns, model.rows])
@@ -103,7 +103,8 @@ def random_sun_scene(
         ray = model.lens.unit_vectors(point[None, :])[0]
         sun = random_direction(generator)
         roll = random_direction(generator)
-        # Camera axes and inertial ones, each from the Sun's direction and another: the attitude joins them.
+        # Camera axes and inertial axes are each built from the Sun direction and a second direction; the
+        # attitude relates them.
         camera = _triad(ray, np.array([0.6, 0.8, 0.0]))
         attitude = quaternion.from_matrix(camera.T @ _triad(sun, roll))
         position = (SEMI_MAJOR_AXIS + generator.uniform(*altitudes)) * random_direction(generator)
@@ -119,7 +120,7 @@ def random_sun_scene(
 
 
 def _triad(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return rows (3, 3): `first`, normal to both, normal to these."""
+    """Return an orthonormal triad (3, 3) whose first row is `first`."""
     across = np.cross(first, second)
     across = across / np.linalg.norm(across)
     return np.stack([first, across, np.cross(first, across)])
@@ -133,7 +134,7 @@ def _draw(
     upright = EarthScene(position, quaternion.IDENTITY, sun)
     limb, _ = limb_directions(upright, 720)
     target = limb[generator.integers(len(limb))]
-    # A boresight that has the limb's point somewhere within the circle about the detector.
+    # A boresight with the limb point within the circle around the detector.
     aside = generator.uniform(0.0, model.lens.half_diagonal)
     boresight = np.cos(aside) * target + np.sin(aside) * _normal_to(target, generator)
     attitude = pointing(boresight, _normal_to(boresight, generator))

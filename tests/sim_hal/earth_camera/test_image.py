@@ -1,4 +1,4 @@
-"""Frames of Earth and Sun: response, noise, blemishes and blooming of the detector, and the Sun's disc."""
+"""Tests of frames of Earth and Sun: detector response, noise, defects and blooming, and the Sun's disc."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_counts_grow_with_the_light_over_six_decades_evenly_by_its_logarithm() -
     light = LOGARITHMIC.darkest * 10.0 ** np.arange(0.0, 6.01, 0.25)
     mean = np.array([_even(LOGARITHMIC, value).mean() for value in light])
     assert np.all(np.diff(mean) > 0.0)
-    steps = np.diff(mean[6:-1])  # above the knee at the dark current
+    steps = np.diff(mean[6:-1])  # bin above the knee at the dark current
     assert steps == pytest.approx(0.25 * (255 - 8) / 6.0, abs=0.5)
     assert mean[-1] == pytest.approx(255, abs=1.0)
 
@@ -158,7 +158,7 @@ def test_all_the_suns_light_arrives_pi_in_these_units() -> None:
 
 
 def test_the_discs_radius_is_the_suns() -> None:
-    """In a narrow camera the rim is where light falls through half of its neighbours'."""
+    """In a narrow camera, the rim is where the brightness is half of that of its neighbours."""
     model = EarthCameraModel.fuga15d(scatter=0.0, field_of_view=np.radians(5.0))
     scene = _deep_space(ASTRONOMICAL_UNIT * np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]))
     across = expected_radiance(model, scene)[255]
@@ -175,7 +175,7 @@ def test_glare_holds_its_share_of_the_light_and_stays_when_the_sun_leaves_the_fi
     rays = pixel_rays(model.lens)
     solid = (rays[:, 2].reshape(light.shape)) ** 3 / model.lens.focal_length**2
     chords = np.linalg.norm(rays - ahead, axis=1).reshape(light.shape)
-    # Of the law's logarithmic integral what lies between 3 deg and the inscribed circle of 60 deg.
+    # The part of the scattering law's logarithmic integral between 3 deg and the inscribed circle of 60 deg.
     ring = (chords > np.radians(3.0)) & (chords < 1.0)
     square = model.scatter_angle**2
     part = np.log((1.0 + 1.0 / square) / (1.0 + np.radians(3.0) ** 2 / square)) / np.log(1.0 + 2.0 / square)
@@ -190,7 +190,7 @@ def test_glare_holds_its_share_of_the_light_and_stays_when_the_sun_leaves_the_fi
 
 
 def test_the_earth_hides_the_sun_and_its_air_dims_it() -> None:
-    """From full Sun to none within the 0.53 deg of the disc and the air above the limb, never growing."""
+    """The brightness falls from full Sun to none within the disc's 0.53 deg and the air above the limb."""
     distance = SEMI_MAJOR_AXIS + 600e3
     edge = np.arcsin(SEMI_MAJOR_AXIS / distance)
     shares = []
@@ -219,14 +219,15 @@ def test_a_sun_behind_the_earth_leaves_no_trace() -> None:
 
 
 def test_part_of_a_disc_on_the_edge_is_part_of_the_disc_in_the_field() -> None:
-    """The same Sun, half over the edge: the pixels that both have are the same."""
+    """With the Sun half beyond the edge, the common pixels of both images are equal."""
     wide = EarthCameraModel.fuga15d(scatter=0.0)
     narrow = EarthCameraModel(
         lens=replace(wide.lens.ideal, columns=256, focal_length=wide.lens.focal_length),
         columns=256,
         scatter=0.0,
     )
-    # The narrow camera's last column is the wide one's middle; its axis lies 128 px further to the left.
+    # The last column of the narrow camera is the central column of the wide camera, whose axis is 128 px
+    # away.
     ahead = np.array([0.0, 0.0, 1.0])
     f = wide.lens.focal_length
     turned = np.array([128.0 / f, 0.0, 1.0])
@@ -253,7 +254,7 @@ def test_logarithmic_and_linear_frames_saturate_in_the_core_and_nowhere_in_the_d
 
 @pytest.mark.parametrize("aside", [1e-3, 1e-6, 1e-9])
 def test_a_sun_at_a_right_angle_to_the_boresight_leaves_no_disc(aside: float) -> None:
-    """Its image through a lens that never folds lies farther away than any integer counts."""
+    """Through a lens without folding, its image is at coordinates beyond the range of integers."""
     model = EarthCameraModel.fuga15d(scatter=0.0, k1=-0.05, k2=0.01)
     boresight = np.array([0.0, 1.0, 0.0])
     # The rim of 0.27 deg crosses the plane beyond which the lens sees nothing.

@@ -1,4 +1,4 @@
-"""The model of the Earth camera: defaults, and the ends of every range."""
+"""Tests of the Earth camera's settings: defaults, and the limits of each range."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rendered images of the Earth camera are those of the record."""
+"""Tests that rendered images of the Earth camera equal the record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene of the Earth camera: terminator, night, air and texture, and the geometry of limb and nadir."""
+"""Tests of the Earth camera's scene: terminator, night, air, texture, and geometry of limb and nadir."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _solar_cosines(scene: EarthScene) -> FloatArray:
 
 
 def test_the_limb_depth_and_the_zenith_depth_are_integrals_of_exponential_air() -> None:
-    """By quadrature along the lines themselves, round the Earth's curve."""
+    """The reference is a quadrature along the curved lines of sight."""
 
     def through(tangent: float) -> float:
         def density(s: float) -> float:
@@ -83,13 +83,13 @@ def test_light_above_the_limb_falls_by_e_for_each_scale_height() -> None:
 
 
 def test_the_terminator_lies_where_the_sun_is_on_the_horizon() -> None:
-    """Day brighter than a tenth of the subsolar sea's, night darker than a hundredth, from a known Sun."""
+    """Day is brighter than a tenth of the subsolar sea, and night is darker than a hundredth."""
     scene = _nadir_scene(np.array([0.0, 1.0, 0.0]), 2000e3)
     light, cosine = expected_radiance(QUIET, scene), _solar_cosines(scene)
     noon = OCEAN * np.exp(-2.0 * AIR.optical_depth)
     assert light[cosine > 0.15].min() > 0.1 * noon
     assert light[cosine < -0.1].max() < 0.01 * noon
-    # And the light across it falls all the way, over the width of twilight.
+    # The brightness across the terminator decreases monotonically over the width of twilight.
     rows = [light[np.abs(cosine - c) < 0.01].mean() for c in (0.15, 0.1, 0.05, 0.0, -0.05, -0.1)]
     assert np.all(np.diff(rows) < 0.0)
 
@@ -130,7 +130,7 @@ def test_land_and_cloud_cover_their_shares_and_come_from_the_seed_alone() -> Non
         assert ground.max() <= CLOUD + 1e-6
         covered.append(np.mean(ground > 0.6))
         sea.append(np.mean(ground < OCEAN + 0.01))
-    # Few continents a globe: shares scatter from seed to seed.
+    # A globe has few continents, so the land fraction varies with the seed.
     assert np.mean(covered) == pytest.approx(CLOUD_SHARE, abs=0.12)
     assert np.mean(sea) == pytest.approx((1.0 - CLOUD_SHARE) * (1.0 - LAND_SHARE), abs=0.12)
     assert np.array_equal(albedo(directions[:100], 3), albedo(directions[:100], 3))
@@ -216,12 +216,12 @@ def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
     towards = (places - scene.position) @ scene.camera_matrix.T
     crossed = np.cross(towards, rays) / np.linalg.norm(towards, axis=1, keepdims=True)
     assert np.abs(crossed).max() < 1e-9
-    # The first of the two meetings, on the camera's side.
+    # The first of the two intersections, on the camera's side.
     assert np.all(places @ scene.position > 0.0)
 
 
 def test_the_sunlit_limb_has_half_its_brightness_at_the_published_height() -> None:
-    """Down a column, light reaches half of what it has where the line of sight touches the ground."""
+    """Down a column, the brightness reaches half of its value at the tangent point of the ground."""
     scene = limb_scene(600e3, zenith=np.array([0.3, 0.2, 0.9]), sun=np.array([0.5, 0.2, 0.8]))
     narrow = EarthCameraModel.fuga15d(scatter=0.0, blur=0.0, field_of_view=np.radians(8.0))
     light = expected_radiance(narrow, scene)
@@ -248,12 +248,12 @@ def test_distortion_moves_the_limb_as_the_lens_says() -> None:
         map_coordinates(expected_radiance(model, scene), points.T[::-1], order=1)
         for model, points in ((bent, moved), (NOISELESS, straight))
     )
-    # The apparent limb's light changes by a tenth of its value over a tenth of a pixel.
+    # The brightness at the apparent limb changes by a tenth over a tenth of a pixel.
     assert seen == pytest.approx(expected, rel=0.1)
 
 
 def test_a_tilted_pole_carries_the_flattening_with_it() -> None:
-    """A pole towards the camera makes the limb round; the default one does not."""
+    """With the pole towards the camera, the limb is a circle; by default it is not."""
     position = np.array([SEMI_MAJOR_AXIS + 400e3, 0.0, 0.0])
     upright = EarthScene(position, quaternion.IDENTITY, SUN)
     lying = replace(upright, pole=np.array([1.0, 0.0, 0.0]), rotation=0.7)

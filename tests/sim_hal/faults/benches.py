@@ -1,4 +1,4 @@
-"""Devices that several tests of the fault catalogue share."""
+"""Devices for several tests of the fault catalogue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coils, monitor, inertial unit and body in lock-step without a flight loop: only a coil watch looks on."""
+"""Coils, current monitor, IMU and body in lock-step with a coil monitor, without a flight loop."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.support.flights import demo_config, demo_world
 CYCLE_NS = 25_000_000
 
 Command = Callable[[float, ImuReading], FloatArray]
-"""Gives the currents (3,) A at a time in s, from the newest reading."""
+"""Controller that returns the currents (3,), A, at a time (s) from the newest reading."""
 
 
 def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) -> Command:
@@ -48,7 +48,7 @@ def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) 
 
 
 def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilMonitorSettings:
-    """Return what the flight loop gives a watch of the demonstration's hardware."""
+    """Return the settings of a coil monitor for the demonstration's hardware."""
     coils, plant = config.coils, config.plant
     full = [coils.supply_voltage / ohm for ohm in coils.resistance]
     response = ResponseSettings(
@@ -82,7 +82,10 @@ def observe(
     monitor_only: bool = False,
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Watched:
-    """Command the coils for a while and return what a watch says; `gain` scales the configured resistance."""
+    """Command the coils for some time, and return the results of a coil monitor.
+
+    `gain` scales the configured resistance.
+    """
     config = demo_config(duration, camera=False)
     entries = tuple(FaultEntry(fault=fault) for fault in faults)
     ohms = config.coils.resistance

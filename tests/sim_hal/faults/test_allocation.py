@@ -1,4 +1,4 @@
-"""Currents for a wanted torque: its direction survives a lost coil and the limits."""
+"""Tests that currents for a torque keep its direction with a lost coil and at the limits."""
 
 from __future__ import annotations
 

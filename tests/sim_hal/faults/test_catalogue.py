@@ -1,4 +1,4 @@
-"""Every fault can begin on the emulated hardware, has an effect, and leaves no effect after its removal."""
+"""Tests that each fault can be injected, has an effect, and has no effect after its removal."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_fault_that_is_lifted_leaves_nothing_broken(lock: LockStep, kind: Faul
     put([parse(f"{kind.name} @ 1 for 1.3")], bench_of(lock), 0)
     assert is_sound(lock)
     lock.clock.sleep_until_ns(round(1.1 * SECOND_NS))
-    # A unit without power is off in itself; what happens once leaves its mark in registers.
+    # A VN-100 without power is off as a whole; single events leave their effect in registers.
     assert kind.momentary or kind.name == "imu: off" or not is_sound(lock)
     lock.clock.sleep_until_ns(4 * SECOND_NS)
     assert is_sound(lock)
@@ -161,7 +161,7 @@ def test_an_unplugged_line_raises_where_the_driver_asks(lock: LockStep) -> None:
 
 
 def test_legs_that_are_stuck_drive_their_coil_and_are_braked_by_the_other(lock: LockStep) -> None:
-    """Table 5.2 of the thesis: the coil sees the difference of its two ends."""
+    """The voltage across the coil is the difference of its two ends (Table 5.2 of the thesis)."""
     circuit, pwm = lock.hardware.circuit, lock.hardware.pwm
     full = 3.4 / 23.0
     pwm.write(0x40, bytes([0x00, 0x20]))

@@ -1,4 +1,4 @@
-"""The table of faults: defaults and bounds of every parameter, and which faults last or come together."""
+"""Tests of the table of faults: defaults, bounds, durations, and combinations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The size of the effect of faults on samples, wires and parts of the emulated hardware."""
+"""Tests of the size of fault effects on samples, lines and parts of the emulated hardware."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def bench() -> Bench:
 
 
 def altered(bench: Bench, name: str, samples: list[Vn100Sample], **given: float) -> list[Vn100Sample]:
-    """Return what a fault of the inertial unit makes of samples."""
+    """Return IMU samples under a fault."""
     kind = CATALOGUE[name]
     assert kind.begin is not None
     remove = kind.begin(bench, kind, given)
@@ -124,7 +124,7 @@ def test_of_two_faults_on_a_wire_the_stronger_counts(bench: Bench) -> None:
 
 
 class Part:
-    """A part with one attribute."""
+    """A device with one attribute."""
 
     level = 1
 

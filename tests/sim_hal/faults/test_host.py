@@ -1,4 +1,4 @@
-"""Faults inside the flight process: jobs, wall clock, disk, and the configuration file."""
+"""Tests of faults in the flight process: jobs, wall clock, disk, and configuration file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Found:
-    """A result as workers give them."""
+    """A result of a worker."""
 
     angle: float
     path: np.ndarray[Any, Any]
@@ -51,7 +51,7 @@ def runner_of(fault: str) -> tuple[SimClock, Any]:
 
 
 def outcome_at(fault: str, seconds: float, patience: float = 4.0) -> tuple[JobResult, float]:
-    """Hand a job over at a mission time; return its result and after how many seconds it came."""
+    """Submit a job at a mission time, and return its result and the delay, s."""
     clock, runner = runner_of(fault)
     clock.sleep_until_ns(round((1.0 + seconds) * SECOND_NS))
     begun_ns = clock.now_ns()

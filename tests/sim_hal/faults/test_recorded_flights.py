@@ -1,4 +1,4 @@
-"""The faults have the effects of the recorded flights."""
+"""Tests that the faults have the effects of the recorded runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A serial adapter that is pulled out and plugged in again is opened again, under its lasting name."""
+"""Tests that an unplugged serial adapter is opened again under its persistent name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hal.interfaces.errors import NotResponding
 
 
 def plug_in(link: Path) -> tuple[int, int]:
-    """Make a terminal under a lasting name, as udev does."""
+    """Make a pseudo-terminal with a persistent name, as udev does."""
     near, far = os.openpty()
     tty.setraw(far)
     link.unlink(missing_ok=True)
@@ -60,7 +60,7 @@ def test_the_port_is_open_again_within_two_seconds(tmp_path: Path) -> None:
         begun = time.monotonic()
         found = b""
         while not found and time.monotonic() - begun < 3.0:
-            os.write(ends[0], b"after")  # what came before it was open is thrown away
+            os.write(ends[0], b"after")  # bytes that arrived before the port was open are discarded
             found = receive(port, 0.05)
         assert found.startswith(b"after")
         assert time.monotonic() - begun < 2.0

@@ -1,4 +1,4 @@
-"""The grammar of faults, and the messages for invalid faults."""
+"""Tests of the syntax of faults, and of the messages for invalid faults."""
 
 from __future__ import annotations
 

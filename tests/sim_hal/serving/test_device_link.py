@@ -1,4 +1,4 @@
-"""The wire between a flight and devices in another process, and how a flight is plugged into running ones."""
+"""Tests of the connection between a flight process and devices in another process."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Serve = Callable[[Callable[[list[Any]], list[Any]]], RemoteI2cBus]
 
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Serve]:
-    """Return what answers each request by a function's messages, and a bus plugged into it."""
+    """Return a server that answers each request by a function's messages, and a bus connected to it."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(tmp_path / "devices.sock"))
     listener.listen()

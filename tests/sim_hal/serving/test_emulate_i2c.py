@@ -1,4 +1,4 @@
-"""Unchanged programs open the emulated bus as /dev/i2c-N in their own processes."""
+"""Tests that unchanged programs open the emulated bus as /dev/i2c-N in their own processes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def environment() -> Iterator[Mapping[str, str]]:
 
 
 def run(environment: Mapping[str, str], script: str) -> str:
-    """Return the output of a Python script that knows nothing of the emulation."""
+    """Return the output of a Python script without code for the emulation."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
@@ -138,7 +138,7 @@ def test_files_copies_and_children_are_as_ever(environment: Mapping[str, str], t
     reason="adafruit-pureio, another's client, is not installed",
 )
 def test_adafruits_client_drives_a_coil_and_reads_its_current(environment: Mapping[str, str]) -> None:
-    """Coil x full on draws 3.4 V / 23 ohm = 148 mA, which 0.1 ohm turns into 1478 steps of 10 uV."""
+    """A fully driven coil x draws 3.4 V / 23 ohm = 148 mA, or 1478 steps of 10 uV across 0.1 ohm."""
     said = run(
         environment,
         """

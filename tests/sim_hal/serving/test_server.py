@@ -1,4 +1,4 @@
-"""The server of emulated devices: its start, its renderer, and the devices in orbit in real time."""
+"""Tests of the device server: its start, its renderer, and devices in orbit in real time."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults
 def test_the_facts_are_written_before_the_devices_are_served(
     patience: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The parent process waits for the line, so it must not remain in a buffer."""
+    """The parent process waits for this line, so the line must be flushed."""
     calls = Mock()
     calls.server.lines = {"/dev/knightcube-imu": "/dev/pts/7"}
     calls.server.socket_path = tmp_path / "devices"

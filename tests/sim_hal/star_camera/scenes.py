@@ -1,4 +1,4 @@
-"""Scenes for the star camera's tests, and an independent rendering of them by brute force."""
+"""Scenes for the star camera's tests, and an independent brute-force renderer."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import StarCameraModel
 
 POINTING = quaternion.normalise(np.array([0.3, -0.5, 0.7, 0.2]))
-"""Somewhere in the sky, aligned with nothing."""
+"""Arbitrary attitude that is aligned with no axis."""
 
 
 def at_pixels(model: StarCameraModel, points: object, attitude: FloatArray = POINTING) -> FloatArray:
@@ -32,7 +32,7 @@ def still(exposure: float = 1.0) -> tuple[FloatArray, FloatArray]:
 
 
 def centroid(image: FloatArray) -> FloatArray:
-    """Return the centre of light (2,) as x, y."""
+    """Return the brightness centroid (2,) as x, y."""
     rows, columns = np.indices(image.shape)
     return np.asarray(np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum())
 

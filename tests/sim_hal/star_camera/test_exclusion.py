@@ -1,4 +1,4 @@
-"""Sun and Earth in the field of a camera, and the Earth between camera and object."""
+"""Tests of Sun and Earth in the field of view, and of the Earth between camera and object."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_sun_spoils_a_frame_to_its_limb(degrees: float, excluded: bool) -> N
 
 
 def test_the_sun_is_seen_from_the_camera_not_from_the_earths_centre() -> None:
-    """From 4 million km off it stands 1.5 deg aside."""
+    """From a distance of 4 million km, it is displaced by 1.5 deg."""
     aside = np.array([[0.0, 4e9, 0.0]])
     boresight = _tilted(SUN / ASTRONOMICAL_UNIT, np.array([[0.0, -1.0, 0.0]]), 11.0)
     assert sun_in_field(boresight, aside, SUN, HALF)[0]
@@ -78,15 +78,15 @@ def test_a_buffer_widens_both() -> None:
         ((0.0, -7e6, 0.0), True),
         ((0.0, 9e6, 0.0), False),
         ((7e6, 0.0, 0.0), True),
-        # 5000 km off, 0.1 deg below and above the horizon's dip of 19.3 deg.
+        # Objects at 5000 km, 0.1 deg below and above the horizon's dip of 19.3 deg.
         (_below_horizontal(19.4), True),
         (_below_horizontal(19.2), False),
-        # Straight down, but short of the ground.
+        # The object is straight below the camera, but above the ground.
         ((0.0, EARTH_RADIUS + 1000.0, 0.0), False),
     ],
 )
 def test_the_earth_hides_what_is_behind_it(target: tuple[float, float, float], hidden: bool) -> None:
-    """Against the way's closest point to the centre, sought among 100,000."""
+    """The reference is the closest of 100,000 points of the line to the Earth's centre."""
     end = np.array([target])
     way = CAMERA + np.linspace(0.0, 1.0, 100_001)[:, None] * (end - CAMERA)
     assert (np.linalg.norm(way, axis=1).min() < EARTH_RADIUS) == hidden

@@ -1,4 +1,4 @@
-"""The path of a star's light over an exposure, with a global and a rolling shutter."""
+"""Tests of a star's image path over an exposure with a global and a rolling shutter."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_turn_about_plus_y_moves_stars_to_the_left() -> None:
 
 
 def test_a_star_on_the_axis_of_rotation_does_not_move() -> None:
-    """The image is the still star's, at any rate."""
+    """The image is that of a star at rest, at any rate of rotation."""
     point = np.array([[120.3, 60.8]])
     axis = MODEL.pinhole.unit_vectors(point)[0]
     image = expected_electrons(MODEL, at_pixels(MODEL, point), [2.0], *turning(1.5 * axis, samples=3))
@@ -143,7 +143,7 @@ def test_an_even_turn_needs_no_more_knots_for_being_sampled_finely() -> None:
 
 
 def test_an_edge_cuts_a_streak_without_moving_the_rest() -> None:
-    """The small detector's image is the middle of the wide one's, pixel by pixel."""
+    """The image of the small detector equals the centre of the wide image, pixel by pixel."""
     wide = StarCameraModel(columns=400, rows=400, field_of_view=2.0 * np.arctan(200.0 / FOCAL))
     rng = np.random.default_rng(4)
     stars = at_pixels(MODEL, rng.uniform([-60.0, -60.0], [260.0, 220.0], (60, 2)))
@@ -157,7 +157,7 @@ def test_an_edge_cuts_a_streak_without_moving_the_rest() -> None:
 
 @pytest.mark.parametrize(("when", "crossings"), [(0.0, 0.5), (0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (1.0, 0.5)])
 def test_a_sweep_across_the_sky_shows_each_star_while_it_crosses(when: float, crossings: float) -> None:
-    """A turn of 0.5 rad, seven fields; the star is on the boresight at `when`."""
+    """A rotation of 0.5 rad, or seven fields of view; the star is on the boresight at `when`."""
     rate = np.array([0.0, 0.5, 0.0])
     then = quaternion.multiply(quaternion.from_rotation_vector(when * rate), POINTING)
     star = at_pixels(MODEL, MODEL.pinhole.centre, then)
@@ -200,7 +200,7 @@ def test_a_moving_source_streaks_while_the_stars_stand_still() -> None:
 
 
 def test_a_source_that_the_camera_follows_is_a_point() -> None:
-    """It moves in the sky as the boresight does: the stars streak, it does not."""
+    """The object moves with the boresight, so that only the stars streak."""
     times, attitudes = turning([0.0, 60.0 / FOCAL, 0.0], samples=101)
     boresights = quaternion.attitude_matrix(attitudes)[:, 2]
     nothing = np.zeros((0, 3))
@@ -276,7 +276,7 @@ def _worst(model: StarCameraModel, star: FloatArray, times: FloatArray, attitude
 def test_every_row_is_the_integral_over_its_own_exposure(
     line_time: float, velocity: tuple[float, float]
 ) -> None:
-    """Up to 0.15 px a line time, down after the shutter and up against it."""
+    """Motions of up to 0.15 px per line time, with the shutter and against it."""
     model = replace(ROLLING_MODEL, line_time=line_time)
     vx, vy = velocity
     span = EXPOSURE + model.rows * line_time
@@ -314,7 +314,7 @@ def test_jitter_is_followed() -> None:
 
 @pytest.mark.parametrize("start", [(60.0, -2.0), (60.0, 101.0), (-25.0, 50.0), (110.0, 90.0)])
 def test_streaks_that_an_edge_cuts_are_exact(start: tuple[float, float]) -> None:
-    """In from above, up from below, in from the left, out at the corner."""
+    """Stars that enter from above, below and the left, and leave at the corner."""
     vertical = 100.0 if start[1] < 60.0 else -100.0 if start[0] < 100.0 else 200.0
     rate = np.array([vertical, -200.0, 0.0]) / ROLLING_FOCAL
     assert _worst(ROLLING_MODEL, at_pixels(ROLLING_MODEL, start), *_history(rate)) < 2e-3
@@ -343,7 +343,7 @@ def test_a_still_camera_sees_what_a_global_shutter_sees() -> None:
 
 
 def test_with_hardly_any_line_time_a_field_of_streaks_is_a_global_shutters() -> None:
-    """Stars on and around the detector that come and go over every edge, and a few behind the camera."""
+    """Stars on and around the detector that cross each edge, and a few stars behind the camera."""
     rng = np.random.default_rng(6)
     stars = at_pixels(ROLLING_MODEL, rng.uniform(-150.0, 250.0, (300, 2)))
     stars[:20] *= -1.0
@@ -355,7 +355,7 @@ def test_with_hardly_any_line_time_a_field_of_streaks_is_a_global_shutters() -> 
 
 
 def test_stars_far_down_streak_later() -> None:
-    """Two stars 80 rows apart, the camera turning about y: the lower one is 80 line times further on."""
+    """For two stars 80 rows apart and a rotation about y, the lower star is exposed 80 line times later."""
     times, attitudes = _history([0.0, 200.0 / ROLLING_FOCAL, 0.0])
     upper, lower = (
         centroid(

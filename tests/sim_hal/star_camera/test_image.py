@@ -1,4 +1,4 @@
-"""Star images: moments of noise, saturation and counts, and the positions of stars at rest."""
+"""Tests of star images: moments of noise, saturation and counts, and positions of stars at rest."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _frames(model: StarCameraModel, light: FloatArray, number: int, exposure: fl
 
 
 def _check_moments(frames: Image, mean: FloatArray, variance: FloatArray) -> None:
-    """Hold every pixel's mean and variance, and their averages over the frame, to their sampling errors."""
+    """Assert that mean and variance of each pixel, and their averages, agree within sampling errors."""
     number = len(frames)
     z = (frames.mean(axis=0) - mean) / np.sqrt(variance / number)
     assert abs(z.mean()) < 5.0 / np.sqrt(z.size)
@@ -70,7 +70,7 @@ def test_moments_are_right_in_every_pixel_of_a_star_field() -> None:
 
 
 def test_moments_are_right_without_read_noise() -> None:
-    """Then nothing hides the Poisson steps, and each pixel is drawn as what it is."""
+    """Without other noise, the Poisson steps are visible, and each pixel has its own distribution."""
     model = replace(DEEP, read_noise=0.0, dark_current=4.0)
     light = np.full((96, 96), 0.5)
     frames = _frames(model, light, 200)
@@ -89,14 +89,14 @@ def test_moments_scale_with_gain_and_exposure() -> None:
 
 
 def test_the_background_has_gaussian_tails() -> None:
-    """Of 4 million pixels, as many lie beyond 3, 4 and 4.4 sigma as should: no table ends there."""
+    """The numbers of 4 million pixels beyond 3, 4 and 4.4 sigma are as expected: the tails are not cut."""
     model = replace(DEEP, dark_current=0.0, read_noise=100.0, pedestal=1000.0, columns=1000, rows=1000)
     z = (_frames(model, np.zeros((1000, 1000)), 4) - 1000.0) / 100.0
     for limit in (3.0, 4.0, 4.4):
         beyond = np.count_nonzero(np.abs(z) > limit + 0.001)
         expected = (
             2.0 * z.size * ndtr(-limit - 0.005)
-        )  # a count is 0.01 sigma: beyond it from half a count on
+        )  # a count is 0.01 sigma, so the bound applies from half a count on
         assert beyond == pytest.approx(expected, abs=5.0 * np.sqrt(expected))
     assert abs(np.count_nonzero(z > 4.0) - np.count_nonzero(z < -4.0)) < 5.0 * np.sqrt(
         2.0 * z.size * ndtr(-4.0)
@@ -338,7 +338,7 @@ def test_images_of_several_stars_add_up() -> None:
 
 
 def test_the_real_sky_puts_each_bright_star_where_the_pinhole_does() -> None:
-    """Orion's belt, from the catalogue: the light around each is centred on its projection."""
+    """The brightness around each star of Orion's belt is centred on its projection."""
     stars = catalogue.load()
     belt = [int(np.flatnonzero(stars.hip == hip)[0]) for hip in (25930, 26311, 26727)]
     directions = stars.directions_at(2000.0)

@@ -1,4 +1,4 @@
-"""The model of the star camera: defaults of a CubeSat's camera, and the ends of every range."""
+"""Tests of the star camera's settings: defaults of a CubeSat camera, and the limits of each range."""
 
 from __future__ import annotations
 

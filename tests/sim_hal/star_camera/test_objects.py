@@ -1,4 +1,4 @@
-"""Moving objects in the star camera's sky: their tracks, brightness and frames."""
+"""Tests of moving objects in the star camera's sky: tracks, brightness and frames."""
 
 from __future__ import annotations
 
@@ -96,17 +96,17 @@ def test_the_camera_shows_an_object_as_a_streak_of_its_rate_and_magnitude() -> N
     rows, columns = np.nonzero(light)
     pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.radians(camera.field_of_view_deg))
     length = np.radians(0.6) * EXPOSURE * pinhole.focal_length
-    # It starts at the boresight, and its light is even: the middle lies half a length from there.
+    # The object starts at the boresight with constant brightness, so the centroid is half a length away.
     weights, places = light[rows, columns], np.stack([columns, rows], axis=1).astype(float)
     middle = np.average(places, axis=0, weights=weights)
     assert np.hypot(*(middle - (camera.columns - 1) / 2)) == pytest.approx(length / 2, abs=0.5)
-    # An even line of length L has the variance L^2 / 12 along it; across it lies the spot alone.
+    # A uniform line of length L has the variance L^2 / 12 along it, and that of the spot across it.
     across, along = np.linalg.eigvalsh(np.cov(places.T, aweights=weights))
     assert np.sqrt(12.0 * (along - across)) == pytest.approx(length, rel=0.05)
 
 
 def test_an_object_in_orbit_is_shifted_by_its_motion_relative_to_the_camera_alone() -> None:
-    """Planetary aberration: of two bodies that go with the Earth the Earth's own velocity does not count."""
+    """For planetary aberration between two bodies near the Earth, the Earth's velocity cancels."""
     world = _world()
     around = world.surroundings()
     position, velocity = np.array(around.position), np.array(around.velocity)
@@ -210,7 +210,7 @@ def test_a_track_is_sampled_finely_enough_for_any_pass(height: float) -> None:
     times = np.linspace(0.0, 0.5, 30_001)
     exact = directions(camera.positions_at(times), other.positions_at(times))
     off = np.linalg.norm(np.cross(track.directions_at(times), exact), axis=1)
-    # The positions' own rounding is seen from very near.
+    # At very short distances, the rounding of positions is visible.
     assert off.max() < 1.1 * TRACK_ERROR + 1e-8 * 7000.0 / height
 
 
@@ -304,7 +304,10 @@ def test_the_thesis_scenario_has_the_orbits_of_table_4_3() -> None:
 
 
 def test_at_a_frame_a_second_the_thesis_scenario_has_about_as_many_opportunities() -> None:
-    """The thesis had 14, at a date and a cadence not given; a frame a second brings 9 to 19 in a year."""
+    """The thesis has 14 passes for an unstated date and frame interval.
+
+    With a frame a second there are 9 to 19 in a year.
+    """
     counts = [
         len(opportunities(replace(_table_4_3(), epoch=EPOCH + day), cadence=1.0, exposure=0.5))
         for day in (0.0, 91.0, 137.0)
@@ -329,7 +332,7 @@ def test_every_opportunity_lies_within_a_window() -> None:
     found, stretches = opportunities(scenario, cadence=1.0, exposure=0.5), windows(scenario)
     for item in found:
         assert any(w.start - 2e-3 <= item.start and item.start + 0.5 <= w.end + 2e-3 for w in stretches)
-    # And none is missed: the starts on the grid that fit into the windows are as many.
+    # No start is missed: as many starts on the grid fit into the windows.
     fit = sum(
         len([t for t in np.arange(np.ceil(w.start), w.end - 0.5)]) for w in stretches if w.end - w.start > 0.5
     )
@@ -358,7 +361,7 @@ def test_the_object_is_in_the_frame_where_the_opportunity_has_it() -> None:
     assert image.sum() == pytest.approx(float(StarCameraModel().electrons(4.0, 0.5)), rel=1e-3)
     middle = 0.5 * (np.array(item.first) + np.array(item.last))
     assert _centre_of_light(image) == pytest.approx(middle, abs=0.3)
-    # 0.025 rad of turn are 73 px at the boresight, and the object itself moves by a few.
+    # A rotation of 0.025 rad moves stars by 73 px, and the object itself moves by a few px.
     assert np.hypot(*(np.array(item.last) - np.array(item.first))) == pytest.approx(73.0, abs=15.0)
 
 

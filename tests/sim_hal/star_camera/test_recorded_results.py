@@ -1,4 +1,4 @@
-"""Rendered frames of the star camera, and objects in its sky, are those of the record."""
+"""Tests that rendered frames of stars and objects equal the record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A third party's world: a body that turns at its own rate about the thread, whatever the coils do."""
+"""A world of a third party: a body that rotates at its own rate about the thread."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The world of Basilisk compared with `free_body`; skipped if Basilisk is not installed."""
+"""Tests of the Basilisk world against `free_body`; skipped if Basilisk is not installed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def both(
 
 
 def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradient() -> None:
-    """Fields of WMM2025 and IGRF-14 differ by their degree 13, so attitudes part by a milliradian."""
+    """WMM2025 and IGRF-14 differ by degree 13, so that the attitudes differ by a milliradian."""
     currents = [np.array([0.05, -0.03, 0.02])]
     theirs, ours = both(FreeBodySection(craft="cubesat_3u", disturbances=CALM), lambda: currents[0])
     for second in range(1, 121):

@@ -1,4 +1,4 @@
-"""Orbits, Sun and environment against published states, analytic solutions and the models."""
+"""Tests of orbits, Sun and environment against published states, analytic solutions and the models."""
 
 from __future__ import annotations
 
@@ -180,7 +180,10 @@ def test_the_node_regresses_at_the_secular_rate(inclination: float) -> None:
 
 
 def test_a_sun_synchronous_orbit_follows_the_sun() -> None:
-    """Published: 98.6 deg at 800 km; the node turns once a tropical year, 0.9856 deg a day."""
+    """Published inclination: 98.6 deg at 800 km.
+
+    The node rotates by 0.9856 deg a day (once a tropical year).
+    """
     elements = KeplerianElements(semi_major_axis=EARTH_RADIUS + 800e3, inclination=np.radians(98.6))
     times = np.linspace(0.0, 2.0 * 86_400.0, 4001)
     rate = _secular_rate(times, _nodes(propagate(elements, float(times[-1])), times))
@@ -207,7 +210,7 @@ def test_the_perigee_turns_at_the_secular_rate(inclination: float) -> None:
     node /= np.linalg.norm(node, axis=1, keepdims=True)
     ahead = np.cross(momentum / np.linalg.norm(momentum, axis=1, keepdims=True), node)
     argument = np.unwrap(np.arctan2(np.sum(to_perigee * ahead, axis=1), np.sum(to_perigee * node, axis=1)))
-    # From apogee to apogee, where the short-periodic part is the same.
+    # The interval is from apogee to apogee, where the short-periodic part is equal.
     moved = (argument[-1] - argument[0]) / times[-1]
     parameter = 26_000e3 * (1.0 - 0.49)
     scale = 0.75 * J2 * (EARTH_RADIUS / parameter) ** 2 * 2.0 * np.pi / elements.period
@@ -288,7 +291,7 @@ def test_the_sun_stands_where_it_was_published(
     ],
 )
 def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float, longitude: float) -> None:
-    """Longitudes of date; J2000's are less by the precession, 50.29" a year, far more than the 60" here."""
+    """Longitudes of date; Longitudes of J2000 are smaller by the precession of 50.29" a year."""
     when = julian_date + 69.0 / DAY
     x, y, z = sun_position(when)
     along = np.arctan2(y * np.cos(OBLIQUITY) + z * np.sin(OBLIQUITY), x)
@@ -356,7 +359,7 @@ def test_the_local_time_of_the_node_places_the_sun_over_it() -> None:
     position, _ = elements(ORBIT, DATE).state()
     away = sun_position(DATE)
     cosine = position @ away / np.linalg.norm(position) / np.linalg.norm(away)
-    assert np.degrees(np.arccos(cosine)) < 1.0  # at the equinox the Sun stands over the equator
+    assert np.degrees(np.arccos(cosine)) < 1.0  # at the equinox the Sun is above the equator
 
 
 def test_the_ring_current_is_slow_never_reversed_and_as_large_as_asked_for() -> None:

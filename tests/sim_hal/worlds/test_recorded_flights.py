@@ -1,4 +1,4 @@
-"""The simulated worlds move as in the recorded flights."""
+"""Tests that the simulated worlds move as in the recorded runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated testbed obeys its equation of motion, and the field of a Helmholtz pair."""
+"""Tests that the simulated testbed obeys its equation of motion and has a Helmholtz field."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_one_coil_under_constant_current_keeps_the_energy_of_a_dipole_in_a_field
 
 @pytest.mark.parametrize("angle", [-0.7, 0.0, 0.4])
 def test_the_torque_is_the_cross_product_of_dipole_and_field(angle: float) -> None:
-    """A second or so of motion from rest against m x B computed with the attitude matrix."""
+    """The motion from rest over a second is compared with m x B from the attitude matrix."""
     current = np.array([0.07, 0.05, -0.03])
     world = bed(current, angle=angle)
     field_body = attitude_matrix(about_axis_y(angle)) @ np.array([0.0, 0.0, -4.5e-4])
@@ -114,7 +114,7 @@ def test_the_result_does_not_depend_on_how_the_time_was_cut() -> None:
 RADIUS, CURRENT, MEASURED = 0.15, 2.19, 9.98e-4
 """m, A, T: "approximately 15 cm", "9.98 gauss ... at a current of 2.19 A"."""
 TURNS = 76
-"""Of each coil: the whole number that 5.34 makes of the measurement; the thesis gives none."""
+"""Number of turns of each coil that follows from eq. 5.34 and the measurement; the thesis states none."""
 
 
 def test_the_measured_field_is_that_of_76_turns() -> None:

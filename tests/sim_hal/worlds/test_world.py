@@ -1,4 +1,4 @@
-"""A configuration selects the world of a flight."""
+"""Tests that a configuration selects the world of a run."""
 
 from __future__ import annotations
 

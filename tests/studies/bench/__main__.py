@@ -1,7 +1,7 @@
 """`python -m tests.studies.bench NAME [arguments]`: run a bench by name; without a name, list them.
 
-A bench is a module of this package with a `main`. The list is read from the docstrings without importing, and
-only the bench that is asked for is imported: its extras need not be there for the others.
+A benchmark is a module of this package with a function `main`. The list is read from the docstrings. Only the
+requested benchmark is imported, so that the extras of other benchmarks may be missing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def benches() -> dict[str, str]:
             continue
         tree = ast.parse((_FOLDER / f"{module.name}.py").read_text(encoding="utf-8"))
         if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
-            # Each docstring's first line names the command too, which the list need not say again.
+            # The first line of each docstring also names the command, which the list omits.
             line = (ast.get_docstring(tree) or "").partition("\n")[0]
             found[module.name] = line.partition("python -m")[0].rstrip(" :`")
     return found
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    """Run a bench's main: it takes its arguments as a list, or reads the command line when it takes none."""
+    """Run `main` of a benchmark with its arguments as a list, or without if it reads the command line."""
     bench = importlib.import_module(f"tests.studies.bench.{name}").main
     with _command_line(f"python -m tests.studies.bench {name}", arguments):
         status = bench(arguments) if inspect.signature(bench).parameters else bench()
@@ -62,7 +62,7 @@ def _run(name: str, arguments: list[str]) -> int:
 
 @contextmanager
 def _command_line(program: str, arguments: list[str]) -> Iterator[None]:
-    """Make this the process's command line, for mains that read it and for the name in their help."""
+    """Set the command line of the process, for functions `main` that read it and for their help."""
     before = sys.argv
     sys.argv = [program, *arguments]
     try:

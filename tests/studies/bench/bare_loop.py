@@ -1,11 +1,10 @@
-"""A bare absolute-sleep loop in a process of its own, in the flight's place: what the machine itself stalls.
+"""A bare sleep loop in a separate process, instead of the flight process: it measures machine stalls.
 
-It does what the least C program would: clock_nanosleep with TIMER_ABSTIME to the next slot, and notes when it
-woke, and how much processor time the machine's host had given to others by then. Its slots lie on the
-multiples of the period in CLOCK_MONOTONIC, as those of a flight in real time do.
-Run as `python -m tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`, under SCHED_FIFO with a priority
-above zero. At SIGTERM it writes what it noted to the file: rows of two int64, monotonic ns and ns stolen
-since boot.
+Like a minimal C program, it calls clock_nanosleep with TIMER_ABSTIME for the next slot. It records the time
+of each wake-up, and the processor time that the machine's host had given to others until then. Its slots are
+multiples of the period in CLOCK_MONOTONIC, like those of a real-time flight. Run as `python -m
+tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`, under SCHED_FIFO with a priority above zero. At
+SIGTERM it writes its records to the file: rows of two int64, monotonic ns and ns stolen since boot.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ class _Timespec(ctypes.Structure):
 
 
 def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
-    """Wake at every slot until something is in `stopped`, and note when and what was stolen by then.
+    """Wake at every slot until `stopped` is not empty, and record the times and the stolen time.
 
-    What has passed is skipped.
+    Missed slots are skipped.
     """
     nanosleep = ctypes.CDLL(None).clock_nanosleep
     deadline = _Timespec()
@@ -47,7 +46,7 @@ def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
 
 
 def _serve(words: list[str]) -> None:
-    """Loop until SIGTERM, then write what was noted."""
+    """Loop until SIGTERM, then write the records."""
     period_ns, priority, path = int(words[0]), int(words[1]), Path(words[2])
     noted: array[int] = array("q")
     stopped: list[int] = []

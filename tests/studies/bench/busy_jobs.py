@@ -1,9 +1,9 @@
-"""Workers that are never idle: each does its last job again and again until the next one comes.
+"""Workers that are never idle: each repeats its last job until the next job arrives.
 
-For `python -m tests.studies.bench executive --busy`: a satellite plans every 10 s at most, and to emulate a
-camera's frame costs more than to work on it. What is repeated is the flight's own work on its own jobs; the
-results are dropped. A new job waits for the repetition that runs. Imports are made late, as these functions
-are the workers'.
+For `python -m tests.studies.bench executive --busy`: a satellite plans every 10 s at most, and emulating a
+camera frame takes longer than processing it. The flight's own jobs are repeated, and the results are
+discarded. A new job waits for the end of the running repetition. Imports are made late, because these
+functions run in the workers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _M_ARENA_MAX = -8  # malloc.h
 
 
 class Again:
-    """Runs the job of one module, and the last one again while there is no other."""
+    """Runs the jobs of one module, and repeats the last job while no new job waits."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -39,7 +39,7 @@ class Again:
         self._goes.clear()
         with self._turn:
             result = run(argument)
-            # What the job holds may be overwritten once its result is sent.
+            # The arrays of the job may be overwritten once its result is sent.
             begun, self._last = self._last is not None, copy.deepcopy(argument)
         self._goes.set()
         if not begun:
@@ -47,7 +47,7 @@ class Again:
         return result
 
     def rest(self) -> None:
-        """Do nothing again until the next job."""
+        """Stop the repetition until the next job."""
         self._goes.clear()
 
     def _repeat(self, run: Callable[[Any], Any]) -> None:
@@ -58,7 +58,7 @@ class Again:
 
 
 def _one_heap() -> None:
-    """Have all threads of this process use one heap, as a worker's only thread does."""
+    """Let all threads of this process use one heap, like the only thread of a worker."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
@@ -78,12 +78,12 @@ def plan_orbit(job: Any) -> Any:
 
 
 def see(job: Any) -> Any:
-    """Work on a star camera's frame."""
+    """Process a star camera frame."""
     return _again("knightcube.vision.frame_job", job)
 
 
 def see_wide(job: Any) -> Any:
-    """Work on the wide cameras' frames."""
+    """Process the frames of the horizon cameras."""
     return _again("knightcube.vision.horizon_camera_job", job)
 
 
@@ -93,11 +93,11 @@ BUSY: dict[str, Callable[[Any], Any]] = {
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,
 }
-"""By the module of the job that is done again."""
+"""Repeated functions by the module of the job."""
 
 
 def keep_busy() -> None:
-    """Have the flight that this process opens keep its workers busy."""
+    """Let the flight of this process keep its workers busy."""
     from flight.app import flight as opening  # noqa: PLC0415
     from flight.app.flight import workers as made  # noqa: PLC0415
 

@@ -1,9 +1,8 @@
 """The command socket under a flood: `python -m tests.studies.bench command_flood [--seconds S]`.
 
-The step demonstration flies in real time and listens on UDP for commands: undisturbed, then with 20,000
-datagrams a second at its port that are not commands, then with 20,000 a second that begin like commands. A
-peer sends twenty pings, each once. The lateness of the control cycles and the number of answered pings are
-printed.
+The step demonstration runs in real time with a UDP command port: without a flood, with 20,000 datagrams a
+second that are not commands, and with 20,000 a second that begin like commands. A peer sends twenty pings,
+each once. The lateness of the control cycles and the number of answered pings are printed.
 """
 
 from __future__ import annotations
@@ -36,7 +35,10 @@ FLOODS = ("none", "no commands", "begin as commands")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly all and print; return 1 if a ping was lost, except under datagrams that begin like commands."""
+    """Run all cases and print.
+
+    Return 1 if a ping was lost, except under datagrams that begin like commands.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default %(default)s)"
@@ -53,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, seconds: float, kind: str) -> dict[str, Any]:
-    """Fly once under a kind of flood; return lateness, strangers' datagrams and the answered pings."""
+    """Run one case, and return the lateness, the number of flood datagrams, and the answered pings."""
     port, run, config = free_port(), place / "run", place / "flight.yaml"
     commands = json.dumps({"udp": f"127.0.0.1:{port}"})
     config.write_text(f"{CONFIG.read_text(encoding='utf-8')}\ncommands: {commands}\n", encoding="utf-8")
@@ -77,7 +79,7 @@ def measure(place: Path, seconds: float, kind: str) -> dict[str, Any]:
 
 
 def _datagrams(kind: str) -> list[bytes]:
-    """Return what strangers send: random bytes, or commands of which all but the beginning is random."""
+    """Return flood datagrams: random bytes, or commands with a valid start and random rest."""
     draw = np.random.default_rng(2)
     sizes = draw.integers(16, 200, _KINDS).tolist()
     found = [draw.bytes(size) for size in sizes]
@@ -88,7 +90,7 @@ def _datagrams(kind: str) -> list[bytes]:
 
 
 def _is_answered(port: int, number: int) -> bool:
-    """Send a ping once; return whether its answer came."""
+    """Send a ping once, and return whether its answer arrived."""
     try:
         return bool(exchange(f"127.0.0.1:{port}", CommandPacker().pack(Ping(number), utc_ns()), _ANSWER_S))
     except FlightError:

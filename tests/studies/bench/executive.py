@@ -1,13 +1,13 @@
 """The 40 Hz loop with everything running: `python -m tests.studies.bench executive [--minutes M] [--orbit]`.
 
 The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
-its devices: planner and vision have work without pause, the guardian watches. With `--orbit` the KnightCube
+its devices: planner and vision work without pause, and the guardian watches. With `--orbit` the KnightCube
 of `config/orbit.yaml` flies in its place, at nadir from the begin; its planner has the shortest period that
 the configuration allows, 10 s, and the wide cameras work as they fly; with `--busy` each worker does its
 last job again until the next one comes, so that none is ever idle. Beside it a bare absolute-sleep loop at
 the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the kernel the time
-that a virtual machine's host takes; a working loop meets such stalls more often than a sleeping loop. Where
-SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of
+that a virtual machine's host takes; a working loop meets such stalls more often than a sleeping loop. If
+SCHED_FIFO is permitted, the flight runs twice, with and without it. Run it alone on two cores. The slope of
 memory needs flights of 16 minutes or longer.
 """
 
@@ -51,13 +51,13 @@ from tests.support.lateness import Grid, draw
 from tests.support.process_watch import ProcessWatch, answering
 
 PRIORITY = 50
-"""Of the bare loop under SCHED_FIFO: that of the flight's control thread."""
+"""Priority of the bare loop under SCHED_FIFO, equal to that of the flight's control thread."""
 
 ORBIT = ROOT / "config" / "orbit.yaml"
 SHARED_LOOKS = 9
-"""How often it is looked at what the flight shares with other processes."""
+"""Interval at which the shared memory of the flight is sampled."""
 SHORTEST_REPLAN = 10.0
-"""s between the pointing's plans: the least that the schema allows."""
+"""Interval (s) of pointing plans: the shortest that the schema permits."""
 AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
 """The release: along the flight, the star camera at the sky, so that all work from the first minute on."""
 
@@ -83,12 +83,12 @@ _ROLES = {
     "tests.studies.bench.busy_jobs:see ": "vision",
     "tests.studies.bench.busy_jobs:see_wide": "wide",
 }
-"""By what stands in a process's command line."""
+"""Names of processes by a text in their command line."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """How long to fly, how often frames and plans are wanted, and how long to warm up, s; and what flies."""
+    """Duration, intervals of frames and plans, and warm-up time, s, and the configuration."""
 
     duration: float
     camera_period: float = 0.4
@@ -100,7 +100,7 @@ class Load:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Fly, print what was asked beside what was measured; return 1 when something misses it."""
+    """Run, print required and measured figures, and return 1 if a requirement is not met."""
     load, options = _load(arguments)
     flights: dict[str, Figures] = {}
     grids: dict[str, Grid] = {}
@@ -120,7 +120,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
-    """Return what to fly, and all options."""
+    """Return the configuration and all options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -158,7 +158,7 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
 
 
 def _schedulings(wanted: str) -> list[str]:
-    """Return how to fly; with SCHED_FIFO where that is allowed."""
+    """Return the ways to run, including SCHED_FIFO if it is permitted."""
     if wanted == "ordinary" or fifo_allowed():
         return ["fifo", "ordinary"] if wanted == "both" else [wanted]
     sys.stderr.write("SCHED_FIFO is refused here: flown without it\n")
@@ -197,7 +197,8 @@ def full_load(load: Load) -> str:
         tree["pointing"]["replan_period"] = SHORTEST_REPLAN
         tree["targets"] = [{"at": 0.0, "point": "nadir", "roll_deg": 0.0}]
         tree["simulation"]["free_body"]["release"] = AT_NADIR
-        # Of the simulated day, where the clock is the host's: the receiver alone gives time and place.
+        # The simulated date differs from the host's clock, so that only the GPS receiver gives time and
+        # position.
         del tree["elements"]
         return yaml.safe_dump(tree, sort_keys=False)
     tree = yaml.safe_load(TEXT)
@@ -208,7 +209,7 @@ def full_load(load: Load) -> str:
 
 @contextmanager
 def _compiled() -> Iterator[None]:
-    """Have Python find its modules compiled, as the installer leaves them, whatever this shell forbids."""
+    """Let Python use compiled modules, as after an installation, whatever the environment of the shell."""
     with tempfile.TemporaryDirectory() as folder:
         before = {name: os.environ.pop(name, None) for name in (_NO_BYTECODE, _BYTECODE)}
         os.environ[_BYTECODE] = folder
@@ -222,7 +223,7 @@ def _compiled() -> Iterator[None]:
 
 
 def fly(folder: Path, load: Load, fifo: bool) -> Flown:
-    """Fly once in `folder`, the bare loop beside it, and return what was measured."""
+    """Run once in `folder` beside the bare loop, and return the measured figures."""
     config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
     facts = devices / "facts.json"
     config.write_text(full_load(load), encoding="utf-8")
@@ -233,7 +234,7 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
                 "tests.studies.bench.bare_loop", str(PERIOD_NS), str(PRIORITY if fifo else 0), str(wakes)
             )
         )
-        # Devices as a board has its own: there before the flight.
+        # Devices that exist before the flight process, as on a board.
         outputs = "--folder", str(devices), "--facts", str(facts)
         stack.enter_context(answering("sim_hal", "serve", str(config), *outputs))
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -261,16 +262,16 @@ def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watc
                 notifications.recv(4096)
             if len(shared) < SHARED_LOOKS and time.monotonic() > due:
                 due += load.look_period
-                with suppress(OSError, LookupError, ValueError):  # one of them has just ended: again then
+                with suppress(OSError, LookupError, ValueError):  # a process has just ended: try again
                     present = members(flight)
                     held = sum(process_watch.look(present).memory.values())
                     shared.append(process_watch.unshared(present) - held)
-    # A job that begins or ends between the two looks would count as shared.
+    # A job that begins or ends between the two samples would count as shared.
     return Watched(watch.looks, max(0.0, median(shared)) if shared else 0.0)
 
 
 def members(flight: LiveFlight) -> dict[str, int]:
-    """Return the flight's processes by what they do."""
+    """Return the processes of the flight by their function."""
     found = {"control": flight.process.pid}
     for process in process_watch.below(flight.process.pid):
         words = process_watch.command(process)
@@ -281,12 +282,12 @@ def members(flight: LiveFlight) -> dict[str, int]:
 def _started(
     folder: Path, config: Path, notifications: socket.socket, load: Load, facts: Path, fifo: bool
 ) -> LiveFlight:
-    """Start the flight beside its devices, without a right to SCHED_FIFO when it is not to have it."""
+    """Start the flight beside its devices, without the right to SCHED_FIFO if this is requested."""
     started: list[LiveFlight] = []
 
     def start() -> None:
         if not fifo:
-            # Of this thread alone, and of what it starts.
+            # The right is removed from this thread and its child processes only.
             ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
         words = folder, config, notifications, load.duration, "--devices", str(facts)
         started.append(LiveFlight(*words, before=_KEPT_BUSY if load.busy else ""))

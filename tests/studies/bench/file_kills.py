@@ -1,8 +1,8 @@
-"""A file through killed processes: `python -m tests.studies.bench file_kills [--kills N] [--seed S]`.
+"""File transfer with killed processes: `python -m tests.studies.bench file_kills [--kills N] [--seed S]`.
 
 Link process and the ground's `flight files` are processes of their own, on loopback. In each of N transfers,
-down and up by turns, each of them once gets SIGKILL at a drawn moment and is started again. Counted are the
-transfers whose file came whole (SHA-256) and of which neither end has one open in the end.
+alternately down and up, each process gets one SIGKILL at a random time and is restarted. The bench counts the
+transfers whose file arrived whole (SHA-256) and that are closed at both ends.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from tests.support.linked_flight import service
 
 _RATE = 1.5e5
 _START_S, _LATEST_S = 1.0, 3.0
-"""What a process needs to start, and within what time then it is killed."""
+"""Time (s) that a process needs to start, and time (s) after the start within which it is killed."""
 _PATIENCE_S = 120.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Transfer, kill, print; return 0 when all came whole and were closed."""
+    """Run and print all transfers; return 0 if all files arrived whole and all transfers were closed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20, metavar="N", help="of each side (default 20)")
     parser.add_argument("--megabytes", type=float, default=1.0, metavar="M", help="of the file (default 1)")

@@ -1,8 +1,8 @@
-"""A file through the link at losses: `python -m tests.studies.bench files [--megabytes M] [--seed S]`.
+"""File transfer with losses: `python -m tests.studies.bench files [--megabytes M] [--seed S]`.
 
-Link process and ground in one process, in protected frames, on a clock that is moved; frames are lost at
-random in both directions alike. Stated are for each loss and direction whether the file came whole and both
-ends closed, and seconds of that clock and of the processor.
+Link and ground run in one process on a manual clock with protected frames. Frames are lost at random with the
+same probability in both directions. For each loss and direction, the bench states whether the file arrived
+whole and both ends closed, the duration on the clock, and the processor time.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from tests.flight.link.process.filed_ends import FiledEnds
 
 _LOSSES = (0.0, 0.1, 0.3)
 _RATE = 250_000.0
-"""Bytes/s of frames, both ways."""
+"""Data rate of frames (bytes/s) in both directions."""
 _LONGEST_NS = 7200 * 10**9
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Transfer all, print; return 0 when all came whole."""
+    """Run and print all transfers; return 0 if all files arrived whole."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of the file (default 10)")
     parser.add_argument("--seed", type=int, default=1, metavar="S")
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, size: int, loss: float, seed: int, *, down: bool) -> dict[str, Any]:
-    """Transfer one file; return what came of it."""
+    """Transfer one file, and return the result."""
     data = np.random.default_rng(seed).bytes(size)
     link = FiledEnds(place, rate=_RATE, loss=loss, up_rate=_RATE, seed=seed)
     begun, begun_ns = time.process_time(), link.clock.now_ns()

@@ -1,7 +1,7 @@
 """How long the coils carry current after a fault: `python -m tests.studies.bench guardian [ROUNDS]`.
 
-Flights in real time on emulated devices in a process of their own are stopped, hung and killed; the time is
-that from the act to zero in the devices' own log (25 ms apart). The guardian owes 0.5 s.
+Flights in real time on emulated devices in a process of their own are stopped, hung and killed; the measured
+time is from the act to zero current in the devices' log (every 25 ms). The guardian owes 0.5 s.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tests.hal.guardian.campaign import UNGUARDED, Hurt, hurt_in_every_way
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the table; fail when a coil was driven for longer than 0.5 s."""
+    """Print the table, and fail if a coil was driven for more than 0.5 s."""
     rounds = int(arguments[0]) if arguments else 3
     found: defaultdict[str, list[Hurt]] = defaultdict(list)
     for _ in range(rounds):

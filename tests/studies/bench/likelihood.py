@@ -38,7 +38,10 @@ _BRIGHT = 8
 
 
 def estimated(scene: Scene, known_sky: bool) -> MotionResult:
-    """Return the motion of a frame, the true rate giving its sign; of the second fit for a known sky."""
+    """Return the motion of a frame with the sign of the true rate.
+
+    For a known sky, that of the second fit.
+    """
     found = estimate_motion(scene.pixels, CAMERA.pinhole, scene.exposure, _SETTINGS, scene.rate, 0.0)
     if not known_sky or found.rate is None:
         return found
@@ -74,9 +77,9 @@ def rate_row(
 
 
 def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[float]:
-    """Return the squared errors, over the bound, of the brightest stars' places; 1 is expected.
+    """Return the squared position errors of the brightest stars relative to the bound; 1 is expected.
 
-    A streak with both ends outside has no place along itself and is left out.
+    A streak with both ends outside has no determined position along its direction and is omitted.
     """
     out = []
     bright = scene.stars[:_BRIGHT]

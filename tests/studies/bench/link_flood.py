@@ -2,8 +2,8 @@
 
 The step demonstration flies in real time on its emulated devices beside its link process: alone, then with
 10,000 forged frames a second at the link while it plays the archive back and sends a file of 50 MB down, at
-a megabyte a second together. Stated are the lateness of the control cycles, what the link and its ground
-counted, and how much of the file came.
+a megabyte a second together. The bench states the lateness of the control cycles, the counts of link and
+ground, and the received part of the file.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
-    """Fly once; return lateness in ms by quantile, cycles, and the link's counts."""
+    """Run once, and return quantiles of the lateness, ms, the number of cycles, and the link's counts."""
     with ExitStack() as stack:
         port = free_port()
         config = write_linked_config(place, udp=f"127.0.0.1:{port}", rate=1e6)
@@ -80,7 +80,7 @@ def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
 
 
 def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool) -> dict[str, int]:
-    """Receive telemetry until the flight is over, and have it played back again and again; return counts."""
+    """Receive telemetry and request playbacks until the flight ends, and return counts."""
     keys = place / "keys" / "ground"
     terminal = open_terminal(f"127.0.0.1:{port}", keys)
     store, now_ns = Store(place / "ground-files"), time.monotonic_ns()
@@ -110,7 +110,7 @@ def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool)
 
 
 def _flood(port: int, ended: threading.Event, forged: list[int]) -> None:
-    """Send forged and damaged frames until `ended`; note how many in each burst."""
+    """Send forged and damaged frames until `ended`, and record the number in each burst."""
     chance = Random(1)
     with tempfile.TemporaryDirectory() as folder:
         attacker = LinkAttacker(Path(folder))

@@ -2,8 +2,8 @@
 
 Each time a link process takes the commands of a ground while an attacker sends every old frame again, and is
 killed (SIGKILL) before or after one of its calls that write to the disk or to the socket of the flight;
-some of the writes are cut in the middle first. The ground's sender is killed in the same way. Counted
-are commands that the flight received twice, and counters that two frames have.
+some of the writes are cut in the middle first. The ground's sender is killed in the same way. The bench
+counts commands that the flight received twice, and counters that two frames share.
 
 With `--scheduled` the commands stand in the link's schedule and fall due while the link process is killed.
 A second process, which is not killed, takes over. Counted are commands that the flight received twice,
@@ -192,7 +192,7 @@ class Way:
         os.kill(os.getpid(), signal.SIGKILL)
 
     def pwrite(self, file: int, data: bytes, offset: int) -> int:
-        """Write, or write half or all and die."""
+        """Write, or write half or all of the data and die."""
         if self.ends():
             self._pwrite(file, data[: len(data) // 2] if self._torn else data, offset)
             self.die()

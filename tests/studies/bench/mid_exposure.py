@@ -1,4 +1,4 @@
-"""The attitude at mid-exposure of a streaked frame beside its bound.
+"""Error of the attitude at mid-exposure of a streaked frame, relative to its lower bound.
 
 `python -m tests.studies bench mid_exposure`.
 
@@ -41,14 +41,14 @@ _STARS = 30
 _SHARED = 4
 EXPOSURE = 0.2
 SOLUTIONS = ("flight", "known sky")
-# rad: by how much the tracker's prior is wrong about each axis, and believed to be.
+# Error (rad) of the tracker's prior about each axis, and its claimed standard deviation.
 _PRIOR_ERROR, _PRIOR_SIGMA = np.array([2e-4, -1e-4, 1e-4]), 3e-4
 # Median of the distance of a point whose two coordinates have the rms distance 1.
 _RAYLEIGH_MEDIAN = float(np.sqrt(np.log(2.0)))
 
 
 def estimated(pixels: Image, rate: FloatArray, exposure: float, camera: StarCameraModel) -> MotionResult:
-    """Return what the likelihood estimator says of a frame; the true `rate` (3,) only gives the sign."""
+    """Return the likelihood estimate of a frame; the true `rate` (3,) is used only for the sign."""
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
     return estimate_motion(pixels, camera.pinhole, exposure, settings, rate, 0.0)
 
@@ -62,7 +62,7 @@ def scenes(
     seed: tuple[int, ...],
     faintest: float,
 ) -> list[Scene]:
-    """Return frames of a turn of `percent` of the field, theta spread evenly over `thetas` deg.
+    """Return frames with a rotation of `percent` of the field, and theta spread evenly over `thetas` deg.
 
     The sky holds stars down to magnitude `faintest`.
     """
@@ -86,7 +86,7 @@ def _by_attitude(vectors: FloatArray, pinhole: Pinhole) -> FloatArray:
 
 
 def across_bound(scene: Scene, camera: StarCameraModel) -> float:
-    """Return the least rms error of the boresight's direction, rad, of any unbiased attitude.
+    """Return the lower bound of the rms error, rad, of the boresight direction.
 
     Raises numpy.linalg.LinAlgError when the stars fix none.
     """
@@ -123,7 +123,7 @@ def across_bound(scene: Scene, camera: StarCameraModel) -> float:
 def tracked(
     found: MotionResult, scene: Scene, camera: StarCameraModel, truth: FloatArray
 ) -> tuple[FrameSolution, FrameSolution]:
-    """Return what the star tracker makes of the fit, and of a second one with all stars known."""
+    """Return the solutions of the star tracker for the fit, and for a second fit with all stars known."""
     settings = SolveSettings(
         likelihood=LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, line_time=0.0)
     )
@@ -193,7 +193,7 @@ def _figures(angles: FloatArray, least: FloatArray, pixel: float) -> dict[str, A
 
 
 def _root_mean_square(values: FloatArray) -> float | None:
-    """Return that of the values that there are, None without any."""
+    """Return the statistic of the existing values, or None without values."""
     there = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(there)))) if len(there) else None
 

@@ -1,9 +1,9 @@
 """Processor time of a flight in lock-step: `python -m tests.studies.bench orbit_cost [--config FILE]`.
 
 Flies the first seconds of config/orbit.yaml, from the tip-off to pointing, or of another configuration by
-`flight run`, and reads from its log the processor time of a control cycle and of the workers' jobs. A cycle
-includes the emulated side of the coils' wire, but not the jobs. On a machine that is slower than an ordinary
-one, times are scaled down.
+`flight run`, and reads from its log the processor time of a control cycle and of the workers' jobs. The time
+of a cycle includes the emulated devices on the coils' bus, but not the jobs. On a slow machine, times are
+scaled to those of a standard machine.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def figures(run: Run, slowness: float) -> str:
-    """Return what a cycle took in each mode, and the jobs' time for each second of flight.
+    """Return the time of a cycle in each mode, and the time of the jobs per second of flight.
 
     The times are divided by the `slowness` of the machine.
     """
@@ -86,7 +86,7 @@ def figures(run: Run, slowness: float) -> str:
 def command_s(*arguments: str) -> tuple[float, float]:
     """Return the processor time of a command of the flight application, s, and the slowness of this machine.
 
-    The time includes that of the child processes and is that of an ordinary machine.
+    The time includes child processes and is scaled to a standard machine.
     """
     begun, paces = _children_s(), [pace_s()]
     words = [sys.executable, "-c", BY_PROCESSOR, *arguments]

@@ -2,9 +2,9 @@
 
 Slews of 30 to 180 deg from rest to rest, of a 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2, 80 to 400 s) and a 3U
 (0.0066 and 0.0333 kg m^2, 0.2 A m^2, 300 to 1,200 s), in the orbits of the space station and of a
-Sun-synchronous satellite, in the field of WMM2025. `--recorded` plans those of `optimum_orbit.json` beside
-their optima, and flies the dipoles by an integrator of the test's own. `--job` runs the planner's job of the
-flight instead: prediction, slew within cones, planned with air and sunlight and then planned again with
+Sun-synchronous satellite, in the field of WMM2025. `--recorded` plans the slews of `optimum_orbit.json`,
+compares them with their optima, and integrates the dipoles independently. `--job` runs the planner's job of
+the flight instead: prediction, slew within cones, planned with air and sunlight and then planned again with
 the areas that the body exposes on it, and table. Times are of this process's processor.
 """
 
@@ -140,7 +140,7 @@ def _jobs(runs: int, seed: int) -> int:
 
 
 def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
-    """Return the job of a task whose torques are by `draw` (9,) of those that a filter expects."""
+    """Return the job of a task whose torques are `draw` (9,) times those that a filter expects."""
     craft = {"1U": "knightcube", "3U": "cubesat_3u"}[name[:2]]
     place = task.along(np.array([0.0, 1.0])).position
     end = task.end(task.horizon)

@@ -4,7 +4,7 @@ Random slews over the testbed's range, with thread, disturbance and moving ends
 (tests.support.step_problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one,
 and too short ones, which are stretched.
 Solve times are of this process's processor time; cost is compared with the collocation oracle at the same
-horizon; limits are watched on 4001 points of the path.
+horizon; limits are checked at 4001 points of the path.
 """
 
 from __future__ import annotations

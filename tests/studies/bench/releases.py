@@ -1,12 +1,11 @@
 """Real releases renewed over the link: `python -m tests.studies.bench releases`.
 
 The releases are built from the sources of this repository with pip, virtual environments and the packages
-of this Python environment. Only systemd and the radio are stand-ins. The first release is installed into a
-folder by `deploy/install.sh`. The second release has a higher version. Its bundle is signed, sent up by
-CFDP, activated, built by the privileged program (which is killed once during the build), tested, flown and
-confirmed. The ground withdraws it, and the first release flies again. A third release passes its self-test,
-but its flight of the board's configuration ends at once, so that its trial ends with the return to the
-release before it.
+of this Python environment. Only systemd and the radio are replaced by test doubles. The first release is
+installed into a folder by `deploy/install.sh`. The second release has a higher version. Its bundle is signed,
+sent up by CFDP, activated, built by the privileged program (which is killed once during the build), tested,
+flown and confirmed. The ground withdraws it, and the first release flies again. A third release passes its
+self-test, but its flight with the board's configuration ends at once, so that the previous release returns.
 """
 
 from __future__ import annotations
@@ -87,7 +86,7 @@ class RealBoard(FakeBoard):
         (release / "manifest").write_text(releases.manifest_text(release), encoding="utf-8")
 
     def fly(self, *program: str) -> tuple[str, str]:
-        """Start the flight by the launcher; return the version that flew ("" for none) and the messages."""
+        """Start the flight by the launcher, and return the started version ("" for none) and the messages."""
         state = self.root / "state"
         state.mkdir(exist_ok=True)
         text = (self.root / "etc/knightcube/flight.yaml").read_text(encoding="utf-8")
@@ -127,7 +126,7 @@ class RealReleases(RenewedBoard):
 
 
 class Rehearsal:
-    """The steps of the bench, each with the version that flies after it and its duration."""
+    """The steps of the benchmark, each with the version in use after it and its duration."""
 
     def __init__(self, place: Path) -> None:
         self._begun = time.monotonic()
@@ -138,7 +137,7 @@ class Rehearsal:
         self._note(f"install.sh installs {__version__}")
 
     def _note(self, step: str, **facts: object) -> None:
-        """Fly, and print a step of the rehearsal."""
+        """Start the flight, and print a step of the benchmark."""
         seconds = round(time.monotonic() - self._begun, 1)
         flown = self.ends.flown_release()
         row = {"step": step, "flies": flown, "answers": self.ends.answers(), "s": seconds, **facts}
@@ -162,7 +161,7 @@ class Rehearsal:
         self._note(f"{version} is activated", bundle_bytes=bundle.stat().st_size, killed=killed)
 
     def command(self, directive: Confirm | Withdraw, step: str) -> None:
-        """Send a command about the release, and note what flies after it."""
+        """Send a command about the release, and record the version in use after it."""
         self.ends.ask(directive)
         self.ends.turn(1.5)
         self.advance()
@@ -176,7 +175,7 @@ class Rehearsal:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Renew the releases; return 0 if the expected release flies after each step."""
+    """Renew the releases, and return 0 if the expected release is in use after each step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.parse_args(arguments)
     minor, _, patch = __version__.rpartition(".")

@@ -4,9 +4,10 @@ Photographs: those of a folder with a `truth.json` (right ascension and declinat
 the horizontal field, degrees), with the field known to 5 % and, where it is of 10 to 30 deg, unknown.
 Simulated frames: the simulator's camera of 12 deg and 0.1 s, with the field known to 0.1 deg, the axis of
 the turn 30 to 90 deg off the boresight, and across it. The bounds are Cramer-Rao's: `over bound`, the rms
-error across the boresight over that of the stars' places, and `bound`, that of the rate's magnitude. The
-names of the stars lower the latter by 2 % at most: a streak's length gives the rate, its middle the place.
-Times are of one core's CPU; peers extract the stars themselves, as they come and with their filters off.
+error across the boresight over that of the stars' places, and `bound`, that of the rate's magnitude.
+Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths of
+streaks. Times are of one core's CPU; peers extract the stars themselves, with their default filters and
+without filters.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def _or_nan(figure: Any, values: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Case:
-    """A frame for the peers: of which configuration, its truth (3,), and the job as they take it."""
+    """A frame for the peers: its configuration, its truth (3,), and the job in their format."""
 
     configuration: str
     boresight: FloatArray

@@ -1,8 +1,8 @@
 """Rates from streaks during a slew: `python -m tests.studies.bench slew_frames [--as-they-come]`.
 
 The 3U of `config/orbit_3u.yaml` is released near rest, holds its attitude and slews by 100 deg in 300 s or
-more, a frame every 5 s, through the whole loop. Exposures keep clear of the coils' steps, or begin whenever
-the camera's turn comes. Rates are compared with the truth's mean over their exposures.
+more, a frame every 5 s, through the whole loop. Exposures avoid the steps of the coils, or begin at the
+scheduled times of the camera. Rates are compared with the truth's mean over their exposures.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class _Unscheduled(SatelliteControl):
 
 
 def _as_they_come(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
-    """Return the satellite with exposures whenever the camera's turn comes."""
+    """Return the satellite with exposures at the scheduled times of the camera."""
     body = ORBIT.make(config, services, learned)
     estimation = body.estimation
     assert isinstance(estimation, SatelliteEstimation)

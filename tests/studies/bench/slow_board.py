@@ -1,13 +1,12 @@
-"""A board of the 800 MHz class: `python -m tests.studies.bench slow_board [--orbit] [--share S]`.
+"""Flight on a board of the 800 MHz class: `python -m tests.studies.bench slow_board [--orbit] [--share S]`.
 
-The flight flies in real time on emulated devices, with vision and planner, in a share of one core and in
-512 MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz: the yardstick (heap sort
-and Linpack's elimination) is measured here and compared with the published figures of that processor
+The flight runs in real time on emulated devices, with vision and planner, in a fraction of one core and 512
+MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz: the yardstick (heap sort and
+Linpack's elimination) is measured here and compared with the published figures of that processor
 (`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The emulated
-devices are outside the limit. `--camera-period` and `--replan-period` ask for more work than fits, so that
-work is shed.
-Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`. `user_mode_linux.sh` runs the
-bench with cgroup v2 on a machine with cgroup v1.
+devices are outside the limit. `--camera-period` and `--replan-period` can request more work than the board
+can do, so that work is shed. Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`.
+`user_mode_linux.sh` runs the bench with cgroup v2 on a machine with cgroup v1.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ class Wish:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure the yardstick, fly, and print what fitted and what was shed."""
+    """Measure the speed of the core, run the flight, and print the completed and the shed work."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -180,7 +179,7 @@ def _demote(flight: LiveFlight, limits: Limits, stop: threading.Event) -> None:
 
 
 def _shed(run: Run, seconds: float) -> Figures:
-    """Return what the flight says it did and shed."""
+    """Return the completed and the shed work that the flight reports."""
     house, load = run["housekeeping"], run["workload"]
     last = house[-1]
     span = (int(last["time_ns"]) - int(house[0]["time_ns"])) * 1e-9

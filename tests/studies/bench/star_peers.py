@@ -1,10 +1,10 @@
 """Other people's star identification on our lists: tests/studies/bench/star_peers.py PEER JOBS.json.
 
-Runs by itself, with nothing of this repository, in whichever Python the peers are installed in: cedar-solve
-wants numpy below 2. A job is a list (`pixels`, `size`) or a frame (`image`, a file of numpy), with the field
-and what it is known to in degrees; of a frame the peer's own extraction is timed too. Prints one JSON
-object: of each job milliseconds of CPU and the boresight (3,), or null where the peer refused; and what the
-process grew by in resident memory with the catalogue and the index, after the peer itself was imported.
+The program runs without this repository in the Python of the peers, because cedar-solve needs numpy below 2.
+A job is a list (`pixels`, `size`) or a frame (`image`, a file of numpy), with the field and what it is known
+to in degrees; of a frame the peer's own extraction is timed too. Prints one JSON object with the CPU time
+(ms) and the boresight (3,) of each job, or null for a refusal, and the growth of resident memory by catalogue
+and index after the import of the peer.
 """
 
 import importlib
@@ -26,7 +26,7 @@ def direction(right_ascension: float, declination: float) -> list[float]:
 
 
 def cedar(**extraction: Any) -> Solver:
-    """Return cedar-solve with the database it comes with, 10 to 30 deg."""
+    """Return cedar-solve with its own database of 10 to 30 deg."""
     import numpy as np  # noqa: PLC0415 - of the peer's Python, where it is asked for
 
     tetra3: Any = importlib.import_module("tetra3")
@@ -84,7 +84,7 @@ PEERS: dict[str, tuple[str, Callable[[], Solver]]] = {
     "tetra3rs": ("tetra3rs", tetra3rs),
     "tetra3rs, any shape": ("tetra3rs", lambda: tetra3rs(max_elongation=None, max_sharpness=None)),
 }
-"""Of each the module it is imported by, and what makes its solver: as it comes, or its filters off."""
+"""Module and solver factory of each peer, with its default filters or without filters."""
 
 
 def main(peer: str, path: str) -> int:

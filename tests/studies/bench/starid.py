@@ -2,9 +2,9 @@
 
 The twelve configurations of issue 4 (1024 x 1024 pixels; 12 and 20 deg; 0.1 and 0.5 px of noise; 0, 2, 5
 false stars; the field known to 0.1 deg and really that far off), then the field unknown between 10 and 30
-deg, and lists that show no part of the sky. A list is right when its boresight is right to 0.05 deg and
-four in five of the stars named are those drawn. Times are of CPU, one core, one list a call; peers run in
-their own process.
+deg, and lists that show no part of the sky. An answer is correct if its boresight is correct to 0.05 deg and
+80 % of the identified stars are correct. Times are of CPU, one core, one list a call; peers run in their own
+process.
 
 `bound`: the median over the lists of pointing error over the median that the centroid noise allows, from
 the Fisher information of all true stars of the list with attitude and scale unknown (1.1774 sigma: Rayleigh).
@@ -163,7 +163,7 @@ def row_of(
 
 
 def memory_of_index() -> float:
-    """Return by how many megabytes a process grows that loads the index and identifies a list."""
+    """Return the memory growth, MB, of a process that loads the index and identifies a list."""
     script = (
         "import resource, numpy as np\n"
         "from knightcube.vision.startracker.index.build import default_index\n"
@@ -212,7 +212,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return all figures."""
     sky = default_index()
     everything = cases(options.lists, sky, options.seed)
-    # The first call of each numpy function and each list of triangles costs once a process.
+    # The first call of each numpy function and the first use of each triangle list take extra time.
     our_answers(everything[next(iter(everything))][:20], sky)
     rows = []
     bounds = {
@@ -267,7 +267,7 @@ def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> di
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables; 1 when a list was named wrongly."""
+    """Print the tables, and return 1 if a list was identified wrongly."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lists", type=int, default=200, help="of each configuration (default %(default)s)")
     parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")

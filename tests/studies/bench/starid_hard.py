@@ -1,11 +1,11 @@
-"""Star identification where lists are hard: `python -m tests.studies.bench starid_hard`.
+"""Star identification in difficult lists: `python -m tests.studies.bench starid_hard`.
 
 Fields of view unknown, false stars that are all brighter than the true ones, mirrored images, hints of the
 field that are 10 % wrong, lenses with 2 to 8 % of distortion that nobody calibrated, and points that show no
 part of the sky, with the times of their refusals. Lists as in the bench `starid`; `wrong` is an answer that
-is not right. Of distorted lenses an answer is misleading that is off by more than five of its own sigmas and
-120 arcseconds. The status is 1 when an answer is wrong or misleading. `--peer` runs tetra3rs or cedar-solve
-on the same lists.
+is not right. For a distorted lens, an answer is misleading if its error exceeds both five sigmas and 120
+arcseconds. The status is 1 when an answer is wrong or misleading. `--peer` runs tetra3rs or cedar-solve on
+the same lists.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ _EVEN = 10.0, 30.0
 
 @dataclass(frozen=True, slots=True)
 class Hardship:
-    """One row: a kind of list, the fields of view (lowest, highest) deg it is drawn from, and what is wrong.
+    """One row: a kind of list, its range of fields of view (deg), and its difficulties.
 
     Attributes:
-        kind: the field of view of it is drawn.
+        kind: name of the row.
         fields: deg.
-        distorted: whether the lens is, by _DISTORTION at the corner, and the false stars 0 to 5.
+        distorted: whether the lens is distorted by _DISTORTION at the corner, with 0 to 5 false stars.
         hint: relative error of the field of view given.
-        strewn: whether the points show no part of the sky.
+        strewn: whether the points are random.
     """
 
     kind: ListKind
@@ -97,7 +97,7 @@ def drawn_list(row: Hardship, stars: GuideStars, rng: np.random.Generator) -> St
 
 
 def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[StarMatch, float]:
-    """Return our answer and its milliseconds."""
+    """Return the project's answer and its time, ms."""
     field = drawn.field()
     if row.hint:
         field = replace(field.rescaled(1.0 + row.hint), scale=field.scale)
@@ -107,7 +107,7 @@ def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[StarMatch, 
 
 
 def verdict(row: Hardship, drawn: StarList, found: StarMatch) -> str:
-    """Return right, wrong or refused; of a distorted lens right, misleading or refused."""
+    """Return "right", "wrong" or "refused"; for a distorted lens "right", "misleading" or "refused"."""
     if found.fix is None:
         return "refused"
     matched = found.star >= 0

@@ -1,4 +1,4 @@
-"""Commands and lateness beside strangers: `python -m tests.studies.bench strangers [--rounds N]`.
+"""Commands and lateness under attack by strangers: `python -m tests.studies.bench strangers [--rounds N]`.
 
 In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
 quiet, and attacked. The attackers share one core. They send 30,000 datagrams a second from an address that is
@@ -6,9 +6,9 @@ not a peer's, and open 200 TCP connections a second from a peer's address, each 
 With `--forged N` they also send N forged frames a second from a peer's address: replayed, damaged and without
 the key. The link has to examine these frames, so that commands by UDP may be lost among them.
 In both flights the operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a
-new one. Printed are the obeyed commands, the rates of the attackers and the lateness of the control cycles.
-The exit status is 1 if a command was not obeyed, or if the 99 % quantile of the lateness is more than twice
-that of the quiet flights (medians over the rounds).
+new one. The bench prints the executed commands, the rates of the attackers, and the lateness of the control
+cycles. The exit status is 1 if a command was not obeyed, or if the 99 % quantile of the lateness is more than
+twice that of the quiet flights (medians over the rounds).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> dict[str, Any]:
-    """Fly once; return the commands that were obeyed, the lateness in ms and the strangers' rates."""
+    """Run once, and return the executed commands, the lateness, ms, and the rates of the attackers."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     with ExitStack() as stack:
         config, run = (
@@ -117,7 +117,7 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
     ways = (f"127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}", f"tcp:127.0.0.1:{tcp}")
     with ExitStack() as stack:
         lasting = [stack.enter_context(contextlib.closing(open_terminal(way, keys))) for way in ways[:2]]
-        for terminal in lasting:  # as gateway and console do; strangers displace a connection without a frame
+        for terminal in lasting:  # like gateway and console
             terminal.send(packer.pack(Ping(), utc_ns()))
         for number in range(count):
             try:

@@ -54,7 +54,7 @@ def campaigns() -> dict[str, Listed]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a campaign; return the exit status: 0 done, 1 the cluster was lost, 2 wrong use, 130 broken off."""
+    """Run a campaign, and return the exit status: 0 done, 1 cluster lost, 2 wrong use, 130 interrupted."""
     known = campaigns()
     listed = "\n".join(f"  {name:18} {campaign.purpose}" for name, campaign in known.items())
     parser = argparse.ArgumentParser(

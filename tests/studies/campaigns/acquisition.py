@@ -1,9 +1,9 @@
-"""Campaign `acquisition`: from a slow turn, lost in space, to a fine attitude, in the loop.
+"""Campaign `acquisition`: from a slow rotation, lost in space, to a fine attitude in the loop.
 
-Every flight has an attitude, an axis of its turn and a place in the orbit of its own; the receiver has a fix
-after a second. The star camera is blind while the Sun is near its field or lit ground in it. Flights in the
-sunlight and in the shadow are counted apart. Errors and claims are those of the star camera's attitude; the
-attitude of the body has the error of the mounting, too.
+Each run has its own attitude, rotation axis and position in the orbit; the receiver has a fix after a second.
+The star camera is blind while the Sun is near its field of view, or sunlit ground is in it. Runs in sunlight
+and in shadow are counted separately. Errors and claims are those of the star camera's attitude; the attitude
+of the body has the error of the mounting, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.support.flights import CONFIG, fly
 ORBIT = CONFIG.parent / "orbit.yaml"
 SPEED, DURATION = math.radians(0.5), 120.0
 WANTED, SETTLED = 60.0, 10.0
-"""s: from lost to fine, and after which a fine attitude is judged."""
+"""Limits (s): time to a fine attitude, and time after which a fine attitude is judged."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:

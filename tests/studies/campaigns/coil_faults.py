@@ -1,9 +1,9 @@
-"""Campaign `coil-faults`: the estimate while a coil does not carry the commanded current.
+"""Campaign `coil-faults`: accuracy of the filter while a coil does not carry the commanded current.
 
 Each run flies 20 s of the demonstration's loop in lock-step, without a camera, through two slews, and breaks
-one coil or one leg of a bridge at a random time, for 3 s or to the end. The inertial unit stays healthy. From
+one coil or one leg of a bridge at a random time, for 3 s or to the end. The IMU has no fault. From
 log and truth: for how long after the fault's onset and end the estimated rate or angle is more than 5 of its
-own standard deviations off; how long after the onset measurements of the healthy unit are still refused; how
+own standard deviations off; how long after the onset measurements of the healthy IMU are still refused; how
 often control was lost.
 """
 
@@ -34,9 +34,9 @@ DURATION = 20.0
 SPAN = 3.0
 SIGMAS = 5.0
 LONGEST_BEYOND = 0.25
-"""s: the limit of the time that the estimate may be beyond `SIGMAS` after an onset or an end."""
+"""Longest time (s) for which the estimate may be beyond `SIGMAS` after an onset or an end."""
 LONGEST_REFUSAL = 0.5
-"""s after the onset, from which on no measurement of the healthy unit may be refused."""
+"""Time (s) after the onset from which no measurement of the healthy IMU may be refused."""
 
 
 def faults() -> list[str]:
@@ -59,7 +59,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly one case and judge its estimate."""
+    """Run one case and judge its estimate."""
     rng = np.random.default_rng(case.seed)
     fault, span = case.parameters["fault"], case.parameters["span"]
     entry = FaultEntry(fault=fault, at=float(rng.uniform(4.0, 11.0)), span=span)
@@ -81,7 +81,7 @@ def config_for(slews: tuple[float, float]) -> Config:
 
 
 def judge(flown: Run, entry: FaultEntry) -> Result:
-    """Return how long the estimate was dishonest, and when healthy measurements were refused."""
+    """Return how long the error exceeded the limit, and when healthy measurements were refused."""
     beyond, times = estimate_beyond(flown)
     period = float(np.median(np.diff(times)))
     begin = entry.at or 0.0
@@ -148,7 +148,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _first(event: Any, names: Sequence[str], name: str, after: float) -> float | None:
-    """Return when an event came first, s after a time, None if never."""
+    """Return the time, s, from a given time to the first event of a name, or None."""
     at = event["time_ns"][np.array([one == name for one in names], bool)] / SECOND_NS - after
     return min(at[at >= 0.0].tolist(), default=None)
 

@@ -5,8 +5,8 @@ control on its testbed (ch. 5, Hardware Results). Here all fly the same simulate
 noise: this loop, also with paths that save supply energy, the thesis's, the thesis's on raw readings (its
 filter made transparent), and PID and adaptive control, which are shown the targets themselves. All gains of
 PID and adaptive are tuned by one criterion, `python -m tests.studies.tune_controllers`: the least power with
-every step settled in 9 s and overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone,
-and a PID by three poles in one place, stand beside them.
+every step settled in 9 s and overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone
+and a PID with three equal poles are compared with them.
 
 Two powers are given (`knightcube.gnc.guidance.one_axis.plant`): V |I|, which the chopped coils take from
 their supply of 3.4 V and which compares with the thesis's consumption, and R I^2 of the mean current, the
@@ -17,8 +17,8 @@ it printed (R I^2), so the controllers of `STIFF` are also flown on this thread,
 tuned for it.
 
 The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
-command and held, by direct collocation (tests.support.collocation_oracle). What reaches its targets later
-may lie below.
+command and held, by direct collocation (tests.support.collocation_oracle). A controller that reaches its
+targets later may use less power.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ THESIS_W = {"thesis": 0.10, "thesis, raw readings": 0.10, "pid": 0.15, "adaptive
 
 
 def this_loop() -> TestbedConfig:
-    """Return the demonstration as it is flown here, without its camera."""
+    """Return the demonstration with the project's controllers, without camera."""
     return demo_config(DURATION, camera=False)
 
 
@@ -54,7 +54,7 @@ def thesis_loop() -> TestbedConfig:
 
 
 def raw_thesis_loop() -> TestbedConfig:
-    """Return the thesis's loop on each reading as it comes: to the filter readings are without noise."""
+    """Return the thesis's loop with unfiltered readings: the filter assumes readings without noise."""
     config = thesis_config(DURATION)
     unit = configuration.replace(config.inertial_unit, angle_noise=3e-4, rate_noise=3e-5)
     estimation = configuration.replace(
@@ -64,7 +64,7 @@ def raw_thesis_loop() -> TestbedConfig:
 
 
 def towards_steps(**control: Any) -> TestbedConfig:
-    """Return the demonstration with another controller, which is shown the targets themselves."""
+    """Return the demonstration with a given controller that receives the targets instead of a path."""
     config = this_loop()
     return configuration.replace(
         config,
@@ -74,7 +74,7 @@ def towards_steps(**control: Any) -> TestbedConfig:
 
 
 def supply_saving() -> TestbedConfig:
-    """Return the demonstration as flown here, with paths that save supply energy."""
+    """Return the demonstration with paths of minimum supply energy."""
     config = this_loop()
     return configuration.replace(config, guidance=configuration.replace(config.guidance, cost="supply"))
 
@@ -106,7 +106,7 @@ def stiff_adaptive() -> TestbedConfig:
 
 
 def placed_pid() -> TestbedConfig:
-    """Return the demonstration under PID control with three poles in one place."""
+    """Return the demonstration under PID control with three equal poles."""
     return towards_steps(tracker="pid", bandwidth=0.76)
 
 
@@ -184,7 +184,7 @@ def run(case: Case) -> Result:
 
 
 def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
-    """Return the largest figure; infinite when a step never came to it."""
+    """Return the largest figure, or infinity if a step did not reach it."""
     return max(np.inf if row[key] is None else row[key] for row in rows)
 
 

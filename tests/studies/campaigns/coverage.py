@@ -1,11 +1,11 @@
-"""Campaign `coverage`: what the cameras of VT, UW and USU have in view along the orbit (Meller et al., 4).
+"""Campaign `coverage`: stars, Sun and limb in view of the cameras of VT, UW and USU (Meller et al., 4).
 
-Each run is one revolution of the paper's orbit from a random date and node, for each suite and way to fly:
-level; rolled and pitched by up to 15 deg (4.1); tipped back and forth by 90 deg in pitch (4.3); any
-attitude at all. It gives the share of time with the horizon, lit or not, in 0, 1, 2, ... cameras, and that
-of the sunlit time with the Sun in a camera. For UW, level, the Sun's share is given over the Sun's height
-over the orbit's plane (beta) and three headings of the hexagon, for the square detector and for the cone in
-it: the paper names none of them.
+Each run is one revolution of the paper's orbit with a random date and node, for each camera suite and each
+kind of attitude: level; rolled and pitched by up to 15 deg (4.1); pitched back and forth by 90 deg (4.3);
+random. It gives the share of time with the horizon, lit or not, in 0, 1, 2, ... cameras, and that of the
+sunlit time with the Sun in a camera. For UW, level, the Sun's share is given over the Sun's height over the
+orbit's plane (beta) and three headings of the hexagon, for the square detector and for the cone in it: the
+paper names none of them.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ STEP = 20.0
 MOST_TILT = np.radians(15.0)
 ATTITUDES = ("level", "within 15 deg", "tipped 90 deg", "any")
 HEADINGS = {"two to the Sun's side": -90.0, "one forward": 0.0, "one to the Sun's side": 90.0}
-"""deg, where the first camera looks, from forward towards the Sun's side of the orbit's plane."""
+"""Azimuth (deg) of the first camera, from forward towards the Sun's side of the orbital plane."""
 BEST = "two to the Sun's side"
 BETA_STEP = 5.0
 PAPER = 74.0
 LEAST_ARC = 5
-"""Limb points of 720 that make a horizon: 2.5 deg of it."""
+"""Number of limb points, of 720, that count as a horizon: 2.5 deg of the limb."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -57,7 +57,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Look around for one revolution."""
+    """Evaluate the views of one revolution."""
     if case.parameters["kind"] == "heading":
         return {**case.parameters, "shares": sun_by_heading(suite("uw"), np.radians(case.parameters["beta"]))}
     rng = np.random.default_rng(case.seed)
@@ -135,7 +135,7 @@ def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, flo
     lit = sunlit_share(np.broadcast_to([0.0, 0.0, -radius], sun.shape), ASTRONOMICAL_UNIT * sun) > 0.5
     found: dict[str, dict[str, float]] = {}
     for heading, degrees in HEADINGS.items():
-        # The body yawed so that its first camera, at azimuth 0, looks there.
+        # The body is yawed so that its first camera, at azimuth 0, points in the heading.
         turn = attitude_matrix(from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)])))
         body = sun[lit] @ turn.T
         found[heading] = {
@@ -146,7 +146,7 @@ def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, flo
 
 
 def all_three_up_to(name: str = "vt") -> float:
-    """Return the tilt, rad, up to which every camera has the horizon, whichever way it leans."""
+    """Return the largest tilt, rad, in any direction, at which each camera has the horizon in view."""
     edge = limb(revolution(FIRST_DATE, 0.0, 6000.0).positions[:1])[0]
     direction = np.radians(np.arange(0.0, 360.0, 5.0))
     axes = np.stack([np.cos(direction), np.sin(direction), np.zeros_like(direction)], axis=-1)

@@ -1,4 +1,4 @@
-"""Campaign `damaged-files`: one flipped bit in one file of a board, and a whole release flies all the same.
+"""Campaign `damaged-files`: a whole release starts after one flipped bit in one file of a board.
 
 The files are both copies of the launcher and of the safe state, the manifest and a module of the current
 release, the records that flight and link have stored, and all keys. Each flip is followed by a start of the
@@ -66,7 +66,7 @@ class DamagedBoard:
         return sorted(path for path in found if path.is_file() and path.stat().st_size > 0)
 
     def flip(self, path: Path, bit: int) -> Result:
-        """Flip a bit of a file and return what is wrong afterwards; undo the flip."""
+        """Flip a bit of a file, return the resulting faults, and undo the flip."""
         content, mode = path.read_bytes(), path.stat().st_mode
         record = (self._state / "releases.json").read_bytes()
         damaged = bytearray(content)
@@ -99,7 +99,7 @@ class DamagedBoard:
         return runs
 
     def _link_problems(self, path: Path) -> list[str]:
-        """Return what the link has lost; it may lose the record of one open transfer."""
+        """Return the records that the link has lost; it may lose the record of one open transfer."""
         vault = Vault(self._link / "keys", self._link / "witness")
         opened: Gate = gate(vault)
         counters = [entry and entry.unused for entry in map(vault.read, _SPIS)]
@@ -115,7 +115,7 @@ class DamagedBoard:
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return boards for `runs` flips together."""
+    """Return boards for a total of `runs` flips."""
     sizes = [min(FLIPS, runs - done) for done in range(0, runs, FLIPS)]
     return [Case(str(number), (seed, number), {"flips": size}) for number, size in enumerate(sizes)]
 

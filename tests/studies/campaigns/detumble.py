@@ -1,4 +1,4 @@
-"""Campaign `detumble`: from 10 deg/s to 0.5 by coils alone, in the simulated world with all disturbances.
+"""Campaign `detumble`: detumbling from 10 to 0.5 deg/s by coils alone, with all simulated disturbances.
 
 Two craft, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law `magnetometer` has only a
 magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a coarse attitude. The law
@@ -119,16 +119,16 @@ SAMPLES_NS = range(SCHEDULE.settle_ns, SCHEDULE.settle_ns + SCHEDULE.measure_ns,
 LAWS = ("magnetometer", "attitude", "inertia")
 CELLS = tuple((orbit, law) for orbit in ("sso", "iss", "equator") for law in LAWS)
 LONGEST = 6000.0
-"""s: a body that is not slow by then is lost."""
+"""Time (s) after which a body that is not slow counts as lost."""
 WALK, LIGHTEST = 4.0, 1.04
 """Largest random walk of the residual dipole, in standard deviations of an axis, and strongest sunlight, as a
 multiple of that at one astronomical unit."""
 LEAST_CYCLES = 16
-"""Commands in a window; the flight gives 152."""
+"""Number of commands in a window; a flight has 152."""
 HORIZON = {"knightcube": 1500.0, "cubesat_3u": 3000.0}
-"""s that a plan looks ahead."""
+"""Horizon (s) of a plan."""
 ATTITUDE_SIGMA = np.radians(1.0)
-"""rad an axis, of the coarse attitude: Sun and field."""
+"""Error (rad per axis) of the coarse attitude from Sun and field."""
 FIELD_SIGMA = 2e-7
 TORQUE_WALK = {"knightcube": 3e-4, "cubesat_3u": 3e-5}
 """rad/s per sqrt(s): a tenth of the coils' torque over a few seconds."""
@@ -169,7 +169,7 @@ def description(law: str, seed: int, inertia: FloatArray) -> DescriptionErrors:
 
 
 def run(case: Case) -> Result:
-    """Fly until the body is slow, or lost."""
+    """Simulate until the body is slow or counts as lost."""
     wanted = case.parameters
     release = TipOff(speed=wanted.get("speed") or SPEED)
     noises = Disturbances(**(STILL if wanted.get("still") else {}))
@@ -272,7 +272,7 @@ class _Bound:
 
 
 class _Law:
-    """The flight's law with what it may know; some samples of the magnetometer may be spiked."""
+    """The flight's control law with its permitted knowledge; some magnetometer samples may be outliers."""
 
     def __init__(self, flight: FreeFlight, wanted: dict[str, Any]) -> None:
         self._flight = flight

@@ -1,11 +1,11 @@
 """Attitude from gyros, Sun, nadir and magnetic field (Meller et al., section 2 and Fig. 3).
 
 Gyros propagate the attitude; directions correct attitude and bias. The filter is `AttitudeFilter` of
-`knightcube.gnc.estimation` for a free body in orbit. No flight uses it there: the campaigns `orbit-attitude`
-and `orbit-frames` measure it. It starts from the first directions that agree and fix an attitude accurately
-enough. Then each measurement of Sun, nadir and field is used at its own time. The magnetometer's bias is
-estimated together with the error of the field model, which changes as slowly: the estimate from sunlight is
-used in eclipse.
+`knightcube.gnc.estimation` for a free body in orbit. Flights do not use this filter; the campaigns
+`orbit-attitude` and `orbit-frames` measure it. It starts from the first directions that agree and fix an
+attitude accurately enough. Then each measurement of Sun, nadir and field is used at its own time. The
+magnetometer's bias is estimated together with the error of the field model, which changes as slowly: the
+estimate from sunlight is used in eclipse.
 """
 
 from __future__ import annotations
@@ -41,18 +41,21 @@ class DeterminationSettings:
     """Sensor noise, body and limits.
 
     Attributes:
-        inertia: (3, 3) kg m^2, body axes.
-        rate_sigma: rad/s of a gyro sample.
-        bias_start, bias_walk: rad/s and rad/s per sqrt(s), of the gyros.
-        field_sigma: T of a magnetometer sample.
-        field_bias_start, field_bias_walk: T and T per sqrt(s), of the magnetometer, hard iron and model.
-        disturbance_start, disturbance_walk: rad/s^2 and per sqrt(s), of all torques over the inertia.
-        start_sigma: rad, largest sigma of the worst axis to start.
-        start_age: s, largest age of directions to start from.
-        lost_sigma: rad, a worse estimate is discarded because linearisation no longer holds.
-        fresh: s, a sensor without accepted measurements for longer is not in use.
-        gate_sigma: a measurement less likely than this many sigma is rejected.
-        longest_step: s, of the filter.
+        inertia: inertia tensor (3, 3), kg m^2, body axes.
+        rate_sigma: standard deviation of a gyro sample, rad/s.
+        bias_start, bias_walk: initial gyro bias, rad/s, and its random walk, rad/s per sqrt(s).
+        field_sigma: standard deviation of a magnetometer sample, T.
+        field_bias_start, field_bias_walk: magnetometer bias with the model's error, T, and its random walk, T
+            per sqrt(s).
+        disturbance_start, disturbance_walk: torque over inertia, rad/s^2, and its random walk, rad/s^2 per
+            sqrt(s).
+        start_sigma: largest standard deviation of the worst axis at the start, rad.
+        start_age: largest age of directions at the start, s.
+        lost_sigma: standard deviation, rad, above which the estimate is discarded, because linearisation
+            fails.
+        fresh: longest time without accepted measurements of a sensor in use, s.
+        gate_sigma: rejection threshold of measurements, in sigma.
+        longest_step: longest step of the filter, s.
     """
 
     inertia: FloatArray
@@ -76,11 +79,11 @@ class Status(Enum):
     """The sensors on which the attitude is based."""
 
     ACQUIRING = "acquiring"
-    """No attitude: no directions yet that fix one."""
+    """The available directions determine no attitude yet."""
     OBSERVED = "observed"
     """At least two directions are in use, with or without the field."""
     AIDED = "aided"
-    """One direction is in use: the turn about it drifts with the gyros until the direction moves."""
+    """One direction is in use; the rotation about it drifts with the gyros until the direction changes."""
     COASTING = "coasting"
     """Gyros alone."""
 
@@ -91,7 +94,7 @@ class Report:
 
     Attributes:
         estimate: None while acquiring.
-        sigma: (3,) rad about the body's axes, infinite while acquiring.
+        sigma: standard deviations (3,) about the body axes, rad; infinite while acquiring.
         in_use: the sensors with recent accepted measurements, without the gyros.
     """
 
@@ -104,18 +107,18 @@ class Report:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiting:
-    """A direction measured before there was an attitude."""
+    """A direction that was measured before the first attitude."""
 
     time_ns: int
     observation: VectorObservation
 
 
 class AttitudeDetermination:
-    """Owns the filter, or the directions from which it will start.
+    """State of the filter, or the directions from which it will start.
 
     Attributes:
-        refused: how many measurements of each sensor did not pass their gate.
-        starts: how often the filter started.
+        refused: number of rejected measurements of each sensor.
+        starts: number of starts of the filter.
         nis: normalised innovation squared of the last measurement, NaN without one.
     """
 
@@ -198,7 +201,7 @@ class AttitudeDetermination:
         self.refused[sensor] = self.refused.get(sensor, 0) + 1
 
     def _wait(self, sensor: str, time_ns: int, observation: VectorObservation) -> None:
-        """Keep a direction, and start if the directions at hand fix an attitude."""
+        """Store a direction, and start if the stored directions determine an attitude."""
         self._waiting[sensor] = _Waiting(time_ns, observation)
         oldest_ns = time_ns - round(self._settings.start_age * 1e9)
         self._waiting = {name: w for name, w in self._waiting.items() if w.time_ns >= oldest_ns}
@@ -250,7 +253,7 @@ class AttitudeDetermination:
 
 
 def begin(observations: Sequence[VectorObservation], improbable: float = 1e-4) -> AttitudeFix | None:
-    """Return the attitude that directions fix, None when they fix none or contradict each other.
+    """Return the attitude from directions, or None if they determine none or contradict each other.
 
     Their angles to each other must be those of their references: a chi-square of 2 n - 3 degrees of freedom.
     """
@@ -273,5 +276,5 @@ def _status(in_use: frozenset[str]) -> Status:
 
 
 def _is_unit(vector: FloatArray) -> bool:
-    # A NaN fails the comparison too.
+    # A NaN also fails the comparison.
     return vector.shape == (3,) and abs(float(np.linalg.norm(vector)) - 1.0) <= _UNIT_TOLERANCE

@@ -39,7 +39,7 @@ from tests.support.flights import CONFIG, fly
 
 CRAFT = {"knightcube": "orbit.yaml", "cubesat_3u": "orbit_3u.yaml"}
 LIT, BLIND = 900.0, 300.0
-"""s: from the release to the shadow, and from the last star to it."""
+"""Times (s) from the release, and from the last star fix, to the shadow."""
 SETTLED, LAST = 300.0, 120.0
 """s: from the release until stars are judged; the ends of the sunlight and of the shadow that are judged."""
 NODES = (9.5, 14.5)
@@ -132,7 +132,7 @@ def _facts(flown: Run, settled: float, silent: float, lit: float, last: float) -
 
 
 def judged(error: FloatArray, sigma: FloatArray) -> Result | None:
-    """Return what errors (n, 3) rad and their deviations (n, 3) come to; None without any."""
+    """Return the statistics of errors (n, 3), rad, and their standard deviations (n, 3); None without any."""
     if not len(error):
         return None
     return {
@@ -147,13 +147,13 @@ LEARNED, SHORTEST, LONGEST = 3_800.0, 1_900.0, 12_000.0
 """s: with stars at least, so that a revolution has passed at the shadow's end; of a shadow at least, and of a
 flight."""
 NOTED = 14.0
-"""s between the errors that are noted: at each time since the last stars, which come each 10 s."""
+"""Interval (s) of the recorded errors, which covers all times since the last star fix (every 10 s)."""
 STORM, STORM_TIME = 5e-8, 300.0
-"""T of an axis and s: a Gauss-Markov process, as large as the configurations expect the model's error."""
+"""Standard deviation per axis (T) and time constant (s) of the Gauss-Markov field error, as configured."""
 SHARE = 0.3
-"""Of the worst torques, as in the configurations."""
+"""Fraction of the worst torques, as in the configurations."""
 WANTED = {"stars": 0.01, "sunlit": 0.05, "eclipse": 0.3}
-"""deg rms of three axes (issue 19)."""
+"""Required attitude error (deg rms, three axes; issue 19)."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -167,19 +167,19 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly the case; its parameters may shorten it."""
+    """Run the case; its parameters may shorten the run."""
     given = case.parameters
     facts = fly_loop(given, case.seed) if given["kind"] == "loop" else _fly_filter(given, case.seed)
     return {"kind": given["kind"], "craft": given["craft"], **facts}
 
 
 class DarkFlight(PointingFlight):
-    """A flight at nadir whose star camera is silent from `dark` s on; `end` s is that of the shadow."""
+    """A flight at nadir whose star camera is silent from `dark` s on; `end` (s) is the end of the shadow."""
 
     dark, end = math.inf, 0.0
 
     def __init__(self, craft: str, seed: int, storm: float = 0.0) -> None:
-        """`storm` T of an axis is added to the field."""
+        """`storm` (T per axis) is the added field error."""
         self._storm, self._weather = storm, np.random.default_rng([seed, 0x570])
         super().__init__({"craft": craft, "share": SHARE, "target": "nadir"}, seed)
         config = as_orbit(configuration.load(CONFIG.parent / CRAFT[craft]))
@@ -191,7 +191,7 @@ class DarkFlight(PointingFlight):
         self.flight.field_error = storm * self._weather.standard_normal(3)
 
     def cycle(self, time: float) -> None:
-        """Fly one cycle in a field that goes on changing."""
+        """Simulate one cycle in a changing field."""
         kept = math.exp(-CYCLE / STORM_TIME)
         kick = self._storm * math.sqrt(1.0 - kept**2) * self._weather.standard_normal(3)
         self.flight.field_error = kept * self.flight.field_error + kick
@@ -271,7 +271,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _dipole(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
-    """Return median and largest share of the residual dipole that is not known, by the light."""
+    """Return median and largest unknown fraction of the residual dipole, in sunlight and in shadow."""
     found = {}
     for light in ("sunlight", "shadow"):
         shares = [r["dipole"][light] for r in results if math.isfinite(r["dipole"][light])]

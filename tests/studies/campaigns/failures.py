@@ -1,15 +1,15 @@
-"""Campaign `failures`: random frames of the real sky, and what the likelihood estimator makes of each.
+"""Campaign `failures`: results of the likelihood estimator for random frames of the real sky.
 
 Pointings are uniform over the sky, theta (axis to boresight) over 0..90 deg, turns over 0..50 % of the field
 (3.28), exposures 0.2 or 1 s; a sky with fewer than five usable stars is drawn again with the same motion.
 Usable is a star whose whole streak lies in the frame, 4 px off its border, and whose light exceeds eight
 standard deviations of the noise under its streak (`scenes.usable`).
 
-Right is an answer that is not wrong. Wrong is one more than 6 of its own standard deviations off (the square
-root of its NEES; chance: 1 in 13 million) and more than 1 % of the rate off, as a vector. Either alone is
-counted too: the first is a covariance that says too much, the second may be an honest answer from streaks of
-a few px. Any other outcome is a refusal, by its status; if the usable stars move less than the estimator's
-minimum length, the rate cannot be determined, and a refusal is right.
+A right answer is an answer that is not wrong. Wrong is one more than 6 of its own standard deviations off
+(the square root of its NEES; chance: 1 in 13 million) and more than 1 % of the rate off, as a vector. Each
+condition alone is counted too: the first means a covariance that is too small, the second may be a consistent
+answer from streaks of a few px. Any other outcome is a refusal, by its status; if the usable stars move less
+than the estimator's minimum length, the rate cannot be determined, and a refusal is right.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
-# Turns in percent of the field, upper edges: time and errors are given for each.
+# Upper bounds of the classes of rotation (percent of the field) for which time and errors are stated.
 TURNS = (5, 20, 35, 50)
 _FREEDOM = 3
 
@@ -55,7 +55,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Estimate one frame's motion and judge the answer."""
+    """Estimate the motion of one frame, and judge the answer."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, drawn = RandomSlew(case.seed[0], case.seed[1], **case.parameters).exposed(camera)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
@@ -160,7 +160,7 @@ def _counts(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _nees(results: Sequence[Result]) -> dict[str, float] | None:
-    """Return the mean of NEES, and the parts of the answers beyond limits that chance exceeds so often."""
+    """Return the mean NEES, and the fractions of answers beyond quantiles of chi-square."""
     values = np.array([r["nees"] for r in results if r["nees"] is not None])
     if not len(values):
         return None

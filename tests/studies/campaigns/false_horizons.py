@@ -1,8 +1,8 @@
-"""Campaign `false-horizons`: horizons found where there are none, and hard limbs that must still be found.
+"""Campaign `false-horizons`: false horizons in images without limb, and difficult limbs that must be found.
 
 Pictures without a limb (`limbless`) are searched by several cameras with three kinds of knowledge: nothing,
 the altitude, and a flight's (position, Sun, coarse Sun and field, all of a scene drawn at random). Any nadir
-is false. Beside them stand rendered limbs that are hard: thin crescents, terminators, a third of the limb
+is false. Difficult rendered limbs are also included: thin crescents, terminators, a third of the limb
 behind a structure, sea glint, the Sun in the frame, a linear narrow camera. There an answer is wrong beyond
 half a degree and five of its own sigmas.
 """
@@ -29,12 +29,12 @@ from tests.support.limb_frames import camera_model, coarse_knowledge, finder_set
 
 KNOWN = ("nothing", "altitude", "flight")
 CAMERAS = ((512, 512, 67.0), (480, 640, 60.0), (768, 1024, 30.0), (768, 1024, 12.8), (512, 512, 100.0))
-"""Rows, columns, and the field across in degrees."""
+"""Rows, columns, and field of view across, deg."""
 HARD = ("sunlit", "crescent", "terminator", "hidden", "glint", "glare", "narrow")
 ALTITUDE = 515e3
 WRONG_DEG, MOST_SIGMAS = 0.5, 5.0
 _CRESCENT = 0.05, 0.35
-"""Share of the limb in view that is lit."""
+"""Fraction of the visible limb that is lit."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -66,7 +66,7 @@ def limbless_picture(kind: str, generator: np.random.Generator) -> tuple[Image, 
 
 
 def knowledge_of(scene: EarthScene, known: str, generator: np.random.Generator) -> HorizonKnowledge:
-    """Return what is known of a scene, one of `KNOWN`."""
+    """Return the prior knowledge of a scene, one of `KNOWN`."""
     if known == "flight":
         return coarse_knowledge(scene, generator)
     height = float(np.linalg.norm(scene.position)) - 6_371e3
@@ -110,7 +110,7 @@ def limb_picture(
 
 
 def _narrow(generator: np.random.Generator) -> tuple[EarthCameraModel, EarthScene]:
-    """Return a narrow camera and a scene; another camera where one sees too little of any limb."""
+    """Return a narrow camera and a scene; the camera is replaced if it shows too little of the limb."""
     while True:
         field = np.radians(generator.uniform(15.0, 40.0))
         model = EarthCameraModel.fuga15d(field, seed=1, response="linear", sensitivity=30_000.0)
@@ -163,7 +163,7 @@ VERDICTS = ("right", "wrong", "ambiguous", "refused", "no-horizon")
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return how often a horizon was found, of each kind of picture and knowledge."""
+    """Return the frequency of found horizons for each kind of image and knowledge."""
     rows = []
     for limb, kind in dict.fromkeys((r["limb"], r["kind"]) for r in results):
         of = [r for r in results if (r["limb"], r["kind"]) == (limb, kind)]

@@ -1,6 +1,6 @@
-"""Judges a flight of campaign `faults` by its log and by the truth beside it.
+"""Judges a run of campaign `faults` by its log and its true states.
 
-Times are of the log and the truth, not of the events alone, which a throttle holds back.
+Times follow from log and truth, not from events alone, because events are rate-limited.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ CYCLE = 0.025
 REPORTED_WITHIN = 20.0
 """s after the end of a fault: later events have another cause."""
 BLIND_GRACE = 0.1
-"""s: within this the coils are at zero after the last measurement."""
+"""Longest time (s) from the last measurement to zero coil current."""
 ZERO = 1e-3
-"""A: a coil that is off carries less."""
+"""Largest current (A) of a coil that is off."""
 FRAME_READOUT = 0.05
 """Readout time (s) of the camera."""
 DRIVEN = 6.0e-3
-"""A, from which on the monitor can judge a driven coil."""
+"""Smallest current (A) at which the monitor can judge a driven coil."""
 
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
-"""A and relative: readings that differ by more are of different currents."""
+"""Absolute (A) and relative difference of two readings of the same current."""
 LOOKED_FROM, LOOKED = 2.0, 3.0
 """s: from when in a flight the monitor's mean is whole, and how long an upset's trace is looked for."""
 FEW = 3
-"""Largest difference in the number of the unit's samples that does not count as an effect."""
+"""Largest difference in the number of IMU samples that does not count as an effect."""
 BACK_WITHIN = 2.0
-"""s: limit for a part's recovery once it answers again."""
+"""Longest recovery time (s) of a device once it answers again."""
 _OUT_OF_REACH = {"nack", "slow", "intermittent"}
 _KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
 
@@ -102,7 +102,7 @@ def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
 def _is_driven(own: FloatArray, kind: str) -> bool:
     """Return whether a broken coil or bridge was driven for long, from the commanded currents (n,) A.
 
-    A leg stuck low has an effect only where it should be high: input A drives forwards, B backwards.
+    A leg stuck low has an effect only if it should be high: input A drives forwards, B backwards.
     """
     driven = {"a-low": own > DRIVEN, "b-low": own < -DRIVEN}.get(kind, np.abs(own) > DRIVEN)
     return kind.endswith("high") or bool(driven.sum() * CYCLE > 2.5)
@@ -113,15 +113,15 @@ def _is_worker_busy(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
     jobs = flown["job_timing"]
     when = jobs["time_ns"] * 1e-9
     mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
-    if kind.kind == "endless":  # a job that was under way ran into its time limit
+    if kind.kind == "endless":  # a running job exceeded its time limit
         return bool((mine & (when >= at) & (jobs["outcome"] == b"timed-out")).any())
-    # A result is reported when the latency that the world models for it has passed.
+    # A result is reported after its modelled latency.
     begun = when - getattr(demo_world().latency, kind.device)
     return bool((mine & (begun >= at - 1e-6) & (begun < end)).any())
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
-    """Return whether the commands differed from those of an old answer for a second."""
+    """Return whether the commands differed from the stuck answer for a second."""
     asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
     behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
@@ -129,7 +129,7 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
 
 
 def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Return which supply currents (n,) A differ by more than two readings of one current may."""
+    """Return whether supply currents (n,), A, differ by more than two readings of the same current can."""
     return np.asarray(np.abs(one - other) > OFF_SURELY + GAIN_ERROR * np.maximum(one, other))
 
 
@@ -151,7 +151,7 @@ def _is_upset(flown: Run, device: str, at: float) -> bool:
 
 
 def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
-    """Return whether the fault spoilt a frame that was due."""
+    """Return whether the fault affected a due frame."""
     due = np.arange(0.0, DURATION, FRAME_PERIOD) + FRAME_EXPOSURE + FRAME_READOUT
     spoiled = due[(due >= at) & (due < end)]
     if kind == "torn":
@@ -168,7 +168,7 @@ def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
 def _recovered(
     flown: Run, kind: FaultKind, at: float, end: float, reported: Sequence[tuple[float, str]]
 ) -> float | None:
-    """Return how long after the fault's end the device's data are good again; None for never."""
+    """Return the time from the end of the fault until the device's data are valid again; None for never."""
     house = flown["housekeeping"]
     found: float | None = 0.0
     match kind.device.partition("-")[0]:
@@ -179,12 +179,12 @@ def _recovered(
         case "monitor":
             finite, time = np.isfinite(house["coil_current"]), house["time_ns"] * 1e-9
             lost = time[~finite & (time >= end) & (time < end + LOOKED)]
-            # A momentary fault shows only after it.
+            # A momentary fault has effects only afterwards.
             found = _first(time[finite], end)
             if kind.momentary and len(lost):
                 later = _first(time[finite], float(lost[-1]))
                 found = None if later is None else float(lost[-1]) + later - end
-            # Reported four times a second, where housekeeping comes once.
+            # This packet is sent four times a second, housekeeping once.
             known = [t for t, name in reported if name == "power-recovered" and t < DURATION - CYCLE]
             back = _first(np.array(known), end)
             if back is not None:
@@ -207,7 +207,7 @@ def _first(times: FloatArray, end: float) -> float | None:
 
 
 def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float | None:
-    """Return how long after `end` samples come without a gap again, s."""
+    """Return the time, s, from `end` until samples arrive without a gap."""
     later = times[times >= end - 1e-6]
     short = np.diff(later) < gap
     for first in range(len(short) - count):
@@ -217,10 +217,10 @@ def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float 
 
 
 def _obeyed(flown: Run, end: float) -> float | None:
-    """Return how long after `end` the coils carry the logged commands for half a second, s."""
+    """Return the time, s, from `end` until the coils carry the logged commands for half a second."""
     control, truth = flown["control"], flown["truth"]
     count = min(len(control), len(truth) - 1)
-    # The truth's sample at a cycle's start is of the current before its command.
+    # The true sample at the start of a cycle has the current of the previous command.
     reported, real = control["current_written"][:count], truth["current"][1 : count + 1]
     agrees = (np.abs(reported - real) < 8e-3).all(axis=1)
     time = control["time_ns"][:count] * 1e-9
@@ -231,7 +231,7 @@ def _obeyed(flown: Run, end: float) -> float | None:
 
 
 def _is_unmeasured(flown: Run) -> BoolArray:
-    """Return for each cycle whether the newest measurement in it was older than the grace and a cycle."""
+    """Return for each cycle whether its newest measurement was older than the permitted age plus a cycle."""
     time_ns = flown["control"]["time_ns"]
     came_ns, sampled_ns = flown["imu"]["time_ns"], flown["imu"]["sample_time_ns"]
     count = np.searchsorted(came_ns, time_ns, side="right")
@@ -240,10 +240,10 @@ def _is_unmeasured(flown: Run) -> BoolArray:
 
 
 def _blind_current(flown: Run, also_unsteered: bool) -> float:
-    """Return the largest current in A while nothing was measured for longer than the grace.
+    """Return the largest current, A, while measurements were older than the permitted age.
 
-    The estimate may be propagated meanwhile, but may drive no coil. `also_unsteered` adds cycles in which the
-    loop has not steered for that long because it refused the measurements.
+    In this time, the estimate may be propagated, but no coil may be driven. `also_unsteered` adds cycles in
+    which the loop has not steered for that long because it refused the measurements.
     """
     off = flown["control"]["state"] == 0
     cycles = round(BLIND_GRACE / CYCLE)
@@ -254,7 +254,7 @@ def _blind_current(flown: Run, also_unsteered: bool) -> float:
 
 
 def _carried(flown: Run) -> FloatArray:
-    """Return the largest true current of a coil in each cycle, A: at the start of the cycle after it."""
+    """Return the largest true coil current in each cycle, A, sampled at the start of the next cycle."""
     current: FloatArray = np.abs(flown["truth"]["current"]).max(axis=1)[1:]
     return current
 
@@ -262,7 +262,7 @@ def _carried(flown: Run) -> FloatArray:
 def _reaction_right(
     flown: Run, kind: FaultKind, at: float, end: float, warned: Sequence[tuple[float, str]]
 ) -> bool | None:
-    """Return whether the table's reaction followed; None where the table has none."""
+    """Return whether the table's reaction followed; None if the table has none."""
     part = part_of(kind)
     # A reversed coil is not isolated, but used with its sign changed.
     expected = COIL_JUDGED if part == "coil" else {REACTION.get(part)}
@@ -282,7 +282,7 @@ def _reaction_right(
                 right = bool(times)
         case "pwm" | "bus":
             if times and driven[(time >= times[0] - 1.0) & (time <= times[0])].any():
-                # An unreachable chip keeps its outputs: it must obey soon after it is back.
+                # An unreachable chip keeps its outputs, and must accept commands soon after it returns.
                 carried = _carried(flown)
                 reported = (time >= times[0] - CYCLE) & (time <= end + BACK_WITHIN)
                 zero = np.abs(control["current_written"]).max(axis=1) < ZERO

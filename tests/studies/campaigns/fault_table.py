@@ -1,7 +1,7 @@
-"""The event and the reaction that each fault must cause: campaign `faults` judges by this table.
+"""Table of the event and the reaction that each fault must cause, used by campaign `faults`.
 
-A fault counts as reported only by an event of its own: an event that the body tumbles is true of a stuck
-coil, but does not say which part failed. Where the table of events has a reaction, the reaction must follow.
+A fault counts as reported only by a specific event: a stuck coil also causes a tumbling event, but that event
+does not name the failed part. Where the table of events has a reaction, the reaction must follow.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ COIL_JUDGED = frozenset({"coil-broken", "coil-corrected"})
 """Events by which a broken coil is isolated, or a reversed one used with its sign changed."""
 
 OWN_OF_KIND: dict[str, frozenset[str]] = {
-    # The packets are good, but too few or too old to steer by: only the stream's own event applies.
+    # The packets are valid, but too few or too old for control: only the event of the stream applies.
     "imu: slow": OWN["imu"] | {"stream-poor"},
     "imu: delayed": OWN["imu"] | {"stream-poor"},
     "imu: intermittent": OWN["imu"] | {"stream-poor"},
     "imu: cut": OWN["imu"] | {"stream-poor"},
 }
-"""Exceptions from it, by kind."""
+"""Exceptions from the table, by kind of fault."""
 
 REACTION: Mapping[str, str] = {
     "imu": "control-lost",
@@ -57,7 +57,7 @@ REACTION: Mapping[str, str] = {
 
 
 def part_of(kind: FaultKind) -> str:
-    """Return what the table calls a device: one row for the coils of all axes."""
+    """Return the device name in the table, which has one row for the coils of all axes."""
     return kind.device.partition("-")[0]
 
 

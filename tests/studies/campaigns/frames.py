@@ -1,4 +1,4 @@
-"""Campaign `frames`: mutated, repeated and reordered telecommand frames at every edge of the counter.
+"""Campaign `frames`: mutated, repeated and reordered telecommand frames near the limits of the counter.
 
 Each run starts a link process whose next counter lies at an edge, and gives it 1,000 frames in portions:
 genuine frames in another order, repetitions, damaged frames with a wrong and with a right CRC, parts of two

@@ -1,4 +1,4 @@
-"""Campaign `ionf`: the three satellites of Meller et al. in the loop, their attitudes beside the flown one.
+"""Campaign `ionf`: the three satellites of Meller et al. in the loop, with separate attitudes.
 
 Each run flies one satellite pointing at nadir in sunlight, with four or three cameras at 2 Hz. The four
 attitudes of the paper (cameras, magnetometer, fused, filtered) and the flown one are compared with the truth.

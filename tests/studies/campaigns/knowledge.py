@@ -1,4 +1,4 @@
-"""Campaigns `aged-elements` and `calendar`: what the orbit environment knows, and how far off its claims are.
+"""Campaigns `aged-elements` and `calendar`: errors and claimed errors of the predicted environment.
 
 `aged-elements` gives the environment elements of up to 60 days, whose B* is wrong by up to 100 %, and a
 receiver that is good, silent or false. `calendar` flies a revolution in every month from 2026 to 2036, over

@@ -1,4 +1,4 @@
-"""Campaign `object-flights`: objects kept in the field by coils alone, with filter, planner and law.
+"""Campaign `object-flights`: objects kept in view by coils alone, with filter, planner and law.
 
 Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`); every other flight does
 not see the object for ten seconds. From the frame on in which a track is followed the object is to stay

@@ -1,4 +1,4 @@
-"""Judges a flight of campaign `orbit-faults` by its log and by the truth beside it."""
+"""Judges a run of campaign `orbit-faults` by its log and its true states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Campaign `orbit-frames`: rendered frames to edges to Sun and nadir to the attitude filter, over one orbit.
+"""Campaign `orbit-frames`: rendered frames, edges, Sun, nadir and attitude filter over one orbit.
 
 The satellite and the sensors of the campaign `orbit-attitude` (`orbit_world`: one revolution that ends with
 an eclipse), but Sun and nadir come out of frames of all the suite's cameras, rendered by

@@ -1,4 +1,4 @@
-"""One flight of campaign `orbit-pointing`: a craft with its filter, its planner's job and its law.
+"""One run of campaign `orbit-pointing`: a craft with its filter, planning job and control law.
 
 The tables are those of the planner worker (`pointing_job`): a slew from far off, as in the loop, then the
 pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been

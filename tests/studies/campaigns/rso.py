@@ -1,4 +1,4 @@
-"""Scenes of an object among stars, and the search for it: for the campaign `rso-orbits` and the figures."""
+"""Scenes of an object among stars, and the search for it, for the campaign `rso-orbits` and its plots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Campaign `rso-orbits`: Table 4.3's ten orbits, Table 4.4, and the weakest object that is found.
+"""Campaign `rso-orbits`: the ten orbits of Table 4.3, Table 4.4, and the faintest detected object.
 
 The camera turns at 0.05 rad/s about its y axis for ten orbits, with a frame every second; those in which the
 object is observable are the opportunities. Run 0 starts as the thesis does; the others start turned about

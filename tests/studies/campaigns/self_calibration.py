@@ -1,4 +1,4 @@
-"""Campaign `self-calibration`: a lens learned from the frames of a rotating camera, and the claims with it.
+"""Campaign `self-calibration`: a lens estimated from frames of a rotating camera, and its uncertainty.
 
 Each run has one unknown lens and FRAMES frames of random fields, at rotations of 5 to 30 % of the field in
 0.2 s. The lens differs from its description by its stated standard deviations: 2 px along each axis, 0.5 % of

@@ -1,4 +1,4 @@
-"""Campaign `soak`: hours of simulated flight in lock-step, something breaking all the time.
+"""Campaign `soak`: hours of simulated operation in lock-step with repeated faults.
 
 Each run is some hours of the demonstration's loop without a break: a new attitude every 50 to 150 s, a fault
 of the catalogue every minute or so, at the wire, lifted again after seconds; axes that were taken out of use

@@ -1,4 +1,4 @@
-"""Campaign `warped-photographs`: photographs of the sky, stretched, sheared or tangentially distorted.
+"""Campaign `warped-photographs`: stretched, sheared or tangentially distorted photographs of the sky.
 
 Each photograph of ../shared/data/sky is warped about its centre by 1 to 4 %: `stretch` along the columns or
 the rows, `shear`, or `tangential` distortion (displacement of a corner relative to its distance). In the

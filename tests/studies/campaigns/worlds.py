@@ -1,4 +1,4 @@
-"""Campaign `worlds`: the same craft in our own world and in Basilisk, flight by flight.
+"""Campaign `worlds`: runs of the same craft in the project's world and in Basilisk.
 
 `detumble/` flies the campaign `detumble`'s KnightCube by its two laws in turns, `nadir/` holds nadir as
 `orbit-pointing` does, 3U and KnightCube in turns at SHARE of the worst torques; only the world is another.

@@ -1,4 +1,4 @@
-"""A slice of the campaign of the acquisition: one flight whose camera sees stars, in the loop."""
+"""Runs a slice of the campaign `acquisition`: one run in the loop with stars in view."""
 
 from __future__ import annotations
 

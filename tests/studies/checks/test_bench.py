@@ -1,4 +1,4 @@
-"""`python -m tests.studies.bench`: benches by name; and what the benches of the streaks measure with."""
+"""Tests of `python -m tests.studies.bench`: benchmarks by name, and measures of the streak benchmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A campaign is the same however it is run, and goes on where it was broken off."""
+"""Tests that a campaign has the same results however it is executed, and resumes after an interruption."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A campaign on a Dask cluster without this checkout loses nothing to a dead worker or a lost scheduler."""
+"""Tests that a campaign on a Dask cluster loses no result if a worker or the scheduler dies."""
 
 from __future__ import annotations
 

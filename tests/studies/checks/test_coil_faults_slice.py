@@ -1,4 +1,4 @@
-"""Slices of the campaigns `coil-faults` and `unlike-inertia`, at fixed seeds."""
+"""Runs slices of the campaigns `coil-faults` and `unlike-inertia` at fixed seeds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of the campaigns of control: the floor, one world that is unlike the loop's belief, the table."""
+"""Runs a slice of the control campaigns: the lower bound, one unlike world, and the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of the damaged files of a board, and the proof that damage would be found."""
+"""Runs a slice of the campaign `damaged-files`, and tests that damage would be detected."""
 
 from __future__ import annotations
 

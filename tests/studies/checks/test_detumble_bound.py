@@ -1,4 +1,4 @@
-"""The bound of detumbling's time in fields whose least time is known."""
+"""Tests of the lower bound of the detumbling time in fields with a known minimum time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fig. 3 as a whole: it starts when it can, goes on without lost sensors, and reports its accuracy."""
+"""Tests of the filter of Fig. 3: its start, operation without lost sensors, and reported accuracy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slices of the campaign of the eclipse: a minute or two with stars, and as long into the shadow without."""
+"""Runs slices of the campaign `eclipse`: one or two minutes with stars, and the same time in shadow."""
 
 from __future__ import annotations
 

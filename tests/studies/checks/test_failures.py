@@ -1,4 +1,4 @@
-"""The campaign `failures`: its frames, its verdicts, and a small slice of it with a seed of its own."""
+"""Tests of the campaign `failures`: frames, verdicts, and a small slice."""
 
 from __future__ import annotations
 

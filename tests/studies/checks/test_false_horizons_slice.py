@@ -1,4 +1,4 @@
-"""A small slice of the campaign `false-horizons`, always the same."""
+"""Runs a small slice of the campaign `false-horizons` at a fixed seed."""
 
 from __future__ import annotations
 

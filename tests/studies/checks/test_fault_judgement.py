@@ -1,4 +1,4 @@
-"""Which faults count as exercised."""
+"""Tests of which faults count as exercised."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flights killed while their devices live on; and proof that a coil left on and a torn log are found."""
+"""Tests of killed flight processes with running devices, and that driven coils and torn logs are found."""
 
 from __future__ import annotations
 

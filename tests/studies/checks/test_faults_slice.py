@@ -1,4 +1,4 @@
-"""Flights with faults: each fault is reported, and a sound flight reports nothing."""
+"""Tests that each fault of a run is reported, and that a healthy run reports none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small slice of the campaign of first orbits, always the same: errors as claimed, short arcs refused."""
+"""Runs a small slice of the campaign `first-orbits`: errors as claimed, and short arcs refused."""
 
 from __future__ import annotations
 

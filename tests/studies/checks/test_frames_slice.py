@@ -1,4 +1,4 @@
-"""A small slice of the campaign `frames`, always the same, and what the campaign would notice."""
+"""Runs a small slice of the campaign `frames`, and tests the faults that it would detect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slices of the campaigns of a free satellite under its coils."""
+"""Runs slices of the campaigns of a free satellite that is controlled by coils."""
 
 from __future__ import annotations
 

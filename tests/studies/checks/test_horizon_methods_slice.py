@@ -1,4 +1,4 @@
-"""A small slice of the campaign `horizon-methods`, always the same."""
+"""Runs a small slice of the campaign `horizon-methods` at a fixed seed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sizes of the product's files, classes and functions: measured right, and within their limits."""
+"""Tests of the measured sizes of files, classes and functions, and of their limits."""
 
 from __future__ import annotations
 

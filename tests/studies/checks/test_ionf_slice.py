@@ -1,4 +1,4 @@
-"""A few seconds of an ION-F satellite with two cameras: the separate attitudes are recorded and honest."""
+"""Runs an ION-F satellite with two cameras for a few seconds and checks the separate attitudes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The summaries of the kill campaigns ring where something is wrong; the flights themselves are campaigns."""
+"""Tests that the summaries of the kill campaigns report faults; the runs themselves are campaigns."""
 
 from __future__ import annotations
 

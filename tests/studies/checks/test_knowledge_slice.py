@@ -1,4 +1,4 @@
-"""A small slice of the campaigns of old elements and of the calendar, always the same."""
+"""Runs a small slice of the campaigns `aged-elements` and `calendar` at a fixed seed."""
 
 from __future__ import annotations
 

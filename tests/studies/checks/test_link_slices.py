@@ -1,4 +1,4 @@
-"""A slice of the kills of the link, and the proof that they would find a link that stores too late."""
+"""Runs a slice of the link kills, and tests that they would detect a link that stores too late."""
 
 from __future__ import annotations
 

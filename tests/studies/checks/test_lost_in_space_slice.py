@@ -1,4 +1,4 @@
-"""A small slice of the campaign `lost-in-space`, with its own seed: every method on nominal lists."""
+"""Runs a small slice of the campaign `lost-in-space` with each method on nominal lists."""
 
 from __future__ import annotations
 

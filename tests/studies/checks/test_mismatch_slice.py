@@ -1,4 +1,4 @@
-"""The campaigns `mismatch` and `vibration`: their renderer, and a small slice of each, with its own seed."""
+"""Runs a small slice of the campaigns `mismatch` and `vibration`, and tests their renderer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m tests.studies mutants` on a small repository, and the mutants of small sources."""
+"""Tests of `python -m tests.studies mutants` on a small repository, and of mutants of small sources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of the campaign `nadir`."""
+"""Runs a slice of the campaign `nadir`."""
 
 from __future__ import annotations
 

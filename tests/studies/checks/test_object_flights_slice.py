@@ -1,4 +1,4 @@
-"""A slice of the campaign of flights after objects: the bound by hand, and a flight kept in the field."""
+"""Runs a slice of the campaign `object-flights`, and tests its bound against a manual result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small slice of the campaign of passes: sighted as claimed, and nothing tracked in an empty sky."""
+"""Runs a small slice of the campaign `object-passes`: claimed errors, and no track in an empty sky."""
 
 from __future__ import annotations
 

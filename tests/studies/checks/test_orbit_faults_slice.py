@@ -1,4 +1,4 @@
-"""A slice of campaign `orbit-faults`: two faults of an orbit are reported, a blind current is detected."""
+"""Runs a slice of the campaign `orbit-faults`: two reported faults, and a detected coil current."""
 
 from __future__ import annotations
 

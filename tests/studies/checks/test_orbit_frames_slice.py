@@ -1,4 +1,4 @@
-"""Twenty seconds of the campaign `orbit-frames` in sunlight, always the same."""
+"""Runs twenty seconds of the campaign `orbit-frames` in sunlight at a fixed seed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of the campaign `orbit-slews`: a planned path ends in its target, at little more than its heat."""
+"""Runs a slice of the campaign `orbit-slews`: a planned path ends at its target with little extra heat."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slices of the campaigns of the orbit: what the paper says of its cameras, and an honest sunset."""
+"""Runs slices of the orbit campaigns: camera coverage of the paper, and attitude errors at sunset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of campaign `planner-edge` at a fixed seed, and slews that an earlier planner refused."""
+"""Runs a slice of the campaign `planner-edge`, and slews that an earlier planner refused."""
 
 from __future__ import annotations
 

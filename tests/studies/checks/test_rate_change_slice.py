@@ -1,4 +1,4 @@
-"""A small slice of the campaign `rate-change`: frames summed instant by instant, by other arithmetic."""
+"""Runs a small slice of the campaign `rate-change`, and tests its frames against an independent sum."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of the campaign `renewal-trials`: one renewal that is confirmed, and one that cannot fly."""
+"""Runs a slice of the campaign `renewal-trials`: one confirmed renewal, and one that cannot start."""
 
 from __future__ import annotations
 

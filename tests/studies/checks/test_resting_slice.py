@@ -1,4 +1,4 @@
-"""A small slice of the campaign of frames at rest: claims as large as the errors, of unlike cameras too."""
+"""Runs a small slice of the campaign `resting`: claims agree with errors, also for unlike cameras."""
 
 from __future__ import annotations
 

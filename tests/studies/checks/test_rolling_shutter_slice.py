@@ -1,4 +1,4 @@
-"""A small slice of the campaign `rolling-shutter`: frames summed row by row, by other arithmetic."""
+"""Runs a small slice of the campaign `rolling-shutter`, and tests its frames row by row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small slice of the RSO campaigns, always the same: objects are found, without false alarms."""
+"""Runs a small slice of the RSO campaigns: objects are detected without false alarms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A slice of the campaign `safe-sun`: from behind to the Sun, and its figures."""
+"""Runs a slice of the campaign `safe-sun` with the Sun behind the body, and tests its figures."""
 
 from __future__ import annotations
 

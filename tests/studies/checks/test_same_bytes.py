@@ -1,4 +1,4 @@
-"""The comparison of two checkouts finds a planted difference and passes what may differ."""
+"""Tests that the comparison of two checkouts finds an injected difference and ignores permitted ones."""
 
 from __future__ import annotations
 

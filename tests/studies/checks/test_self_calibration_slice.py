@@ -1,4 +1,4 @@
-"""A small slice of the campaign `self-calibration`: one lens, three frames."""
+"""Runs a small slice of the campaign `self-calibration`: one lens and three frames."""
 
 from __future__ import annotations
 

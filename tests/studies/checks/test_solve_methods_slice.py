@@ -1,4 +1,4 @@
-"""One frame of the bench `solve_methods`."""
+"""Runs one frame of the benchmark `solve_methods`."""
 
 from __future__ import annotations
 

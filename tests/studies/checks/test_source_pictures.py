@@ -1,4 +1,4 @@
-"""The figures of the thesis can be drawn by one command, and show what the thesis shows in them."""
+"""Tests that one command draws the figures of the thesis with the content of the thesis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slices of the tables of the three sources, always the same, and the list of all their tables."""
+"""Runs slices of the tables of the three sources, and tests the list of the tables."""
 
 from __future__ import annotations
 

@@ -387,7 +387,7 @@ def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
 
     None without a rest.
 
-    Added to another prey path, this difference gives a path with the boundary states of that prey path.
+    If this difference is added to a second prey path, the sum has the boundary states of that prey path.
     """
     if last is None:
         return None

@@ -354,7 +354,7 @@ class PathProgram:
         return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
 
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
-        """Return the path between the same ends that differs by `apart` (N,) from the prey path."""
+        """Return the path with the boundary states of the prey path that differs from it by `apart` (N,)."""
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def from_prey(self, trial: Trial) -> FloatArray:

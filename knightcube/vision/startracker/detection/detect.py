@@ -315,7 +315,7 @@ def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, target
 
 
 def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
-    """Return which of the usable stars `sound` (n,) determine the PSF.
+    """Return a mask of the usable stars `sound` (n,) that determine the PSF.
 
     The PSF is determined by the stars that are not saturated, or by all stars if all are saturated.
     """

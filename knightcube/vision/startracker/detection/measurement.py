@@ -110,7 +110,7 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
     """Return the width of the PSF and the noise model of a frame, from the stars selected by `plain` (n,).
 
-    A gain in the settings is used unchanged. A width in the settings is kept unless at least eight stars
+    A gain in the settings is used unchanged. The width in the settings is used unless at least eight stars
     determine the width. If no star is usable, the width is 1 px and the photon noise 0, unless the settings
     state them.
     """

@@ -1,7 +1,7 @@
 """Starts the link repeatedly in one process; in each start, other calls of the operating system fail.
 
 Run as `python -m tests.flight.app.cli.failing_starts FOLDER [all]`, in a process of its own: the hook that
-makes calls fail stays for the life of its process. Prints one JSON object a start.
+makes calls fail stays for the life of its process. Prints one JSON object per start.
 
 Opening files and sockets raises audit events before the call. With `all`, each call fails with each error,
 and calls without an audit event fail too; they are replaced in the modules that contain them.
@@ -44,7 +44,7 @@ class Faults:
     """Makes calls fail while a link starts.
 
     Attributes:
-        seen: the calls of this start, each with what it is about.
+        seen: the calls of this start, each with its arguments.
         waits: how often this start has waited.
     """
 
@@ -62,13 +62,13 @@ class Faults:
         self._error_of = None
 
     def hook(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Make a call fail: the hook of `sys.addaudithook`. Raises OSError."""
+        """Make the selected calls fail; this is the hook of `sys.addaudithook`. Raises OSError."""
         if self._error_of is None or event not in CALLS:
             return
         self._fail(event, str(arguments[-1] if event == "socket.bind" else arguments[0]))
 
     def failing(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that fails like an audited call, and otherwise calls `called`."""
+        """Return a function that fails if selected, like an audited call, and otherwise calls `called`."""
 
         def call(*arguments: Any, **named: Any) -> Any:
             if self._error_of is not None:
@@ -85,8 +85,8 @@ class Faults:
 
 
 def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Callable[[str, str], int]]]:
-    """Yield each start: what fails in it, and the error of a call."""
-    for _ in range(2):  # the first start imports modules
+    """Yield the failing calls of each start and their error."""
+    for _ in range(2):  # the first start is not counted, because it imports modules
         yield "nothing", lambda *_: 0
     calls = list(faults.seen)
     for number, (event, about) in enumerate(calls, 1):
@@ -107,7 +107,7 @@ def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Ca
 
 
 def run(place: Path, complete: bool = False) -> None:
-    """Make all starts under `place` and print how each went."""
+    """Make all starts in the folder `place`, and print the result of each."""
     (place / "board").mkdir()
     config = write_linked_config(place / "board", udp="127.0.0.1:0", tcp="127.0.0.1:0")
     words = ["link", str(config), "--log", str(place / "board" / "runs")]
@@ -127,7 +127,7 @@ def run(place: Path, complete: bool = False) -> None:
         wait(self, problem, 0.0)
 
     sys.addaudithook(faults.hook)
-    # The start alone is tried, and without the pauses.
+    # Only the start is tested, without its pauses.
     with ExitStack() as stack:
         stack.enter_context(patch.object(Station, "run", run_shortly))
         stack.enter_context(patch.object(StartRetry, "wait", count_waits))

@@ -18,5 +18,5 @@ def test_the_commands_are_the_published_ones() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_has_its_published_arguments(name: str) -> None:
-    """Scripts and units depend on them: an argument that changes here changes the interface."""
+    """Scripts and systemd units of users depend on these arguments."""
     assert arguments_of(f"flight.app.cli.{name}:configure") == PUBLISHED[name]

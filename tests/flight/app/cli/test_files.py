@@ -21,7 +21,7 @@ LOG = "log/run-000001/flight-0001.ccsds"
 
 @pytest.fixture(scope="module")
 def way(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[str]]:
-    """Return the words that reach a link, whose archive holds a file."""
+    """Return the command-line arguments for a link whose archive contains a file."""
     place = tmp_path_factory.mktemp("files")
     satellite, ground = make_keys(place / "keys")
     address = f"127.0.0.1:{free_port()}"

@@ -38,7 +38,7 @@ CAMERA = MountedCamera(Pinhole.from_field_of_view(64, 64, 1.0), np.array([0.0, 0
 
 
 class Still:
-    """A satellite at rest that hears the field each tenth of a second, its filter, and its cameras' feed."""
+    """A satellite at rest with a field measurement every 0.1 s, its filter, and its camera measurements."""
 
     def __init__(self, seed: int) -> None:
         self.attitude = normalise(np.random.default_rng(seed).standard_normal(4))
@@ -76,7 +76,7 @@ class Still:
     def seen(
         self, sigma: float, sun: bool = True, nadir: bool = True, turn: float = 0.0
     ) -> HorizonCameraResult:
-        """Return what the cameras show of a body that is turned by `turn` rad from where it is."""
+        """Return the camera measurements of a body that is rotated by `turn` rad from its true attitude."""
         body = attitude_matrix(multiply(from_rotation_vector(np.array([turn, 0.0, 0.0])), self.attitude))
 
         def sighted(direction: FloatArray) -> MeasuredDirection:
@@ -144,7 +144,7 @@ def test_one_false_horizon_is_refused_and_three_in_a_row_start_a_coarse_estimate
     for _ in range(CONTRADICTED + 2):
         craft.rest(1)
         rounds.append(craft.look(craft.seen(1e-3)))
-    # The Sun agrees: it lies near the axis of the error.
+    # The Sun direction agrees because it lies near the axis of the error.
     assert not any(nadir for _, nadir in rounds[:CONTRADICTED])
     assert rounds[-1] == (True, True)
     assert craft.error < 0.01

@@ -20,7 +20,7 @@ FIELD = np.array([2e-5, 0.0, 3e-5])
 
 
 class Seen:
-    """The law of Sun acquisition with the events that it reported."""
+    """The control law of Sun acquisition with its reported events."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []
@@ -37,7 +37,7 @@ class Seen:
         self.told.append((kind.name, text))
 
     def fly(self, begin: int, end: int, currents: FloatArray | None, noise: float = 1e-9) -> bool:
-        """Let seconds pass with readings of the strings; return whether the coils acted in the last."""
+        """Run for some seconds with string readings, and return whether the coils acted in the last cycle."""
         acted = False
         for tenth in range(10 * begin + 1, 10 * end):
             now_ns = tenth * SECOND_NS // 10
@@ -87,6 +87,6 @@ def test_the_command_for_learned_coils_causes_the_wanted_dipole() -> None:
 
 
 def test_the_command_for_a_coil_that_seems_dead_stays_bounded() -> None:
-    """The coil monitor decides about it; until then the command is not amplified without a bound."""
+    """Until the coil monitor decides on the coil, the amplification of the command is bounded."""
     wanted = np.array([0.05, -0.02, 0.01])
     np.testing.assert_allclose(commanded(wanted, np.diag([1.0, 0.0, -1.0])), wanted / [1.0, 0.7, 0.7])

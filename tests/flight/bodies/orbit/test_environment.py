@@ -104,7 +104,7 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
 
 @pytest.mark.parametrize("speed", [0.0, 0.9, 1.5])
 def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements, speed: float) -> None:
-    """The orbit would meet the Earth or leave it."""
+    """The orbit would be below the surface or unbound."""
     for known in (
         EstimatedEnvironment(elements, SimClock(UTC_NS)),
         EstimatedEnvironment(None, SimClock(UTC_NS)),
@@ -130,7 +130,7 @@ def dragged(drag: str) -> TwoLineElements:
 
 
 def ahead(degrees: float) -> TwoLineElements:
-    """Return elements of a satellite that flies ahead of FIRST and SECOND on the same orbit."""
+    """Return elements of a satellite that is ahead of FIRST and SECOND on the same orbit."""
     return TwoLineElements(FIRST, summed(f"{SECOND[:43]}{(64.3547 + degrees) % 360.0:8.4f}{SECOND[51:]}"))
 
 
@@ -169,7 +169,10 @@ class Flight:
 @pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
 @pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
 def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
-    """Elements with B* 0 of a satellite with B* 2.5e-4 and 5e-4; later fixes are judged by earlier fixes."""
+    """The elements have B* 0, but the satellite has 2.5e-4 or 5e-4.
+
+    Later fixes are compared with earlier fixes.
+    """
     flight = Flight(TwoLineElements(FIRST, SECOND), dragged(drag), age)
     off, sigma = flight.off()
     assert off < 4.0 * sigma
@@ -218,7 +221,7 @@ def test_consistent_fixes_replace_elements_that_they_contradict(degrees: float) 
 @pytest.mark.parametrize("shift", [(7e3, 0.0, 0.0), (0.0, -3e4, 0.0), (0.0, 2e5, 3e5)])
 @pytest.mark.parametrize("days", [6, 30])
 def test_a_shifted_receiver_is_not_confirmed(days: int, shift: tuple[float, float, float]) -> None:
-    """Its positions and velocities are not those of an orbit, however old the elements are."""
+    """These positions and velocities do not belong to an orbit, at any age of the elements."""
     flight = Flight(TwoLineElements(FIRST, SECOND), dragged(" 50000-3"), days)
     assert not any(flight.fly(1200, lambda: flight.reading(np.array(shift))))
     off, sigma = flight.off()
@@ -260,13 +263,13 @@ def test_a_date_before_the_elements_is_refused(days: float) -> None:
 
 
 def strength(flight: Flight, elements: TwoLineElements) -> float:
-    """Return the field strength, T, at the present place of a satellite."""
+    """Return the field strength, T, at the present position of a satellite."""
     date = UNIX_EPOCH + (UTC_NS + flight.seconds * SECOND_NS) / (DAY * SECOND_NS)
     return float(np.linalg.norm(field(date, elements.at(date).position)))
 
 
 def test_the_field_decides_between_elements_and_a_consistent_false_orbit() -> None:
-    """The magnetometer contradicts a quarter of an orbit, and confirms the same replacement if it is true."""
+    """The magnetometer refutes a position error of a quarter of an orbit, and confirms the true position."""
     there, here = ahead(90.0), TwoLineElements(FIRST, SECOND)
     for known, true, used in ((here, there, False), (there, here, True)):
         flight = Flight(known, true)

@@ -53,7 +53,7 @@ def test_an_example_detumbles_with_currents_within_the_limit_of_each_coil(name: 
 def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     windings: tuple[Winding, ...] | None, tmp_path: Path
 ) -> None:
-    """A pyramid of rods, and three axes of which one has two different coils."""
+    """Cases: a pyramid of rods, and three axes with two different coils along one of them."""
     path, broken = FOLDER / "orbit_6u_redundant.yaml", 3
     config = without_cameras(as_orbit(configuration.load(path)), BROKEN)
     if windings is not None:
@@ -68,22 +68,22 @@ def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     assert np.isnan(told["written"][:, 4:]).all()
     before = true["time_ns"] < 10_000_000_000
     limits = np.array(config.coils.limits)
-    # Each coil is driven, by the emulated bridges, and as the telemetry reports.
+    # The emulated bridges drive each coil, and the telemetry reports it.
     assert (np.abs(true["current"][before, :4]).max(axis=0) > 0.3 * limits).all()
     assert (np.abs(true["current"][:, :4]).max(axis=0) <= limits * (1.0 + 1e-6)).all()
-    # What is written in a cycle flows until the next cycle, with an error of the supply.
+    # The current written in a cycle flows until the next cycle, with an error of the supply.
     told_before = told[told["time_ns"] < 9_900_000_000]
     flowing = true["current"][np.searchsorted(true["time_ns"], told_before["time_ns"] + 25_000_000), :4]
     assert np.abs(flowing - told_before["written"][:, :4]).max() < 0.01
     assert run["truth"]["current"] == pytest.approx(true["current"][:, :3], abs=1e-7)
-    # The fourth coil is isolated, and the other coils continue to brake the body.
+    # The fourth coil is isolated, and the remaining coils continue to damp the body.
     (event,) = [row for row in run["event"] if row["name"] == b"coil-broken"]
     assert event["text"].startswith(b"coil 4 open")
     assert event["time_ns"] < 25_000_000_000
     assert int(run["health"]["coils_in_use"][-1]) == 0b0111
     after = told["time_ns"] > event["time_ns"] + 1_000_000_000
     assert not told["command"][after, broken].any()
-    # What the filter has learned of four coils does not hold for three.
+    # The learned state of four coils is not valid for three coils.
     told_of = run["description"]
     place = np.searchsorted(told_of["time_ns"], event["time_ns"])
     learned, anew = told_of["coils_sigma"][place - 1], told_of["coils_sigma"][place]

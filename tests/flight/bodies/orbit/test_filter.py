@@ -55,7 +55,7 @@ def around(_: int) -> FilterEnvironment:
 
 
 class Flown:
-    """A body under its coils, a few steps of Euler's equation a reading, and its filter."""
+    """A simulated body with coils, integrated by some Euler steps per reading, and its filter."""
 
     def __init__(
         self, pulses: bool = False, errors: BodyErrors | None = None, slow: SlowStates | None = None
@@ -78,15 +78,15 @@ class Flown:
         self.attitude, self.rate, self.time_ns = IDENTITY, SPIN, 0
         self.attitudes = {0: IDENTITY}
         self._pulses = pulses
-        self.carries = 1.0  # the coils' dipole over the commanded one
+        self.carries = 1.0  # true dipole of the coils relative to the commanded dipole
         self.rests = False  # no dipole is commanded
-        self.alternates = False  # the dipole is about x and -z in turn
-        self.field: FloatArray | None = None  # what the magnetometer repeats
+        self.alternates = False  # the dipole alternates between x and -z
+        self.field: FloatArray | None = None  # field that a stuck magnetometer repeats
         self.magnet: FloatArray = np.zeros(3)  # T, added to the field
         self.has_gyro = True
 
     def fly(self, seconds: float) -> None:
-        """Fly on; with pulses the coils act for 0.8 s of each second."""
+        """Simulate some time; with pulses the coils act for 0.8 s of each second."""
         for _ in range(round(seconds * SECOND_NS / PERIOD_NS)):
             acts = self._pulses and not self.rests and self.time_ns % SECOND_NS >= 200_000_000
             dipole = np.array([DIPOLE if acts else 0.0, 0.0, 0.0])
@@ -117,13 +117,13 @@ class Flown:
         )
 
     def stars(self, time_ns: int, off: FloatArray | None = None) -> AttitudeMeasurement:
-        """Return the stars' attitude of a past time, wrong by `off` (3,) rad."""
+        """Return the star attitude at a past time with the error `off` (3,), rad."""
         error = STAR * self.generator.standard_normal(3) + (0.0 if off is None else off)
         seen = multiply(from_rotation_vector(error), self.attitudes[time_ns])
         return AttitudeMeasurement(time_ns, seen, STAR**2 * np.eye(3), by_stars=True)
 
     def see(self, age_ns: int, off: FloatArray | None = None) -> bool:
-        """Give the filter the stars' attitude of `age_ns` ago; return whether it was used."""
+        """Pass a star attitude of the age `age_ns` to the filter, and return whether it was used."""
         used: list[bool] = []
         self.filter.measure_late([self.stars(self.time_ns - age_ns, off)], used.extend)
         return used == [True]
@@ -214,7 +214,7 @@ def test_the_claim_of_the_star_camera_is_that_of_the_present_and_not_of_the_last
     for seconds in (1.5, 0.7):
         flown.fly(seconds)
         found = flown.filter.description(flown.time_ns)["camera_attitude_sigma"]
-        # The attitudes of a camera without misalignment and of the body have one uncertainty.
+        # Without misalignment, the attitudes of camera and body have the same uncertainty.
         present = flown.filter.at(flown.time_ns).covariance[ATTITUDE, ATTITUDE]
         assert found == pytest.approx(np.sqrt(present.diagonal()))
         claims.append(found)
@@ -251,7 +251,10 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
 
 @pytest.mark.parametrize("wrong", [-2e-3, 1.5e-3])
 def test_stars_replace_a_wrong_bias_of_an_earlier_boot_within_half_a_minute(wrong: float) -> None:
-    """The stored bias claims 1e-5 rad/s; the stars contradict it and begin the filter again."""
+    """The stored bias claims an uncertainty of 1e-5 rad/s.
+
+    Star fixes contradict it and restart the filter.
+    """
     prior = FreeFilterSettings().error_state(INERTIA).prior[SLOW, SLOW].copy()
     values, bias = np.zeros(len(prior)), slice(GYRO.start - SLOW.start, GYRO.stop - SLOW.start)
     values[bias], prior[bias, bias] = wrong, 1e-10 * np.eye(3)
@@ -281,7 +284,7 @@ def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
     return SlowStates(values, covariance)
 
 
-# Elements of the inertia, relative to the trace, that are 10 or 15 % of a moment off.
+# Elements of the inertia, relative to the trace, with errors of 10 or 15 % of a moment.
 WRONG_INERTIA = {INERTIA_ERROR.start: (0.052, 1e-4), INERTIA_ERROR.start + 1: (-0.034, 1e-4)}
 KNOWN_COILS = {index: (0.0, 5e-3) for index in range(COILS.start, COILS.stop)}
 
@@ -316,7 +319,7 @@ def test_the_motion_replaces_wrong_learned_values_after_a_minute_and_healthy_one
 
 
 def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:
-    """A failing vision worker may send such attitudes. They must not stop the control task."""
+    """A failing vision worker may send such attitudes. Invalid attitudes must not stop the control task."""
     flown = acquired()
     for _ in range(2 * REFUSALS_TO_RESTART):
         flown.fly(2.0)
@@ -343,7 +346,7 @@ def test_currents_that_may_not_have_flown_widen_the_claim() -> None:
 
 
 def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
-    """A coil carries nothing from the middle of a step on; the gyro tells."""
+    """A coil fails in the middle of a step, which the gyro shows."""
     flown = acquired(pulses=True)
     flown.carries = 0.0
     flown.fly(7.5)
@@ -354,9 +357,9 @@ def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_cl
 
 
 def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim() -> None:
-    """A coil makes a third of the commanded dipole: too little for the gyro, 7 sigma after ten seconds.
+    """A coil makes a third of the commanded dipole, which the gyro does not show.
 
-    The stars were refused then, and the attitude led astray until the third.
+    The filter must not refuse correct star fixes because of the wrong dipole.
     """
     flown = acquired(pulses=True)
     flown.carries = 0.3
@@ -417,7 +420,7 @@ def test_a_correction_of_a_coil_is_applied_in_the_currents_and_not_in_the_learne
     gain, sigma = _coil_x(flown)
     assert gain == pytest.approx(1.0, abs=0.15)
     assert sigma > 0.05
-    flown.carries = 1.0  # the commanded currents are now those of the corrected coil
+    flown.carries = 1.0  # the commanded currents include the correction of the coil
     assert flown.see(60 * PERIOD_NS), "a measurement from before the correction"
     for _ in range(6):
         flown.fly(5.0)
@@ -456,13 +459,13 @@ def test_the_dipole_of_a_corrected_coil_is_unknown_in_the_steps_before() -> None
 
 
 def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_less_certain() -> None:
-    """The matrix of four coils holds for the least heat of all coils, or of those that are not isolated."""
+    """The currents of four coils have the least heat of all coils, or of all coils that are not isolated."""
     flown = acquired()
     pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
     coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
     errors = BodyErrors(coil_gain=0.2)
     settings = replace(flown.filter._settings, coils=coils, free=FreeFilterSettings(errors=errors))
-    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # a current without a dipole
+    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # current combination that makes no dipole
     linear = coils.currents(np.array([DIPOLE, 0.0, 0.0]))
     doubts = []
     for used, currents in (
@@ -478,7 +481,7 @@ def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_les
             filter_.accept(flown._reading_at(cycle * PERIOD_NS))
             filter_.command((cycle + 1) * PERIOD_NS, currents)
         doubts.append(filter_._steps[0].doubt)
-    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils of length sqrt(3) m^2 per ampere
+    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils with sqrt(3) m^2 (dipole moment per ampere)
     assert doubts == pytest.approx([0.0, expected, 0.0], abs=1e-12)
 
 

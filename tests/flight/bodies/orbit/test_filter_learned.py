@@ -44,7 +44,7 @@ THEN, CHANGED = 1.78e9, 0.05
 
 
 def known(share: float = 0.1) -> SlowStates:
-    """Return states known to a share of their first deviations, the dipole's two parts correlated."""
+    """Return states with a fraction of their initial standard deviations and correlated dipole parts."""
     sigma = share * START
     together = np.eye(len(sigma))
     dark, lit = DIPOLE.start - GYRO.start, SUNLIT.start - GYRO.start
@@ -53,17 +53,17 @@ def known(share: float = 0.1) -> SlowStates:
 
 
 def stored(slow: SlowStates) -> dict[str, Learned]:
-    """Return what comes back from the disk."""
+    """Return the states after storing and reading them."""
     return decode(encode(1, StoredState(learned=learned_of(slow, THEN)))).state.learned
 
 
 def grown(age: float) -> FloatArray:
-    """Return the variances of states that were known to a tenth, after an age, s."""
+    """Return the variances, after an age (s), of states that were known to a tenth of their prior."""
     return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + thinned(age).diagonal())
 
 
 def thinned(age: float) -> FloatArray:
-    """Return the covariance by which the density of the air changes the states during an age, s."""
+    """Return the covariance of the states due to changes of the air density during an age, s."""
     changed, at = np.zeros_like(PRIOR), slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
     changed[at, at] = age * density_walk(0.5 * START[at])
     return changed

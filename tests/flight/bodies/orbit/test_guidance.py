@@ -47,11 +47,11 @@ def paths() -> PointingPaths:
 
 ALL = np.ones(3, dtype=bool)
 COILS = CoilMap(0.8 * np.eye(3), np.full(3, 0.5), np.array([10.0, 20.0, 30.0]))
-"""Coils of 2 LIMIT, which are driven half of the time."""
+"""Coils with a limit of 2 LIMIT, which are driven half of the time."""
 
 
 def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int, usable: BoolArray = ALL) -> PointingJob:
-    """Return the job that a planner submits for a goal when asked for a plan."""
+    """Return the job that a planner submits for a target."""
     (job,) = submitted(paths, goal, now_ns, requested=True, usable=usable)
     return job
 
@@ -67,7 +67,7 @@ def submitted(
 ) -> list[PointingJob]:
     """Return the jobs that a planner submits for a goal while these coils (n,) are not isolated.
 
-    The texts of its events are appended to `told`.
+    The texts of the planner's events are appended to `told`.
     """
     jobs: list[PointingJob] = []
 
@@ -161,7 +161,7 @@ def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, 
 
 
 def _fast_from(path: AttitudeReferences, place: int) -> AttitudeReferences:
-    """Return a path that turns at 0.2 rad/s from an instant on."""
+    """Return a path that rotates at 0.2 rad/s from an instant on."""
     rate = path.rate.copy()
     rate[place:] = [0.2, 0.0, 0.0]
     return replace(path, rate=rate)

@@ -28,16 +28,16 @@ ORBIT = OrbitState(2_461_120.0, np.array([6.878e6, 0.0, 0.0]), np.array([0.0, -9
 FIELD = predict(ORBIT, 300.0)
 OBJECT = PointingTarget(Goal.OBJECT)
 CUBE, LONG = (np.array([1.1e-3, 1.05e-3, 0.99e-3]), 0.0959), (np.array([0.0066, 0.0333, 0.0333]), 0.2)
-"""KnightCube and the 3U: inertia kg m^2 and A m^2 of a coil."""
+"""Inertia (kg m^2) and dipole limit (A m^2) of the KnightCube and of the 3U."""
 BLINK = 0.05
-"""s, of the test's own integrator."""
+"""Time step (s) of the test's integrator."""
 
 
 @dataclass
 class Chase:
-    """A rigid body in the field, with a planner that answers at once and sightings without images.
+    """A simulated rigid body in the magnetic field, with immediate plans and simulated sightings.
 
-    The object begins `begin` deg from the boresight and moves at `rate` deg/s towards `across`.
+    The object starts `begin` deg from the boresight and moves at `rate` deg/s towards `across`.
     """
 
     inertia: FloatArray
@@ -110,12 +110,12 @@ class Chase:
 
 
 def chase(craft: tuple[FloatArray, float], rate: float, begin: float) -> Chase:
-    """Return a chase whose object needs no torque along the field."""
+    """Return a pursuit of an object that needs no torque along the field."""
     strength = FIELD.field_at(np.zeros(1))[0]
     up = strength / np.linalg.norm(strength)
     first = np.cross(up, np.array([0.3, -0.5, 0.8]))
     first /= np.linalg.norm(first)
-    # The boresight along the field lets the coils turn it about both axes across.
+    # If the boresight is along the field, the coils can rotate it about both perpendicular axes.
     rows = np.stack([first, -up, np.cross(first, -up)])
     return Chase(*craft, rate, begin, from_matrix(rows), first)
 
@@ -169,7 +169,7 @@ def test_where_it_is_looked_for_is_what_was_ordered_else_where_the_camera_looks(
 
 
 def test_the_boresight_stays_where_an_object_is_looked_for_whatever_axis_the_body_points() -> None:
-    """The best course of weights that make a turn about +z cheap would lead up to 7 deg away."""
+    """With small weights of the rotation about +z, the optimal path deviates by up to 7 deg."""
     rng = np.random.default_rng(3)
     for attitude in rng.normal(size=(5, 4)):
         spin = 3.5e-4 * np.array([0.4, -0.5, 0.8])

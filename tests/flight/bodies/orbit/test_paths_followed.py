@@ -17,7 +17,7 @@ NADIR, SUN = PointingTarget(Goal.NADIR), PointingTarget(Goal.SUN)
 
 
 def table(horizon: float | None, fastest: float = 0.005) -> Any:
-    """Return a table with a slew of `horizon` s."""
+    """Return a table with a slew that lasts `horizon` s."""
     slew = None if horizon is None else SimpleNamespace(horizon=horizon)
     path = SimpleNamespace(quaternion=np.ones((2, 4)))
     made = SimpleNamespace(

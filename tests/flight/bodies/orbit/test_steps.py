@@ -53,7 +53,7 @@ def test_the_mean_dipole_is_that_on_the_wire() -> None:
 
 
 def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean() -> None:
-    """The dipole acts in the last quarter of a second, of which the mean rate shows an eighth."""
+    """The dipole acts in the last quarter of a second; the mean rate contains an eighth of its effect."""
     history = DipoleHistory(10 * SECOND_NS)
     history.record(0, (0.0, 0.0, 0.0), True)
     history.record(3 * SECOND_NS // 4, (0.0, 0.08, 0.0), True)

@@ -44,7 +44,7 @@ def _field(config: TestbedConfig, section: Simulation) -> CageField:
 def test_the_predicted_field_is_the_simulators_within_what_models_and_coils_differ(
     config: TestbedConfig, section: Simulation
 ) -> None:
-    """WMM2025 and SGP4 here, IGRF-14, a ring current and J2 there: 60 nT and 2 %, ten times as strong."""
+    """The software uses WMM2025 and SGP4, and the simulator IGRF-14, a ring current and J2."""
     assert section.cage is not None
     assert config.cage is not None
     believed, true = (
@@ -67,12 +67,12 @@ def test_the_local_frame_looks_down_and_ahead() -> None:
     assert np.linalg.det(frame) == pytest.approx(1.0)
     assert frame @ np.array([-1.0, 0.0, 0.0]) == pytest.approx([0.0, 0.0, 1.0], abs=1e-12)
     assert frame @ np.array([0.0, 1.0, 0.0]) == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
-    # y stands against the orbit's normal, +z here.
+    # Body y points opposite to the orbit normal, which is +z.
     assert frame[1] == pytest.approx([0.0, 0.0, -1.0], abs=1e-12)
 
 
 class _Fixed:
-    """A field that stands still, a reader that tells one angle, and a tracker that wants one current."""
+    """A constant field, a sensor with a constant angle, and a tracker with a constant current."""
 
     def __init__(self, field: FloatArray, angle: float, current: float) -> None:
         self._field, self._angle, self._current = field, angle, current
@@ -95,7 +95,7 @@ class _Fixed:
 def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less_current(
     config: TestbedConfig, direction: float
 ) -> None:
-    """Also where the field lies along body x and coil x alone could make none."""
+    """The torque is also made if the field lies along body x, where coil x alone makes none."""
     plant, dipole = plant_of(config), config.plant.coil_turns * config.plant.coil_area
     for angle in (-0.6, 0.0, 0.4):
         field = 1.1 * config.plant.field * np.array([np.sin(direction), 0.0, np.cos(direction)])

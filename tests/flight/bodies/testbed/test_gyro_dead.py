@@ -31,7 +31,7 @@ FIELD = surrounding_field(CONFIG)
 
 
 def feed_of(field: FloatArray = FIELD) -> tuple[UnitFeed, AttitudeFilter]:
-    """Return the feed and the filter of the demonstration, in a field in reference axes."""
+    """Return the measurement feed and the filter of the demonstration in a given field (reference axes)."""
     filter_ = attitude_filter(CONFIG, plant_of(CONFIG), {})[0]
     return UnitFeed(filter_, CONFIG, lambda _: field), filter_
 
@@ -66,7 +66,7 @@ def test_a_weak_field_gives_no_heading() -> None:
 
 
 def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_weight() -> None:
-    """The offset of 0.1 rad by the coils' field stays below the claimed uncertainty after 5 s."""
+    """After 5 s, the error of 0.1 rad due to the coils' field is below the claimed uncertainty."""
     feed, filter_ = feed_of()
     for step in range(40):
         feed.accept(reading(step * PERIOD_NS, FIELD))
@@ -107,7 +107,7 @@ def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: 
 def navigation(
     uses: bool, *polled: ImuReading, accurate: Any = None, spare: Any = None
 ) -> tuple[Navigation, Any, Any]:
-    """Return the navigation of a body, the mocked feed and the mocked facts; the unit gives `polled`."""
+    """Return the navigation of a body, its mocked feed and mocked facts; the IMU returns `polled`."""
     unit, estimation, services = Mock(), Mock(), Mock()
     unit.poll.return_value, services.recorder.epoch_ns = polled, 0
     link = Mock(bad_checksum=0, discarded_bytes=0, out_of_range=0, not_finite=0, last_byte_ns=0)

@@ -36,7 +36,7 @@ class Pair:
         return Entity(number, self.store(number), anything, MOST, self.now_ns)
 
     def kill(self, number: int) -> None:
-        """End a process without a word, and start another."""
+        """Kill a process without notice, and start a new one."""
         self.ends[number] = self.opened(number)
 
     def send(self, source: int, path: Path, name: str, kind: int = CRC32) -> Progress:
@@ -44,7 +44,7 @@ class Pair:
         return self.ends[source].send(path, name, to, kind, self.now_ns, self.now_ns, Origin())
 
     def turn(self, units: int = 20) -> None:
-        """Let each end send some units, and time pass."""
+        """Let each end send some data units, and advance the clock."""
         for number, other in ((SATELLITE, GROUND), (GROUND, SATELLITE)):
             for _ in range(units):
                 unit = self.ends[number].unit(self.now_ns)
@@ -60,7 +60,7 @@ class Pair:
         self.now_ns += STEP_NS
 
     def until_closed(self, seconds: float = 3600.0) -> None:
-        """Turn until no transfer is open at either end. Raises TimeoutError."""
+        """Run both ends until no transfer is open. Raises TimeoutError."""
         until = self.now_ns + round(seconds * 1e9)
         while any(end.transfers() for end in self.ends.values()):
             self.turn()

@@ -62,7 +62,7 @@ class User(CfdpUserBase):  # type: ignore[misc]
 
 
 class Faults(DefaultFaultHandlerBase):  # type: ignore[misc]
-    """Does nothing beyond what the handlers do by themselves."""
+    """User callbacks of the handlers that do nothing."""
 
     def notice_of_suspension_cb(self, *_: Any) -> None:
         pass
@@ -76,7 +76,7 @@ class Timers(CheckTimerProvider):  # type: ignore[misc]
 
 
 class Ends:
-    """Our satellite, the foreign ground, and the channel between them."""
+    """KnightCube's satellite end, the ground end of cfdp-py, and the channel between them."""
 
     def __init__(
         self,
@@ -116,11 +116,11 @@ class Ends:
         )
 
     def get(self, path: Path, kind: int, received: Path) -> int:
-        """Begin to send a file down; return its number."""
+        """Start the downlink of a file and return its transaction number."""
         return self.ours.send(path, received.name, FOREIGN, kind, 10**9, self.now_ns, NOBODY).number
 
     def turn(self, seconds: float = STEP_S) -> None:
-        """Let both ends send their waiting units."""
+        """Let both ends send their queued data units."""
         until = self.now_ns + round(seconds * 1e9)
         while self.now_ns < until:
             self.now_ns += round(STEP_S * 1e9)
@@ -139,21 +139,21 @@ class Ends:
         assert not (*self.store.outgoing(), *self.store.incoming())
 
     def handler(self, way: str) -> Any:
-        """Return the foreign handler of a transfer."""
+        """Return the cfdp-py handler of a transfer."""
         return self.source if way == "up" else self.dest
 
     @property
     def conditions(self) -> list[int]:
-        """Conditions of the ended transfers, ours and theirs."""
+        """Condition codes of the ended transfers at both ends."""
         return [*(one.condition or 0 for one in self.ours.ended), *map(int, self.user.ended.values())]
 
     def _arrives(self) -> bool:
         return bool(self.draw.random() >= self.loss)
 
     def _give(self, unit: Any) -> None:
-        """Give a unit to the handler whose transfer it is, or answer for a transfer that has ended."""
+        """Pass a data unit to the handler of its transfer, or answer for a transfer that has ended."""
         if isinstance(unit, EofPdu) and unit.condition_code > CANCELLED:
-            # spacepackets 0.32 leaves the condition in the upper half of its byte.
+            # spacepackets 0.32 does not shift the condition out of the upper half of its byte.
             unit.condition_code = ConditionCode(unit.condition_code >> 4)
         if unit.direction == Direction.TOWARDS_SENDER:
             if not self.source.states.state.value:

@@ -350,7 +350,7 @@ def test_without_an_end_missing_data_are_requested_ten_seconds_after_the_last_da
 
 
 def _sliced(missing: set[int]) -> list[tuple[int, int]]:
-    """Return the first gap below 25, and the last gap, cut at 7."""
+    """Return the first gap, limited to 25, and the last gap, cut at 7."""
     edges = [n for n in range(26) if (n in missing) != (n - 1 in missing)]
     gaps = list(zip(edges[::2], edges[1::2], strict=True))
     return gaps[:1] + [(max(begin, 7), end) for begin, end in gaps if end > 7][-1:]

@@ -25,7 +25,7 @@ SETTINGS = TerminalSettings(frame_bytes=512)
 
 
 class Wire:
-    """A line of either end that keeps what is put on it."""
+    """A line of either end that stores the sent frames."""
 
     name = "wire"
 
@@ -52,7 +52,7 @@ class Wire:
 
 
 class GroundWire:
-    """The ground's side of a wire."""
+    """The ground's end of a line."""
 
     def __init__(self, wire: Wire) -> None:
         self.wire = wire
@@ -72,7 +72,7 @@ class GroundWire:
 
 
 class StreamWire(Wire):
-    """A wire on which both ends send streams of bytes, which `noise` damages."""
+    """A line on which both ends send streams of bytes, which `noise` damages."""
 
     def __init__(self, codes: LinkCodes, noise: Callable[[bytes], bytes], kiss: bool = False) -> None:
         super().__init__()
@@ -117,7 +117,7 @@ class BothEnds:
         codes: LinkCodes | None = None,
         noise: Callable[[bytes], bytes] = bytes,
     ) -> None:
-        """Make keys and an empty run under `place`; with `codes` the wire is a noisy stream."""
+        """Make keys and an empty run in the folder `place`; with `codes` the line is a noisy stream."""
         make_keys(place / "keys")
         self.place, self.rate, self.clock = place, rate, ManualClock()
         self.settings, self.idle_rate, self.codes = settings, idle_rate, codes or LinkCodes()
@@ -133,7 +133,7 @@ class BothEnds:
         self.restart()
 
     def restart(self) -> None:
-        """Start another link process, and another terminal."""
+        """Replace link process and terminal by new ones."""
         given = self.settings
         settings = StationSettings(
             given.spacecraft,
@@ -156,12 +156,12 @@ class BothEnds:
         self.log.append(list(packets))
 
     def mode_packet(self, mode: Mode, trigger: str) -> bytes:
-        """Return the packet of a change of mode, now."""
+        """Return the packet of a mode change at the present time."""
         fields = {"before": 0, "mode": int(mode), "trigger": trigger, "reason": "", "target_q2": 0.0}
         return self.packer.pack(MODE, self.clock.now_ns(), fields)
 
     def turn(self, seconds: float = 0.5, answer: Callable[[bytes], bool] | None = None) -> None:
-        """Let time pass; the flight obeys what comes, or what `answer` says."""
+        """Advance the clock; the flight executes received commands or answers with `answer`."""
         until = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < until:
             self.station.turn()
@@ -180,15 +180,15 @@ class BothEnds:
         self.packets += self.terminal.take()
 
     def stages(self, counter: int, spi: int = 1) -> list[str]:
-        """Return the stages of a command as the ground has seen them."""
+        """Return the verification stages of a command that the ground has received."""
         return [r.stage.name.lower() for r in self.reports() if (r.counter, r.spi) == (counter, spi)]
 
     def reports(self) -> list[Report]:
-        """Return all reports that came down."""
+        """Return all received reports."""
         return [report_of(packet) for packet in self.of(VERIFICATION.name)]
 
     def of(self, name: str) -> list[bytes]:
-        """Return the packets of a name that came down."""
+        """Return the received packets with a name."""
         identifier = LAYOUTS[name].identifier.to_bytes(2, "big")
         return [packet for _, packet in self.packets if packet[:2] == identifier]
 

@@ -21,8 +21,8 @@ class FiledEnds(BothEnds):
     """A satellite and a ground that transfer files.
 
     Attributes:
-        ended: the ground's transfers that ended.
-        seconds: of its clock, until all transfers were closed.
+        ended: ended transfers of the ground.
+        seconds: time (s) of the clock until all transfers were closed.
     """
 
     def __init__(
@@ -34,17 +34,17 @@ class FiledEnds(BothEnds):
         super().__init__(place, rate)
 
     def restart(self) -> None:
-        """Start another link process, another terminal and another session, as after kills."""
+        """Replace link process, terminal and file session by new ones, as after kills."""
         super().restart()
         store = Store(self.place / "ground-files")
         self.session = FileSession(self.terminal, store, 1, self.up_rate, self.clock.now_ns())
 
     def ask(self, directive: Directive) -> None:
-        """Send a command of the session."""
+        """Send a command of the file session."""
         self.session.ask(directive, self.clock.now_ns())
 
     def turn(self, seconds: float = 0.5, answer: object = None) -> None:
-        """Let time pass in turns of the link."""
+        """Advance the clock in cycles of the link."""
         del answer
         until = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < until:
@@ -52,7 +52,7 @@ class FiledEnds(BothEnds):
             super().turn(TURN_NS * 1e-9)
 
     def collect(self) -> None:
-        """Take what came down, for the session too."""
+        """Process the received telemetry, also in the file session."""
         now_ns = self.clock.now_ns()
         self.wire.down = self._left(self.wire.down)
         packets = list(self.terminal.take())
@@ -63,7 +63,7 @@ class FiledEnds(BothEnds):
             self.ended.append(self.session.entity.ended.popleft())
 
     def until_closed(self) -> None:
-        """Let time pass until the ground has no open transfer. Raises TimeoutError."""
+        """Advance the clock until the ground has no open transfer. Raises TimeoutError."""
         until = self.clock.now_ns() + round(_MOST_S * 1e9)
         self.turn(0.5)
         while self.session.entity.transfers() or self.station.transfers:
@@ -72,7 +72,7 @@ class FiledEnds(BothEnds):
             self.turn(0.5)
 
     def command(self, directive: Directive) -> str:
-        """Send a command; return why it failed, or its last stage."""
+        """Send a command, and return the reason of its failure or its last stage."""
         self.session.reports()
         self.ask(directive)
         reports: list[Report] = []

@@ -122,7 +122,10 @@ def test_a_file_that_changes_while_it_is_checked_is_chosen_as_it_was_checked(
 def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
     link: FiledEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both are copied beside the same folder: the longer file first, so that the checks overlap."""
+    """Both files are copied next to the same folder.
+
+    The longer file comes first, so that the checks overlap.
+    """
     monkeypatch.setattr(filing, "_PORTION", 1)
     folder = link.place / "keys" / "files"
     (folder / "received" / "elements").mkdir()

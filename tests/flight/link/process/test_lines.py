@@ -60,7 +60,7 @@ def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
             stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
         )
         stranger.bind(("127.0.0.2", 0))
-        for _ in range(10_000):  # far more than the buffer holds
+        for _ in range(10_000):  # much larger than the buffer
             stranger.sendto(FRAME, ("127.0.0.1", line.port))
         peer.sendto(FRAME, ("127.0.0.1", line.port))
         assert [frame for frame, _ in line.receive()] == [FRAME]
@@ -68,7 +68,7 @@ def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
 
 
 def test_an_operator_whose_frame_is_late_is_not_displaced_by_200_strangers_a_second() -> None:
-    """The link turns five times a second only, as on a busy board; the frame follows after half a second."""
+    """The link runs only five cycles a second, as on a busy board; the frame follows after half a second."""
     line = TcpLine("127.0.0.1:0")
     with ExitStack() as stack:
         (operator,) = callers_of(line, stack, 1)
@@ -131,7 +131,7 @@ def test_a_connection_that_does_not_read_is_closed() -> None:
         ((frame, sender),) = received_by(line)
         assert frame == FRAME
         line.trust(sender, 0)
-        for _ in range(300):  # far more than the sockets hold
+        for _ in range(300):  # much larger than the socket buffers
             line.send([bytes(1 << 16)], 0)
         assert sender not in line._connections
         assert len(line._connections) == 1

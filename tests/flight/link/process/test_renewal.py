@@ -46,7 +46,7 @@ def ends(tmp_path: Path) -> Iterator[Ends]:
 
 
 def put(ends: Ends) -> Activate:
-    """Send a bundle up; return the directive that activates it."""
+    """Uplink a bundle, and return the directive that activates it."""
     path = ends.place / "configuration-2.renewal"
     path.write_bytes(DATA)
     ends.session.put(path, f"configuration/{path.name}", ends.clock.now_ns())

@@ -206,7 +206,7 @@ def test_the_loop_shows_once_a_second_that_it_turns_also_while_it_takes_many_fra
     slow = link.station._gate.admit
 
     def admit(frame: bytes) -> Admitted:
-        link.clock.advance(500_000_000)  # as a disk that takes long to store a counter
+        link.clock.advance(500_000_000)  # emulates a disk that takes long to store a counter
         return slow(frame)
 
     monkeypatch.setattr(link.station._gate, "admit", admit)

@@ -13,7 +13,7 @@ _BITS = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64}
 
 
 def timing_packets(count: int, packer: Packer | None = None) -> list[bytes]:
-    """Return `count` small packets, numbered, 25 ms apart."""
+    """Return `count` small numbered packets at intervals of 25 ms."""
     packer = packer or Packer()
     return [
         packer.pack(CYCLE_TIMING, 25_000_000 * i, cycle=i, lateness=1e-5 * i, execution=5e-4)
@@ -22,7 +22,7 @@ def timing_packets(count: int, packer: Packer | None = None) -> list[bytes]:
 
 
 def values_of(field: Field) -> st.SearchStrategy[object]:
-    """Return what may stand in a field."""
+    """Return a strategy for the values of a field."""
     one: st.SearchStrategy[object]
     if field.kind.startswith("S"):
         return st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")).map(
@@ -38,14 +38,14 @@ def values_of(field: Field) -> st.SearchStrategy[object]:
 
 
 def cut(text: str, size: int) -> str:
-    """Return as many whole characters of `text` as fit in `size` bytes of UTF-8 before a zero."""
+    """Return the longest start of `text` that fits in `size` bytes of UTF-8 and has no zero."""
     while len(text.encode()) >= size:
         text = text[:-1]
     return text
 
 
 def contents(packet: Packet) -> st.SearchStrategy[dict[str, object]]:
-    """Return what may stand in a packet."""
+    """Return a strategy for the contents of a packet."""
     return st.fixed_dictionaries({field.name: values_of(field) for field in packet.fields})
 
 

@@ -10,12 +10,12 @@ from flight.link.telemetry.log import SegmentFile, find_segments, open_segment
 
 
 def content(folder: Path, stem: str = "flight") -> bytes:
-    """Return what a log has written, its segments in order."""
+    """Return the bytes that a log has written to its segments, in order."""
     return b"".join(path.read_bytes() for path in find_segments(folder, stem))
 
 
 class SmallDisk:
-    """Opens segments on a disk of `room` bytes; a write beyond it takes what fits, the next fails."""
+    """Opens segments on a disk of `room` bytes. The write that fills the disk is cut; later writes fail."""
 
     def __init__(self, room: int) -> None:
         self.room = room

@@ -45,7 +45,7 @@ def test_a_full_disk_stops_the_log_in_order(tmp_path: Path, room: int) -> None:
 
 @pytest.mark.parametrize("room", [0, 500, 777])
 def test_a_disk_that_was_full_and_has_room_again_gets_what_waited(tmp_path: Path, room: int) -> None:
-    """Within the queue's reach nothing is lost, and what was cut off half-way is written again whole."""
+    """No packet is lost while the queue has room. A partly written packet is written again completely."""
     clock, disk = ManualClock(0), SmallDisk(room)
     packets = timing_packets(60)
     log = FlightLog(tmp_path, clock=clock, segment_bytes=25 * len(packets[0]), opener=disk.open)
@@ -226,7 +226,7 @@ def test_a_hung_disk_blocks_neither_write_nor_close(tmp_path: Path, monkeypatch:
     release.set()
     drain.join()
     assert log._store is not None
-    log._store.close()  # what the process's end does
+    log._store.close()  # simulates the end of the process
 
 
 def test_a_patient_log_begins_without_its_disk_and_writes_all_when_it_comes(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def packets_of(data: bytes) -> list[tuple[int, bytes]]:
-    """Return every packet's place and bytes, by the lengths in the headers alone."""
+    """Return offset and bytes of each packet from the lengths in the headers."""
     found, position = [], 0
     while position < len(data):
         length = int.from_bytes(data[position + 4 : position + 6], "big") + 7
@@ -34,7 +34,7 @@ def packets_of(data: bytes) -> list[tuple[int, bytes]]:
 
 
 def returned(result: ScanResult) -> list[bytes]:
-    """Return the packets found, each kind in its order."""
+    """Return the found packets by type, in order."""
     return sorted(row.tobytes() for array in result.packets.values() for row in array)
 
 
@@ -54,7 +54,7 @@ def test_power_lost_at_every_byte_of_the_last_four_kibibytes_costs_the_packet_it
 
 
 def test_blocks_that_power_loss_left_as_zeros_cost_only_what_they_cover(run: Path) -> None:
-    """What a file system shows of a file whose length was on disk but not its last blocks."""
+    """A file system shows zeros if a file's length was stored but its last blocks were not."""
     data = find_segments(run, "flight")[0].read_bytes()[:8192]
     packets = packets_of(data[: packets_of_prefix(data)])
     for start in range(0, 8192, 512):
@@ -91,7 +91,7 @@ def test_random_damage_costs_the_packets_it_touches_and_invents_none(run: Path, 
 
 
 def test_a_packet_of_a_segment_or_of_a_sequence_is_none_of_ours() -> None:
-    """The sequence flags of a whole packet are both set; a right CRC does not make others right."""
+    """Both sequence flags of a complete packet are set. Other flags are refused even with a correct CRC."""
     body = bytearray(LAYOUTS["cycle_timing"].length - 2)
     body[:2] = LAYOUTS["cycle_timing"].identifier.to_bytes(2, "big")
     body[4:6] = (len(body) + 2 - 7).to_bytes(2, "big")

@@ -1,4 +1,4 @@
-"""Directions as a star camera would see them, and the attitude that they fix, worked out with more digits."""
+"""Star directions measured by a simulated camera, and their optimal attitude in higher precision."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """Directions (n, 3) seen and true, errors (n,) rad, and the true attitude (4,)."""
+    """Measured and true directions (n, 3), errors (n,), rad, and the true attitude (4,)."""
 
     observed: FloatArray
     reference: FloatArray
@@ -40,8 +40,8 @@ def sight(
 ) -> Sight:
     """Return n stars within `half_field` rad of a random boresight, or all over the sky.
 
-    `sigma` is about the rad by which each is seen off; `angle` rad the rotation, about a random axis, drawn
-    evenly from all rotations when None.
+    `sigma` (rad) is the approximate error of each measured direction; `angle` (rad) is the rotation about a
+    random axis; if None, the rotation is drawn uniformly from all rotations.
     """
     drawn = rng.normal(size=(n, 3))
     if half_field is not None:

@@ -1,4 +1,4 @@
-"""ESOQ2 against Wahba's problem solved by singular values, against scipy, and against its own covariance."""
+"""Tests of ESOQ2 against the SVD solution of Wahba's problem, scipy, and its own covariance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import (
 )
 
 _solve = SOLVERS["esoq2"]
-_NARROW = 0.17  # rad, half of a 20 deg field
+_NARROW = 0.17  # half of a 20 deg field of view, rad
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
@@ -92,7 +92,10 @@ def test_it_is_the_solution_of_scipy() -> None:
 )
 @pytest.mark.parametrize("n", [2, 6])
 def test_no_angle_and_no_axis_is_singular(angle: float, axis: tuple[float, float, float], n: int) -> None:
-    """No rotation loses ESOQ2's axis, 180 deg the scalar part: sequential rotation serves both."""
+    """ESOQ2's axis is undefined at 0 deg and its scalar part vanishes at 180 deg.
+
+    Sequential rotations solve both cases.
+    """
     q = from_rotation_vector(angle * _unit(np.array(axis)))
     reference = _reference(np.random.default_rng(44), n, _NARROW)
     found = _solve(reference @ attitude_matrix(q).T, reference, np.full(n, 1e-5))

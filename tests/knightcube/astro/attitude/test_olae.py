@@ -1,4 +1,4 @@
-"""The Optimal Linear Attitude Estimator against exact rotations and Wahba's problem by SVD."""
+"""Tests of the Optimal Linear Attitude Estimator against exact rotations and the SVD solution."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_the_gain_is_the_derivative_of_the_rotation_vector() -> None:
     ends = rotate(starts, rotation)
     weights = np.linspace(0.5, 1.5, 7)
     solution = rotation_between(starts, ends, weights)
-    # Opposite errors of start and end move d = b - r alone.
+    # Opposite errors of b and r change only d = b - r.
     error = 1e-6 * np.array([0.3, -0.5, 0.2])
     moved_starts, moved_ends = starts.copy(), ends.copy()
     moved_starts[2] -= 0.5 * error

@@ -1,4 +1,4 @@
-"""All attitude solvers: with one another, with scipy, with their covariances, and where attitudes end."""
+"""Tests of all attitude solvers against each other, scipy and their covariances, and of degenerate cases."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from knightcube.astro.quaternion import (
 from tests.knightcube.astro.attitude.sights import Sight, information, sight, unit
 
 _ALL = sorted(SOLVERS)
-_FIELD = 0.0524  # rad, half of a 6 deg field
+_FIELD = 0.0524  # half of a 6 deg field of view, rad
 
 
 def _by(name: str, seen: Sight) -> AttitudeFix:
@@ -45,7 +45,7 @@ def _error(fix: AttitudeFix, quaternion: FloatArray) -> FloatArray:
 
 
 def _least_eigenvalue(seen: Sight) -> float:
-    """Return the least eigenvalue of the information, as a part of the sum of weights."""
+    """Return the smallest eigenvalue of the information, relative to the sum of weights."""
     return float(np.linalg.eigvalsh(information(seen.observed, seen.sigma))[0] / np.sum(seen.sigma**-2.0))
 
 
@@ -63,11 +63,12 @@ def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
 ) -> None:
     seen = sight(np.random.default_rng(seed), n, half_field, sigma, angle)
     if _least_eigenvalue(seen) < (30.0 * sigma) ** 2:
-        return  # Stars that their own errors may bring together or apart share no attitude to agree upon.
+        return  # The solvers need not agree on stars whose separation is within their errors.
     fixes = {name: _by(name, seen) for name in OPTIMAL}
     for fix in fixes.values():
         assert angle_between(fix.quaternion, fixes[DEFAULT].quaternion) < 1e-10
-        # Attitudes of different solvers differ by some 1e-15 rad, which changes the loss by this over sigma.
+        # Attitudes of different solvers differ by about 1e-15 rad, which limits the agreement of their
+        # losses.
         assert fix.loss == pytest.approx(fixes[DEFAULT].loss, rel=1e-6, abs=1e-9 + 3e-15 / sigma)
         assert fix.quaternion[3] >= 0.0
         assert np.linalg.norm(fix.quaternion) == pytest.approx(1.0, abs=1e-14)
@@ -110,14 +111,15 @@ def test_directions_without_noise_give_the_true_attitude(name: str) -> None:
             true = sight(rng, n, half_field, 1e-5, angle)
             exact = true.reference @ attitude_matrix(true.quaternion).T
             fix = SOLVERS[name](unit(exact), true.reference, true.sigma)
-            # A direction is rounded by 1e-16; the turn about the boresight is that over the separation.
+            # Directions are rounded by 1e-16, so the rotation about the boresight errs by this, divided by
+            # the separation.
             assert angle_between(fix.quaternion, true.quaternion) < 1e-15 / np.sqrt(_least_eigenvalue(true))
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (-1, 1, 1)])
 @pytest.mark.parametrize("name", _ALL)
 def test_half_a_turn_about_any_axis_is_solved(name: str, axis: tuple[int, int, int]) -> None:
-    """The boresight about which stars are gathered may be the axis, and may be thrown backwards."""
+    """The boresight of the stars may be the rotation axis, and may be reversed by the rotation."""
     q = from_rotation_vector(np.pi * unit(np.array(axis, dtype=float)))
     drawn = np.random.default_rng(63).normal(size=(6, 3)) * [_FIELD, _FIELD, 0.0]
     reference = unit(np.array([0.0, 0.0, 1.0]) + drawn)
@@ -156,7 +158,7 @@ def test_errors_are_as_large_as_the_covariance_says(name: str, n: int, half_fiel
     runs, total, losses = 120, 0.0, 0.0
     for _ in range(runs):
         seen = sight(rng, n, half_field, 1e-5)
-        # Two stars nearly in one place have errors that no covariance describes.
+        # Two stars at nearly the same position have errors that no covariance describes.
         while _least_eigenvalue(seen) < 1e-5:
             seen = sight(rng, n, half_field, 1e-5)
         fix = _by(name, seen)
@@ -179,7 +181,7 @@ def test_what_is_not_optimal_is_off_the_optimum_by_the_difference_of_the_covaria
         seen = sight(rng, 8, None, 1e-5)
         fix, best = _by(name, seen), _by(DEFAULT, seen)
         excess = fix.covariance - best.covariance
-        # Both are formed from directions that are 1e-5 off.
+        # Both attitudes are formed from directions with errors of 1e-5.
         assert np.linalg.eigvalsh(excess)[0] > -1e-4 * np.trace(best.covariance)
         apart = _error(fix, best.quaternion)
         ratios.append(float(apart @ apart / np.trace(excess)))
@@ -227,13 +229,13 @@ def test_directions_that_share_no_attitude_give_the_least_loss_or_none(name: str
 
 @pytest.mark.parametrize("name", _ALL)
 def test_a_field_seen_backwards_has_no_attitude(name: str) -> None:
-    """Of three axes each seen reversed, half a turn about any axis is as good as about any other."""
+    """If all three axes are measured reversed, half a rotation about any axis fits equally well."""
     axes = np.eye(3)
     if name in OPTIMAL:
         with pytest.raises(AttitudeError):
             SOLVERS[name](-axes, axes, np.full(3, 1e-5))
     else:
-        # Those that take part of the data at its word say by their loss that the rest denies it.
+        # Solvers that fit part of the data exactly show by their loss that the other data contradict it.
         try:
             fix = SOLVERS[name](-axes, axes, np.full(3, 1e-5))
         except AttitudeError:

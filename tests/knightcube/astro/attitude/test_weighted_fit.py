@@ -1,4 +1,4 @@
-"""Least-squares attitude with whole covariances: its errors agree with the covariance that it reports."""
+"""Tests that errors of a least-squares attitude with full covariances agree with its covariance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EARTH_FIELD = 3e-5
 def scene(
     rng: np.random.Generator, lopsided: bool = False
 ) -> tuple[FloatArray, VectorObservation, VectorObservation, VectorObservation]:
-    """Return an attitude (4,), and Sun, nadir and field as it sees them, with the errors they claim."""
+    """Return an attitude (4,), and measured directions of Sun, nadir and field with their covariances."""
     truth = normalise(rng.standard_normal(4))
     references = rng.standard_normal((3, 3))
     references /= np.linalg.norm(references, axis=-1, keepdims=True)
@@ -31,7 +31,7 @@ def scene(
     observations = []
     for reference, sigma in zip(references[:2], (SUN_SIGMA, NADIR_SIGMA), strict=True):
         root = sigma * np.eye(3)
-        if lopsided:  # a short arc of limb: one way ten times worse than the other
+        if lopsided:  # short arc of limb: the error along one direction is ten times larger
             axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
             root = sigma * axes * np.array([1.0, 3.0, 10.0])
         seen = attitude_matrix(truth) @ reference + root @ rng.standard_normal(3)
@@ -67,7 +67,7 @@ WAYS: dict[
 
 @pytest.mark.parametrize("way", WAYS)
 def test_errors_are_as_large_as_the_covariance_says(way: str) -> None:
-    """Mean NEES of 150 attitudes in its 99.9 % band; lopsided covariances where they are weighed whole."""
+    """The mean NEES of 150 attitudes is in its 99.9 % band if the full covariances are used."""
     make, lopsided = WAYS[way]
     rng = np.random.default_rng(SEED)
     total = 0.0

@@ -1,4 +1,4 @@
-"""The build of the star table: what it writes, and what it refuses."""
+"""Tests of the build of the star table: written values, and refused sources."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from knightcube.errors import UsageError
 
 
 def _source() -> build.Source:
-    """Return a stand-in of the right size whose counts per magnitude are the published ones."""
+    """Return a replacement of the catalogue with the published counts per magnitude."""
     rows = build.ENTRIES
     magnitude: npt.NDArray[Any] = np.full(rows, 9.0)
     limits = sorted(build.PUBLISHED_COUNTS.items(), reverse=True)

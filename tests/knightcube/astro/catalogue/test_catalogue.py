@@ -1,4 +1,4 @@
-"""The star table against published counts and published positions."""
+"""Tests of the star table against published counts and positions."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _index(hip: int) -> int:
 def test_counts_are_the_published_ones_less_the_entries_without_a_position(
     limit: float, published: int, unplaced: int
 ) -> None:
-    """Three of the unplaced are added, HIP 115125 at its own V of 6.97 and so only below 7."""
+    """Three of the stars without position are added; HIP 115125 has V 6.97 and counts only below 7."""
     added = 2 if limit < 6.97 else 3
     assert len(STARS.brighter_than(limit)) == published - unplaced + added
 

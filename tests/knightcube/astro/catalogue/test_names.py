@@ -1,4 +1,4 @@
-"""Proper names against the stars they are given to."""
+"""Tests of proper names against the positions of the named stars."""
 
 from __future__ import annotations
 

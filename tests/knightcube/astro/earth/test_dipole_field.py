@@ -1,4 +1,4 @@
-"""The dipole's field ahead against the whole World Magnetic Model along the same orbit."""
+"""Tests of the predicted dipole field against the World Magnetic Model along the same orbit."""
 
 from __future__ import annotations
 

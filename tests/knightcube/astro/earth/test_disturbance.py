@@ -1,4 +1,4 @@
-"""Air presses on a body by the area that it shows: shapes beside the faces of a box."""
+"""Tests of the drag on bodies other than boxes by their projected area."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ SPEED, DENSITY = 7_600.0, 1e-12
 
 @pytest.mark.parametrize("name", ["knightcube", "cubesat_3u"])
 def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> None:
-    """The sizes that fit the drag of ten attitudes fit that of 190 others; without areas a 3U's do not."""
+    """Sizes fitted to the drag of ten attitudes fit 190 other attitudes.
+
+    Without areas, those of a 3U do not.
+    """
     craft = CRAFTS[name]
     faces = box(craft.size, ARM, np.zeros(6))
     flight = np.array([1.0, 0.0, 0.0])

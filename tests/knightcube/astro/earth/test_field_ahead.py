@@ -1,4 +1,4 @@
-"""The field ahead, made call by call, against the whole model along the orbit."""
+"""Tests of the incrementally predicted field against the full model along the orbit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WHOLE = predict(STATE, 3600.0)
 
 
 def apart(ahead: FloatArray, since: float) -> FloatArray:
-    """Return the angles (n,) rad to the whole model's field."""
+    """Return the angles (n,), rad, to the field of the full model."""
     true = WHOLE.field_at(since + TIMES)
     across = np.linalg.norm(np.cross(ahead, true), axis=1)
     return np.asarray(np.arctan2(across, np.sum(ahead * true, axis=1)))

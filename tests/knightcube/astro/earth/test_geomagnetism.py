@@ -1,4 +1,4 @@
-"""The two field models against NOAA's published values, and against each other."""
+"""Tests of the two field models against NOAA's published values and each other."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def julian_date(year: float) -> float:
 
 @pytest.mark.parametrize("row", NOAA)
 def test_the_field_on_board_is_the_one_that_was_published(row: tuple[float, ...]) -> None:
-    """To 0.06 nT: half the last digit and rounding."""
+    """The tolerance of 0.06 nT is half the last digit plus rounding."""
     year, height, latitude, longitude, *published = row
     found = believed.field_on_ground_axes(year, np.radians(latitude), np.radians(longitude), 1e3 * height)
     np.testing.assert_allclose(1e9 * found, published, atol=0.06)
@@ -46,7 +46,7 @@ def test_the_field_on_board_is_the_one_that_was_published(row: tuple[float, ...]
 
 @pytest.mark.parametrize("row", NOAA)
 def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tuple[float, ...]) -> None:
-    """IGRF-14 at NOAA's points, by another path: ellipsoid to position, and back to the ellipsoid's axes."""
+    """IGRF-14 at NOAA's points is computed from positions and converted back to the ellipsoid's axes."""
     year, height, latitude, longitude, *published = row
     up, along = np.radians(latitude), np.radians(longitude)
     a, f = 6_378_137.0, 1.0 / 298.257223563
@@ -150,7 +150,7 @@ def test_the_builder_refuses_a_text_that_is_not_a_table_of_the_field() -> None:
 
 
 def test_the_stored_table_is_the_builder_s() -> None:
-    """Columns in the builder's order: the dipole of 2025 that was published stands where it belongs."""
+    """The columns have the builder's order, so that the published dipole of 2025 is in its columns."""
     with np.load(true.TABLE) as stored:
         epochs, table = stored["epoch"], stored["coefficient"]
     assert epochs.tolist() == [2000, 2005, 2010, 2015, 2020, 2025, 2030]

@@ -1,4 +1,4 @@
-"""Elements that are fitted to positions of SGP4 itself, and to an orbit of another model."""
+"""Tests of elements that are fitted to positions of SGP4 and of another orbit model."""
 
 from __future__ import annotations
 

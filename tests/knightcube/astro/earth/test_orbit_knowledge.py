@@ -1,4 +1,4 @@
-"""Where the satellite is: against published SGP4 states, another integrator, and the Earth's own turn."""
+"""Tests of the satellite's position against published SGP4 states, an integrator, and Earth rotation."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_two_line_elements_give_the_published_state() -> None:
 def test_the_frame_of_sgp4_is_turned_into_the_frame_of_the_stars_as_published() -> None:
     """Vallado, Fundamentals of Astrodynamics, Example 3-15: 2004 April 6, 07:51:28.386009 UTC, to 40 m.
 
-    UT1 - UTC is -0.4399619 s; the polar motion that is left out here is 10 m.
+    UT1 - UTC is -0.4399619 s; the neglected polar motion is 10 m.
     """
     date = 2_453_101.5 + (7.0 * 3600.0 + 51.0 * 60.0 + 28.386009) / 86_400.0
     teme = 1e3 * np.array([5094.18016210, 6127.64465950, 6380.34453270])
@@ -76,7 +76,7 @@ def test_down_is_towards_the_ground() -> None:
 
 
 def fix_of(state: FloatArray, date: float, **spread: float) -> GpsFix:
-    """Return the fix that a receiver would give of an inertial state (6,)."""
+    """Return the GPS fix of an inertial state (6,)."""
     turn = celestial_to_terrestrial(date)
     ground = turn @ state[:3]
     return GpsFix(date, ground, turn @ state[3:] - np.cross([0.0, 0.0, ROTATION_RATE], ground), **spread)
@@ -89,7 +89,7 @@ def test_a_fix_carried_on_is_where_another_integrator_has_the_satellite() -> Non
     )
     begin, end = propagate(elements, 1300.0).states_at(np.array([0.0, 1200.0]))
     found = fix_of(begin, DATE).at(DATE + 1200.0 / 86_400.0)
-    # A Julian date's digit is 40 us: 0.3 m.
+    # The resolution of a Julian date is 40 us, or 0.3 m along the orbit.
     np.testing.assert_allclose(found.position, end[:3], atol=20.0)
     np.testing.assert_allclose(found.velocity, end[3:], atol=0.02)
     assert found.sigma > 100.0
@@ -117,7 +117,7 @@ def test_lines_that_are_not_elements_are_refused() -> None:
 
 @pytest.mark.parametrize("day", ["000.50000000", "367.00000000", "999999999999"])
 def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
-    """In an orbit of half a day a place 1e12 days from the epoch is found in half days, and so never."""
+    """A position 1e12 days from the epoch must be refused, because stepping there would never end."""
     first = FIRST[:20] + day + FIRST[32:]
     high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
     with pytest.raises(UsageError, match="day of the year of the epoch"):

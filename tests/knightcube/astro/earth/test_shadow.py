@@ -1,4 +1,4 @@
-"""The Earth's shadow against the tangents of two spheres, and against counting rays to the Sun's disc."""
+"""Tests of the Earth's shadow against tangents of two spheres and against rays to the Sun's disc."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SUN = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
 
 
 def _behind(depth: float, aside: float) -> FloatArray:
-    """Return a position `depth` m behind the Earth's centre and `aside` m off the shadow's axis."""
+    """Return a position `depth` m behind the Earth's centre and `aside` m from the shadow's axis."""
     return np.array([-depth, 0.6 * aside, 0.8 * aside])
 
 

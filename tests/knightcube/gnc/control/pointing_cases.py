@@ -1,4 +1,4 @@
-"""Satellites, orbits and weights that several tests of the pointing control share."""
+"""Satellites, orbits and weights for several tests of the pointing control."""
 
 from __future__ import annotations
 

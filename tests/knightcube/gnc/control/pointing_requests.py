@@ -1,4 +1,4 @@
-"""Requests that several tests of the pointing planner share."""
+"""Requests for several tests of the pointing planner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map from dipole moments to the currents of coils with any axes and strengths."""
+"""Tests of the map from dipole moments to currents for coils with any axes and strengths."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_no
 def test_redundant_coils_share_a_dipole_with_the_least_heat_within_their_limits(
     seed: int, count: int
 ) -> None:
-    """Linear programming says which dipoles can be made, and a general optimiser what they heat."""
+    """Linear programming gives the feasible dipoles, and a general optimiser gives their heat."""
     generator = np.random.default_rng(seed)
     dipoles = generator.standard_normal((3, count))
     limits, ohms = generator.uniform(0.05, 1.0, count), generator.uniform(5.0, 60.0, count)
@@ -112,7 +112,7 @@ def test_the_coils_that_work_have_their_own_limits_and_heat() -> None:
     np.testing.assert_allclose(left.heat, expected.heat)
     np.testing.assert_allclose(left.limits, expected.limits)
     assert np.linalg.eigvalsh(left.heat - coils.heat).min() > -1e-12, "the same dipoles heat more"
-    # Two coils: the dipole across both is assumed to be half as strong.
+    # With two coils, the dipole normal to both is assumed to be half as strong.
     pair = CoilMap.equal(0.6, 0.1, 20.0).working(np.array([True, False, True]))
     np.testing.assert_allclose(pair.limits, [0.06, 0.03, 0.06])
     np.testing.assert_allclose(np.diag(pair.heat), 20.0 / np.array([0.6, 0.3, 0.6]) ** 2)

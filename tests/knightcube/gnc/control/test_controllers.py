@@ -1,4 +1,4 @@
-"""No constant torque leaves an offset, and saturation winds nothing up; beside the thesis, where they do.
+"""Tests that each configured name gives its controller, and that all have the same interface.
 
 Each name in a configuration means its controller, and all of them keep to one interface.
 """
@@ -28,7 +28,7 @@ THREAD = replace(BELIEVED, stiffness=2e-5, damping=2e-6)
 def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: SingleAxisPlant) -> None:
     """The thesis's offset is the torque over its stiffness: d / K_e = 4e-3 / 4.47 rad is 0.051 deg.
 
-    A hold within 0.03 deg, noise and all, shows that there is none.
+    The attitude is held within 0.03 deg with noise, which excludes an offset.
     """
     target = 0.5 if true is THREAD else 0.3
     errors = {}
@@ -53,7 +53,10 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
     ids=["lq", "pid", "adaptive"],
 )
 def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: AngleController) -> None:
-    """0.1 rad there within the coil's limit, held to 0.15 deg: the adaptive one learns while it errs."""
+    """A step of 0.1 rad within the coil's limit is held to 0.15 deg.
+
+    The adaptive controller learns from errors.
+    """
     rows = fly(controller, replace(THREAD, stiffness=1e-5), held(0.1), 60.0)
     assert largest_error(rows, 0.1, 10.0) < 0.15
     assert rows[:, 1].max() < 0.1 * 1.05
@@ -72,7 +75,7 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
 
 
 def test_the_thesis_tracker_overshoots_there() -> None:
-    """Which is why it needs a path: its demand to brake comes when the coil can no longer meet it."""
+    """The controller therefore needs a path: without one it brakes when the coil is already too weak."""
     rows = fly(LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
     assert rows[:, 1].max() > 0.7 * 1.3
 
@@ -98,7 +101,7 @@ def test_a_name_means_its_controller(name: str) -> None:
 
 
 def test_only_the_lq_tracker_feeds_the_estimated_disturbance_forward() -> None:
-    """3.6 A per rad/s^2 at theta = 0: what J / (n A B) says."""
+    """The current per acceleration at theta = 0 is J / (n A B), 3.6 A per rad/s^2."""
     rest = PathSample(0.0, 0.0, 0.0)
     for name in KINDS:
         controller = controller_of(Control(tracker=name), BELIEVED, 0.025, Identification())  # type: ignore[arg-type]  # any of KINDS

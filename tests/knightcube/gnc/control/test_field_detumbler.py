@@ -1,4 +1,4 @@
-"""Detumbling by the magnetometer alone: started by agreement, and out of a spin along the field.
+"""Tests of detumbling by magnetometer only: its start, and a spin about the field direction.
 
 The momentum plan removes what it says in the time it says, near the least time there is.
 """
@@ -40,12 +40,12 @@ INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
 LIMIT = 0.1
 FIELD, TURN = np.array([0.0, 0.0, 4e-5]), np.array([0.0, 2.2e-3, 0.0])
 OWN_FIELD = 4e-4
-"""T by A m^2: the coils at the magnetometer, as strong as the Earth's field at full dipole."""
+"""Field of the coils at the magnetometer (T per A m^2), equal to the Earth's field at full dipole."""
 CYCLE_NS = 100_000_000
 
 
 class Body(NamedTuple):
-    """A body whose inertia differs from the one that is described, and the limit of its coils, A m^2."""
+    """A body whose inertia differs from its description, and the limit of its coils, A m^2."""
 
     described: FloatArray
     inertia: FloatArray
@@ -53,7 +53,7 @@ class Body(NamedTuple):
 
 
 def unlike(described: FloatArray, limit: float, seed: int) -> Body:
-    """Return a body with moments off by up to 10 % and axes off by up to 5 deg, as `craft.accuracy` says."""
+    """Return a body with errors of up to 10 % (moments) and 5 deg (axes), as stated by `craft.accuracy`."""
     rng, errors = np.random.default_rng(seed), BodyErrors()
     moments, axes = np.linalg.eigh(described)
     while True:
@@ -86,10 +86,10 @@ def fly(
     body: Body | None = None,
     seed: int = 4,
 ) -> FloatArray:
-    """Return the speed (n,) rad/s of each cycle; `gyro` makes its reading of the rate.
+    """Return the speed (n,) rad/s of each cycle; `gyro` is the function that measures the rate.
 
-    The field turns by `sooner` times what it does in orbit; a sample is `late` s older than the last command.
-    The speed of a `body` other than the one described is that of its energy, in a body of its mean moment.
+    The field rotates `sooner` times as fast as in orbit; samples are `late` s older than the last command.
+    For a `body` that differs from its description, the speed follows from its energy and mean moment.
     """
     law, rng = detumbler(body), np.random.default_rng(seed)
     limit, inertia = (LIMIT, INERTIA) if body is None else (body.limit, body.inertia)
@@ -122,9 +122,9 @@ def fly(
 
 
 def test_a_slow_spin_along_the_field_is_braked_as_the_field_turns_and_spiked_samples_do_not_mislead() -> None:
-    """B-dot takes 2,000 s and more; a field that turns by a right angle in 714 s needs at least that long.
+    """B-dot takes at least 2,000 s; the minimum is 714 s, in which the field rotates by 90 deg.
 
-    Half a degree per second is left a little sooner. The coils add nothing to the spin.
+    The rate of 0.5 deg/s is reached a little earlier. The coils add nothing to the spin.
     """
     speeds = fly(np.array([0.0, 0.0, 0.03]), 850.0, spikes=0.1)
     assert speeds.max() < 1.1 * speeds[0]
@@ -181,12 +181,12 @@ def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
 
 
 def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
-    """The unit answers, but its samples are rejected: no coil brakes by a field that is only predicted."""
+    """The IMU answers, but its samples are rejected: the coils must not act on a predicted field alone."""
     law = detumbler()
     law.begin(0)
 
     def acts(begin_ns: int, end_ns: int, good: float) -> bool:
-        """Return whether the coils acted while the body turned by 0.1 rad/s across the field."""
+        """Return whether the coils acted while the body rotated at 0.1 rad/s normal to the field."""
         acted = False
         for now_ns in range(begin_ns, end_ns, 25_000_000):
             turned = attitude_matrix(from_rotation_vector(np.array([1e-10 * now_ns, 0.0, 0.0]))) @ FIELD
@@ -299,11 +299,11 @@ def test_constants_that_do_not_brake_are_refused() -> None:
 STEP, DIPOLE_LIMIT, REST = 5.0, 0.1, 1e-5
 TIMES = np.arange(0.0, 400.0 * STEP, STEP)
 FIELD_AHEAD = rotating_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), TIMES)
-"""T: it turns by two turns in 95 min, as in a polar orbit."""
+"""Field (T) that makes two rotations in 95 min, as in a polar orbit."""
 
 
 def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
-    """Return the share of the momentum that is left by a dipole of the limit's length along the plan."""
+    """Return the fraction of the momentum that remains after the plan with dipoles at the limit."""
     now = momentum.copy()
     for there in FIELD_AHEAD[: round(horizon / STEP)]:
         dipole = -np.cross(there, costate)
@@ -313,7 +313,7 @@ def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
 
 
 def least_time(momentum: FloatArray, field: FloatArray) -> float:
-    """Return a bound from below: for any p, a dipole of that length takes at most its integral from p . h."""
+    """Return a lower bound: for any p, dipoles at the limit reduce p . h at most by their integral."""
     directions = np.random.default_rng(1).standard_normal((3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     most = (

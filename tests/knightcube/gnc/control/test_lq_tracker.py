@@ -1,4 +1,4 @@
-"""The tracker: gains and closed form, the error's equations and differences, and the closed loop."""
+"""Tests of the tracker: gains, closed form, error equations, differences, and the closed loop."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_saturation_is_explicit() -> None:
 @settings(deadline=None)
 @given(st.floats(1.01, math.pi - 0.01), st.sampled_from([-1.0, 1.0]))
 def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float, sign: float) -> None:
-    """sin(d) falls again after 90 degrees; the command does not."""
+    """sin(d) decreases beyond 90 deg, but the command does not."""
     tracker = LqTracker(STRONG, *WEIGHTS)
     command = tracker.command(PathSample(sign * size, 0.0, 0.0), 0.0, 0.0)
     edge = tracker.command(PathSample(sign * 1.0, 0.0, 0.0), 0.0, 0.0)

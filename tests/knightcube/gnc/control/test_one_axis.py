@@ -1,4 +1,4 @@
-"""The single-axis control laws on hand-made motions, and the excitation's manoeuvres integrated in time."""
+"""Tests of the single-axis control laws on artificial motions, and of the integrated excitation."""
 
 from __future__ import annotations
 
@@ -86,13 +86,13 @@ def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float)
     rate = math.sqrt(2.0 * braking * math.sin(error) - reach**2) / math.cos(error)
     wanted = PathSample(sign * error, 0.0, 0.0)
     demanded = tracker.command(wanted, 0.0, sign * rate).demanded
-    # What remains is the curvature of the sine.
+    # The remaining difference is the curvature of the sine.
     curvature = -sign * math.sin(error) * rate**2 / math.cos(error)
     assert demanded == pytest.approx(torque_current(0.0, curvature), rel=1e-6)
 
 
 def test_a_disturbance_reduces_the_braking_down_to_a_twentieth_of_the_torque() -> None:
-    """The approach slows down with the disturbance, until a minimum: the rest changes by itself only."""
+    """The approach becomes slower with the disturbance down to a minimum."""
     tracker, wanted = LqTracker(PLANT, 20.0, 1.0), PathSample(0.5, 0.0, 0.0)
 
     def wish(disturbance: float) -> float:
@@ -147,7 +147,7 @@ def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reac
         assert rate == pytest.approx(0.0, abs=1e-9)
         assert max(np.abs(angles)) < 0.2 + 1e-9
         extremes.append((min(angles), max(angles), angle))
-    # A swing is released at the reach; a double pulse comes back to where it began.
+    # A swing is released at the largest angle; a double pulse returns to its start.
     assert extremes[1][2] == pytest.approx(0.2)
     assert extremes[3][2] == pytest.approx(-0.2)
     assert extremes[0][2] == pytest.approx(0.0, abs=1e-9)

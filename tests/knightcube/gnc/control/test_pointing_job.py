@@ -1,4 +1,4 @@
-"""A slew flown by the pointing law ends in its target and stays there, under torques known ahead."""
+"""Tests that a slew under known torques ends at its target and stays there."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def table() -> PointingTable:
 
 
 def flown(table: PointingTable, sizes: Callable[[float], FloatArray]) -> list[float]:
-    """Return how far off the law, deg, a body under `SIZE` and `RESIDUAL` is after each step.
+    """Return the error (deg) from the law after each step of a body under `SIZE` and `RESIDUAL`.
 
-    `sizes` gives what is estimated of the torques at a time, s.
+    `sizes` returns the estimated torque sizes at a time, s.
     """
     law, step = PointingLaw(table, LIMIT), STEP / FINE
     q, w = BEGIN.quaternion, BEGIN.rate
@@ -136,7 +136,7 @@ def test_a_slew_with_an_isolated_coil_is_made_by_the_other_two_within_their_limi
     assert np.abs(currents).max() < LIMIT
     missed = np.linalg.norm(torques - [found.torque for found in made], axis=1)
     assert missed.sum() < 0.05 * np.linalg.norm(torques, axis=1).sum()
-    # The planner knows at least what the other coils heat.
+    # The planner knows the heat of the remaining coils.
     heat = 5.0 * float((currents**2).sum(axis=1).mean()) * path.horizon
     assert heat < 1.2 * path.heat(left.heat)
 
@@ -211,7 +211,7 @@ def test_on_a_known_body_the_rest_is_the_rest_of_the_running_plan(table: Pointin
 
 
 def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> None:
-    """Near the end, 3 deg would be led back at a multiple of the heat that the running path takes."""
+    """Near the end, correcting 3 deg would need several times the heat of the running path."""
     assert table.slew is not None
     since = 0.8 * table.slew.horizon
     there = table.slew.references(np.array([since]))

@@ -1,4 +1,4 @@
-"""Pointing with coils alone: it stays pointed, knows torques ahead, and never exceeds the coils.
+"""Tests that a body far off its path is damped in any attitude until it is slow.
 
 A body that is astray is held still: damping takes energy in any attitude, until the body is slow.
 """
@@ -43,7 +43,7 @@ from tests.knightcube.gnc.control.pointing_cases import (
 
 
 def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_000.0) -> PointingTable:
-    """Plan from a turn (3,) rad and a rate (3,) rad/s off the law."""
+    """Plan from a rotation error (3,), rad, and a rate error (3,), rad/s."""
     times = np.arange(STEP, until, STEP)
     wanted = references(LAW, ORBIT, times)
     begin = multiply(from_rotation_vector(start), wanted.quaternion[0])
@@ -63,7 +63,7 @@ def law() -> PointingLaw:
 def fly(
     law: PointingLaw, start: FloatArray, sizes: FloatArray, residual: FloatArray, seconds: float
 ) -> FloatArray:
-    """Return the turns (n, 3), rad, against the reference, under `SIZE` and `RESIDUAL`; a step of 10 s."""
+    """Return the rotation errors (n, 3), rad, from the reference under `SIZE` and `RESIDUAL`, every 10 s."""
     now = law.wanted(STEP)
     q, w = multiply(from_rotation_vector(start), now.quaternion), now.rate
     turns = []
@@ -121,7 +121,7 @@ def test_the_shapes_are_constant_with_the_flight_and_with_the_sun() -> None:
 
 
 def test_a_path_from_upside_down_is_one_that_the_coils_manage_and_ends_in_the_law() -> None:
-    """The dipoles of the path, flown alone over ten minutes, lead along it; then the law is near."""
+    """Without feedback, the path's dipoles keep the body on the path for ten minutes, near the law."""
     table = table_from(np.array([0.0, 2.8, 0.6]), np.radians([0.2, -0.1, 0.1]), 200, until=4_000.0)
     off = np.degrees(angle_between(table.path.quaternion, table.wanted.quaternion))
     assert off[0] == pytest.approx(np.degrees(np.linalg.norm([0.0, 2.8, 0.6])), abs=0.1)
@@ -202,7 +202,7 @@ def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
     astray = PathRecovery()
     assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
     assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
-    # Nearer again it is held still all the same.
+    # The body is still damped when it is nearer again.
     assert seen(astray, 0.0, 2.0 * SLOW, 20.0) == (10.0, False)
     assert seen(astray, 3.0 * FAR, 0.9 * SLOW, 30.0) == (10.0, True)
     astray.planned()

@@ -1,4 +1,4 @@
-"""Planned motions as references."""
+"""Tests of planned motions as references."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from knightcube.gnc.control.pointing_path import PlannedMotion
 
 
 def test_references_have_the_accelerations_that_lead_from_rate_to_rate() -> None:
-    """Four rates half a second apart; the last acceleration holds on."""
+    """The motion has four rates at intervals of 0.5 s; the last acceleration continues."""
     rate = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 3.0, 0.0], [1.0, 3.0, -2.0]])
     quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     times = np.array([10.0, 10.5, 11.0, 11.5])

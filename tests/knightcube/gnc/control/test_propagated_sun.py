@@ -1,4 +1,4 @@
-"""The Sun propagated on by a gyro: its drift shows the gyro's bias, and it is kept through an eclipse."""
+"""Tests that a gyro propagates the Sun direction through an eclipse and that its drift shows the bias."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from knightcube.gnc.control.sun_acquisition import LARGEST_BIAS, MEMORY, Propaga
 
 SUN = np.array([0.36, 0.48, 0.8])
 BIAS = np.array([8e-4, -6e-4, 0.0])
-"""rad/s, normal to the Sun; what lies along it shows nothing."""
+"""Gyro bias (rad/s) normal to the Sun direction; the component along it is not observable."""
 SECOND_NS = 1_000_000_000
 NOISE = 0.02
 
@@ -19,7 +19,7 @@ NOISE = 0.02
 def follow(
     propagated: PropagatedSun, begin: int, end: int, seen: bool, bias: FloatArray = BIAS
 ) -> FloatArray:
-    """Let seconds pass in a body that rolls about the Sun; return the true direction in body axes."""
+    """Simulate some seconds of a body that rolls about the Sun direction, and return the true direction."""
     rng = np.random.default_rng(3)
     for second in range(begin, end):
         # The body turns about the Sun alone, so that its direction stays.
@@ -62,7 +62,7 @@ def test_a_sun_is_forgotten_after_the_longest_eclipse() -> None:
 
 
 def test_while_nobody_carries_it_no_bias_is_learned_and_an_old_direction_is_not_taken_up() -> None:
-    """In other modes than SAFE the strings are read, too, but the body turns unheard."""
+    """In modes other than SAFE, the strings are read but the rotation is not passed on."""
     propagated = PropagatedSun()
     for second in range(100):
         propagated.measure(second * SECOND_NS, attitude_matrix(from_rotation_vector(second * BIAS)) @ SUN)

@@ -1,4 +1,4 @@
-"""A residual dipole is learned from the rate under it, whatever the coils do, and never beyond its bound."""
+"""Tests that the residual dipole is learned from the rate within its bound, for any coil currents."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STEP = 0.1
 
 
 def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
-    """Return what is learned in 1,500 s of a field that turns as along an orbit's half."""
+    """Return the dipole learned in 1,500 s in a field that rotates as along half an orbit."""
     observer, rng = ResidualDipole(np.diag(INERTIA), bound), np.random.default_rng(5)
     rate = np.array([1e-3, -2e-3, 5e-4])
     for k in range(round(1500.0 / STEP)):

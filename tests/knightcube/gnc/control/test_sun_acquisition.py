@@ -1,4 +1,4 @@
-"""A body turns its axis to the Sun by gyro, strings and measured field, and is held still without a Sun."""
+"""Tests that a body points to the Sun by gyro, strings and field, and is damped without a Sun."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 INERTIA, LIMIT = np.array([1.10e-3, 1.05e-3, 0.99e-3]), 0.0959
 Z = np.array([0.0, 0.0, 1.0])
 TURN = np.array([0.0, 2.2e-3, 0.0])
-"""rad/s: the field's, two turns in an orbit."""
+"""Rate (rad/s) of the field, two rotations per orbit."""
 OWN_FIELD = 4e-4
-"""T by A m^2: the coils at the magnetometer."""
+"""Field of the coils at the magnetometer (T per A m^2)."""
 BIAS = np.array([4e-4, -3e-4, 5e-4])
 STEP_NS = 100_000_000
 
@@ -27,7 +27,7 @@ def seeker() -> SunAcquisition:
 
 
 def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
-    """Return the axis's angle from the Sun, deg, and the speed, deg/s, each ten seconds."""
+    """Return the angle of the axis from the Sun, deg, and the speed, deg/s, every ten seconds."""
     law, rng, step = seeker(), np.random.default_rng(2), 1e-9 * STEP_NS
     attitude, dipole, notes = IDENTITY, np.zeros(3), []
     for k in range(round(seconds / step)):
@@ -85,7 +85,7 @@ def test_a_single_field_or_one_that_jumps_starts_no_coil() -> None:
         law.sample(now_ns, field, np.zeros(3))
         if law.dipole(now_ns).any():
             acted.append(int(window))
-    # The first pause is one field alone; the third and the fourth contradict the one before.
+    # The first pause gives a single field; the third and the fourth contradict the previous pause.
     assert set(acted) == {1, 4}
 
 

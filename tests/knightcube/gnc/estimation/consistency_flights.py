@@ -69,9 +69,9 @@ TRACKER_SIGMAS: FloatArray = np.array([5e-5, 5e-5, 5e-4])
 
 
 class Unit:
-    """The emulated VN-100's sensors, aligned with the body, in the testbed's place.
+    """The emulated VN-100's sensors, aligned with the body, at the position of the testbed.
 
-    `claimed` is what its variances are said to be over what they are.
+    `claimed` is the ratio of claimed to true variances.
     """
 
     def __init__(self, rng: np.random.Generator, bias: FloatArray, claimed: float = 1.0) -> None:
@@ -82,7 +82,7 @@ class Unit:
         self._rate_covariance = np.eye(3) * claimed * RATE_BOUND**2 / 3.0
 
     def sample(self, now_ns: int, world: World) -> tuple[AttitudeMeasurement, RateMeasurement]:
-        """Return what the unit says of now."""
+        """Return the present reading of the IMU."""
         motion = BodyMotion(now_ns, world.attitude, world.rate, np.zeros(3), np.zeros(3))
         said = self._sensors.measure(motion, (1, 1, 1))
         return (
@@ -92,7 +92,7 @@ class Unit:
 
 
 class Camera:
-    """A star camera mounted anyhow, whose results come late."""
+    """A star camera with a random mounting and delayed results."""
 
     def __init__(self, rng: np.random.Generator, tracks: bool) -> None:
         self._rng = rng
@@ -102,7 +102,7 @@ class Camera:
         self._late: list[tuple[int, str, Measurement]] = []
 
     def due(self, cycle: int, world: World) -> list[tuple[str, Measurement]]:
-        """Expose, and return the results that have come by `cycle`."""
+        """Expose a frame, and return the results that have arrived by `cycle`."""
         phase = cycle % CAMERA_PERIOD
         if phase == 1:
             self._started = world.attitude
@@ -127,7 +127,7 @@ class Camera:
 
 
 class Pilot:
-    """Steers by the estimate: steps of q2 on the thread; free, currents that excite all axes."""
+    """Steers by the estimate: steps of q2 on the thread, or currents that excite all axes of a free body."""
 
     def __init__(self, rng: np.random.Generator, suspended: bool) -> None:
         self._suspended = suspended
@@ -146,7 +146,7 @@ class Pilot:
 
 
 def mean_rate(start: FloatArray, end: FloatArray, span: float) -> FloatArray:
-    """Return the constant rate (3,) that turns attitude `start` into `end` within `span` s, by Rodrigues."""
+    """Return the constant rate (3,) that rotates the attitude `start` to `end` in `span` s (Rodrigues)."""
     vector = np.array(
         [
             start[3] * end[0] - end[3] * start[0] - (end[2] * start[1] - end[1] * start[2]),
@@ -168,7 +168,7 @@ def seen_from(
 
 
 def random_axes(rng: np.random.Generator) -> FloatArray:
-    """Return three orthogonal directions (3, 3): a camera mounted anyhow."""
+    """Return three orthogonal directions (3, 3): a random camera mounting."""
     return np.asarray(np.linalg.qr(rng.standard_normal((3, 3)))[0])
 
 
@@ -188,7 +188,7 @@ class Tally:
     refused: dict[str, int] = field(default_factory=dict)
 
     def measured(self, filter_: AttitudeFilter, kind: str, measurement: Measurement) -> None:
-        """Give the filter a measurement and note what it made of it."""
+        """Pass a measurement to the filter, and record its result."""
         used = filter_.measure(measurement)
         if np.isfinite(filter_.nis):
             self.nis.setdefault(kind, []).append(filter_.nis)
@@ -196,7 +196,7 @@ class Tally:
 
 
 def filter_of(world: World) -> AttitudeFilter:
-    """Return the filter that is to follow a world: its noise, none of its surprises."""
+    """Return the filter for a world, with its noise settings but without its unknown errors."""
     push = DRAUGHT if world.suspended else DRAG
     settings = replace(
         KNOWN_PLANT,
@@ -212,7 +212,7 @@ def filter_of(world: World) -> AttitudeFilter:
 
 
 def run(scene: str, seed: tuple[int, ...], seconds: int = SECONDS, claimed: float = 1.0) -> Result:
-    """Fly `testbed` or `free`; `claimed` multiplies the variances that the unit states."""
+    """Fly `testbed` or `free`; `claimed` multiplies the claimed variances of the IMU."""
     rng = np.random.default_rng(seed)
     world: World = SuspendedWorld(rng) if scene == "testbed" else FreeWorld(rng)
     bias = rng.normal(0.0, BIAS_SIGMA, 3)
@@ -232,7 +232,7 @@ def run(scene: str, seed: tuple[int, ...], seconds: int = SECONDS, claimed: floa
             tally.measured(filter_, "gyro", rate)
         for kind, measurement in camera.due(cycle, world):
             tally.measured(filter_, kind, measurement)
-        if not filter_.started:  # it gave up: counted as a restart
+        if not filter_.started:  # the filter restarted
             filter_.start(attitude, rate)
         estimate = filter_.at(now_ns)
         if cycle and cycle % 40 == 0:
@@ -279,12 +279,12 @@ def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
 
 
 def _free_errors(suspended: bool) -> IntArray:
-    """Return which errors of the filter's 15 there are."""
+    """Return the indices of the existing errors among the filter's 15."""
     return np.array([1, 4, 7, 10, 12, 13, 14]) if suspended else np.array([*range(12), 14])
 
 
 def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
-    """Return for each cycle whether the unit is silent: one stretch in each half."""
+    """Return for each cycle whether the IMU is silent: one interval in each half."""
     silent = [False] * (seconds * 40 + 1)
     for half in range(2):
         begin = int(40 * seconds * (0.5 * half + rng.uniform(0.05, 0.4)))
@@ -294,7 +294,7 @@ def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
 
 
 def scene_facts(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the figures of one scene's runs."""
+    """Return the figures of all runs of one scene."""
     degrees = results[0]["degrees"]
     nees = np.array([result["nees"] for result in results]) / degrees
     means = nees.mean(axis=0)

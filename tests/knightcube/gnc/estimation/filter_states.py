@@ -1,4 +1,4 @@
-"""Filter states that several tests of the estimation share."""
+"""Filter states for several tests of the estimation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulated flights for the filter's tests: a body on its thread or free, its unit's samples, commands."""
+"""Simulated runs for filter tests: a suspended or free body, IMU samples, and commands."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def fly(
 ) -> Flight:
     """Return a flight with noise of the unit and of the coils, a gyro bias and a thread or a drag.
 
-    `amplitude` A is that of the currents; `driven` gives the coils' currents by cycle and command.
+    `amplitude` (A) is the amplitude of the currents; `driven` gives the coils' currents by cycle and command.
     """
     rng = np.random.default_rng(seed)
     world = SuspendedWorld(rng) if suspended else FreeWorld(rng)
@@ -96,7 +96,7 @@ def begin(flight: Flight, suspended: bool, settings: FilterSettings = SETTINGS) 
 
 
 def follow(filter_: AttitudeFilter, flight: Flight, first: int = 1, last: int | None = None) -> None:
-    """Give a filter the cycles `first` to `last` (not included) of a flight."""
+    """Run a filter on the cycles `first` to `last` (exclusive) of a simulated run."""
     for cycle in range(first, len(flight.samples) if last is None else last):
         for sample in flight.samples[cycle]:
             filter_.measure(sample)

@@ -1,13 +1,13 @@
-"""A linear Kalman filter of the turn about the thread, the oracle of the three-axis one.
+"""A linear Kalman filter of the rotation about the thread, as reference for the three-axis filter.
 
 Its states are angle, rate and disturbance.
 The angle theta = 2 asin q2 is used rather than q2 because its kinematics are linear (Sease 5.9 is not):
 theta' = omega, omega' = u + d, with u the acceleration that the plant model gives for the known current and d
 what the model does not know (the thread's torque), a random walk. Each measurement is applied at its own
-time: a late measurement is put where it belongs and those after it are applied again. A rate from a
-streaked image is the mean rate over its exposure. Until the exposure ends, the angle at its start is
-kept as one more state (stochastic cloning, Roumeliotis and Burdick 2002), so that an acceleration within the
-exposure does not contradict the mean.
+time. After a late measurement, the later measurements are applied again. A rate from a streaked image is the
+mean rate over its exposure. Until the exposure ends, the angle at its start is kept as one more state
+(stochastic cloning, Roumeliotis and Burdick 2002), so that an acceleration within the exposure does not
+contradict the mean.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Measurement:
 
     @property
     def begin_ns(self) -> int:
-        """The first time it says something about."""
+        """Start time of the measured interval."""
         return self.time_ns if self.since_ns is None else self.since_ns
 
 
@@ -53,8 +53,8 @@ class FilterSettings:
         control_period: s.
         disturbance_walk: rad/s^2 per sqrt(s), the random walk of the unmodelled acceleration.
         disturbance_start: rad/s^2, standard deviation of that acceleration at the start.
-        gate_sigma: a measurement further than this from its prediction is refused.
-        history_ns: how late a measurement may come and still be used.
+        gate_sigma: largest normalised innovation of an accepted measurement.
+        history_ns: largest delay of a measurement that is used, ns.
     """
 
     current_noise: float
@@ -79,7 +79,7 @@ class SingleAxisFilter:
     """Holds the estimate, its recent measurements and the recent commands."""
 
     REJECTIONS_TO_RESTART = 40
-    """After this number of refused measurements in a row the filter is wrong, and restarts."""
+    """Number of refused measurements in a row after which the filter restarts."""
 
     def __init__(self, plant: SingleAxisPlant, settings: FilterSettings) -> None:
         self._plant = plant
@@ -94,17 +94,17 @@ class SingleAxisFilter:
         self.restarts = 0
 
     def command(self, time_ns: int, current: float) -> None:
-        """Note the coil current in force from `time_ns` on, in A."""
+        """Record the coil current, A, from `time_ns` on."""
         if self._commands and self._commands[-1] == current:
             return
         self._command_times.append(time_ns)
         self._commands.append(current)
         oldest = bisect.bisect_right(self._command_times, time_ns - self._settings.history_ns) - 1
-        if oldest > 64:  # now and then, not each cycle
+        if oldest > 64:  # removed occasionally, not in each cycle
             del self._command_times[:oldest], self._commands[:oldest]
 
     def start(self, angle: Measurement, rate: Measurement) -> None:
-        """Begin from one angle and one rate."""
+        """Start the filter from an angle and a rate."""
         state = np.array([angle.value, rate.value, 0.0])
         covariance = np.diag([angle.variance, rate.variance, self._settings.disturbance_start**2])
         newest = max(angle, rate, key=lambda m: m.time_ns)
@@ -113,7 +113,7 @@ class SingleAxisFilter:
 
     @property
     def started(self) -> bool:
-        """Whether there is an estimate at all."""
+        """Whether the filter has an estimate."""
         return bool(self._history)
 
     def measure(self, measurement: Measurement) -> bool:
@@ -135,7 +135,7 @@ class SingleAxisFilter:
         return Estimate(time_ns, angle, rate, disturbance, covariance, newest.measurement.time_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate as it stood at a past time, None when that is before all it remembers."""
+        """Return the estimate at a past time, or None if the time is before the stored history."""
         index = bisect.bisect_right(self._history, time_ns, key=lambda c: c.measurement.time_ns)
         if index == 0:
             return None
@@ -145,7 +145,7 @@ class SingleAxisFilter:
         return Estimate(time_ns, angle, rate, disturbance, covariance, then.measurement.time_ns)
 
     def _insert(self, measurement: Measurement) -> bool:
-        """Go back to where the measurement begins and apply what came after it once more."""
+        """Return to the start of the measurement, and apply the later measurements again."""
         index = self._index_before(measurement.begin_ns)
         if index == 0:
             return False
@@ -156,7 +156,7 @@ class SingleAxisFilter:
         return self._apply(later, measurement)
 
     def _index_before(self, begin_ns: int) -> int:
-        """Return how many checkpoints stand up to `begin_ns`, or up to the begin of a mean that spans it."""
+        """Return the number of checkpoints up to `begin_ns`, or up to the start of a mean that spans it."""
         while True:
             index = bisect.bisect_right(self._history, begin_ns, key=lambda c: c.measurement.time_ns)
             spanning = [c.measurement.begin_ns for c in self._history[index:]]
@@ -189,7 +189,7 @@ class SingleAxisFilter:
     def _propagate(
         self, state: FloatArray, covariance: FloatArray, from_ns: int, to_ns: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Carry state and covariance over the commands in force between two times, forward only."""
+        """Propagate state and covariance with the commands between two times, forward only."""
         time_ns = from_ns
         index = max(bisect.bisect_right(self._command_times, from_ns) - 1, 0)
         while time_ns < to_ns:
@@ -204,7 +204,7 @@ class SingleAxisFilter:
     def _step(
         self, state: FloatArray, covariance: FloatArray, current: float, dt: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Carry the first three states over `dt` s; angles kept from the past stay what they were."""
+        """Propagate the first three states by `dt` s; stored angles of the past are constant."""
         angle, rate, disturbance = state[:3].tolist()
         acceleration = self._plant.acceleration(angle + 0.5 * dt * rate, rate, current) + disturbance
         state = state.copy()
@@ -247,7 +247,7 @@ class SingleAxisFilter:
             self.restarts += 1
 
     def _forget(self, now_ns: int) -> None:
-        """Drop checkpoints and commands that are too old, now and then."""
+        """Delete checkpoints and commands that are too old, not in each cycle."""
         horizon_ns = now_ns - self._settings.history_ns
         if len(self._history) > 2 and self._history[0].measurement.time_ns < horizon_ns - 1_000_000_000:
             keep = bisect.bisect_left(self._history, horizon_ns, key=lambda c: c.measurement.time_ns)
@@ -255,13 +255,13 @@ class SingleAxisFilter:
 
 
 def _clone_angle(state: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return state (n + 1,) and covariance (n + 1, n + 1) with the angle of now kept as the last state."""
+    """Return state (n + 1,) and covariance (n + 1, n + 1) with the present angle as additional last state."""
     pick = np.append(np.arange(len(state)), ANGLE)
     return state[pick], covariance[np.ix_(pick, pick)]
 
 
 def _row(measurement: Measurement, size: int, columns: dict[int, int]) -> FloatArray:
-    """Return the measurement's row (size,): what it says of the states."""
+    """Return the Jacobian row (size,) of the measurement."""
     row = np.zeros(size)
     if measurement.since_ns is None:
         row[measurement.component] = 1.0

@@ -1,4 +1,4 @@
-"""Simulated flights about one axis that several tests of the estimation share."""
+"""Simulated runs about one axis for several tests of the estimation."""
 
 from __future__ import annotations
 

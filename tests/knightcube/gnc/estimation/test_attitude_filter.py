@@ -1,4 +1,4 @@
-"""The filter puts late measurements where they belong, refuses outliers, and finds biases and threads."""
+"""Tests that the filter applies late measurements at their time, rejects outliers and learns biases."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_exposures_may_overlap(suspended: bool) -> None:
 
 @BOTH
 def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
-    """A bias of a milliradian a second, to 2 % of that in 20 s of attitudes and rates alone."""
+    """A bias of 1 mrad/s is found to 2 % in 20 s of attitudes and rates."""
     flight = fly(3, 800, suspended)
     filter_ = begin(flight, suspended)
     follow(filter_, flight)
@@ -113,7 +113,7 @@ def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> N
 
 
 def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
-    """The current by which each belief would hold the body is the true one."""
+    """The holding current is correct for each assumed plant."""
     flight = fly(5, 400, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -147,7 +147,10 @@ def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
 
 @BOTH
 def test_a_drop_out_widens_the_covariance_and_is_recovered_from(suspended: bool) -> None:
-    """Three seconds of silence: sigma grows on and on, the error stays within four, then all is as before."""
+    """In three seconds without samples, sigma grows and the error stays within four sigma.
+
+    Then both recover.
+    """
     flight = fly(7, 500, suspended)
     filter_ = begin(flight, suspended)
     follow(filter_, flight, 1, 200)
@@ -185,17 +188,17 @@ def test_an_outlier_is_refused_and_the_next_good_one_is_not(suspended: bool) -> 
 
 
 def test_the_gate_knows_its_degrees_of_freedom() -> None:
-    """Of honest Gaussian measurements a gate of 2 sigma refuses 4.55 % suspended and free (99.9 % band)."""
+    """A gate of 2 sigma refuses 4.55 % of Gaussian measurements, suspended and free (99.9 % band)."""
     for suspended in (True, False):
         flight = fly(9, 1000, suspended)
         filter_ = begin(flight, suspended, replace(SETTINGS, gate_sigma=2.0))
         follow(filter_, flight)
-        assert 60 < filter_.refused < 125  # 2000 measurements, those refused narrow the rest a little
+        assert 60 < filter_.refused < 125  # 2000 measurements; the refused ones reduce the spread of the rest
         assert filter_.restarts == 0
 
 
 def test_when_attitudes_disagree_for_a_second_the_filter_restarts() -> None:
-    """Even while the gyro agrees: attitudes and rates are counted apart."""
+    """Attitudes and rates are counted separately, so an agreeing gyro does not matter."""
     flight = fly(10, 100, False)
     filter_ = begin(flight, False)
     follow(filter_, flight, 1, 50)
@@ -232,7 +235,7 @@ def test_as_many_rejections_as_earlier_attitudes_restart_the_filter_but_3_to_40(
 
 
 def test_a_start_on_a_sample_from_before_the_release_is_given_up_at_once() -> None:
-    """A late line sends samples of the held body first; three rates that all disagree outweigh the first."""
+    """A delayed line first sends samples of the held body; three contradicting rates restart the filter."""
     flight = fly(16, 40, True)
     thrown = RateMeasurement(0, np.array([0.0, 0.3, 0.0]), RATE_COVARIANCE)
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
@@ -318,7 +321,10 @@ def test_an_attitude_that_wraps_round_is_a_small_innovation() -> None:
 
 @BOTH
 def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
-    """Mean of a cycle under 0.5 ms, a replay of 1.6 s under 20 ms of CPU; asserted at twice that."""
+    """A cycle takes under 0.5 ms on average and a replay of 1.6 s under 20 ms of CPU.
+
+    The bounds are twice that.
+    """
     flight = fly(14, 400, suspended)
     filter_ = begin(flight, suspended)
 

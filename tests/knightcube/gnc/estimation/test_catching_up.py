@@ -1,4 +1,4 @@
-"""Measurements that come late may be put in their places a few at a time, while the estimate goes on."""
+"""Tests that late measurements can be applied in several steps while the estimate is propagated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors and innovations of short flights against the covariance that the filter states."""
+"""Tests of errors and innovations of short runs against the covariance of the filter."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says(
 
 
 def test_variances_that_are_claimed_too_small_are_found_out() -> None:
-    """The unit's noise said to be half of what it is."""
+    """The claimed noise of the IMU is half of its true noise."""
     facts = consistency.scene_facts(fly("testbed", 8, claimed=0.25))
     assert facts["nees_final"] > band(8 * facts["degrees"], 0.999)[1]
     assert facts["nis"]["gyro"]["mean"] > 2.0
 
 
 def test_variances_that_are_claimed_too_large_are_found_out() -> None:
-    """The unit's noise said to be twice what it is: by the innovations, before the errors show it."""
+    """The claimed noise of the IMU is twice its true noise, which the innovations show before the errors."""
     facts = consistency.scene_facts(fly("testbed", 4, claimed=4.0))
     assert facts["nees_mean"] < 0.9
     assert facts["nis"]["gyro"]["mean"] < 0.5

@@ -1,4 +1,4 @@
-"""Directions and fields in the filter: each gives its own information only, late or in time."""
+"""Tests that directions and fields, late or in time, add only their own information to the filter."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FIELD: FloatArray = np.array([2e-5, -1e-5, 3e-5])
 def direction(
     quaternion: FloatArray, reference: FloatArray = REFERENCE, time_ns: int = 0, off: float = 0.0
 ) -> DirectionMeasurement:
-    """Return what a body at `quaternion` sees, turned by `off` rad about its axis x."""
+    """Return the direction measured at `quaternion`, rotated by `off` rad about body x."""
     turned = multiply(from_rotation_vector(np.array([off, 0.0, 0.0])), quaternion)
     return DirectionMeasurement(time_ns, attitude_matrix(turned) @ reference, reference, SIGMA**2 * np.eye(3))
 
@@ -38,7 +38,7 @@ def as_array(state: FilterState) -> FloatArray:
 
 
 def field(quaternion: FloatArray) -> FieldMeasurement:
-    """Return what a magnetometer without a bias reads."""
+    """Return the reading of a magnetometer without a bias."""
     return FieldMeasurement(0, attitude_matrix(quaternion) @ FIELD, FIELD, 1e-16 * np.eye(3))
 
 
@@ -55,7 +55,7 @@ MEASUREMENTS: list[tuple[str, Callable[[], Measurement]]] = [
 def test_rows_are_how_the_innovation_answers_to_each_error(
     name: str, make: Callable[[], Measurement]
 ) -> None:
-    """Central differences of the innovation of a state that is off: minus the rows."""
+    """The Jacobian rows equal minus the central differences of the innovation."""
     seen = make()
     rows = innovation(STATE, seen, False).rows
     assert np.abs(rows).max() > (0.5 if name == "direction" else 1e-5)
@@ -64,7 +64,7 @@ def test_rows_are_how_the_innovation_answers_to_each_error(
         bump = step * np.eye(SIZE)[column]
         up, down = (np.array(innovation(moved(STATE, sign * bump), seen, False).value) for sign in (1, -1))
         scale = 1.0 if name == "direction" else 4e-5
-        # Across the direction expected: the plane moves with it, in the second order.
+        # The plane is normal to the expected direction and moves with it in second order.
         np.testing.assert_allclose((down - up) / (2.0 * step), rows[:, column], atol=2e-6 * scale)
 
 
@@ -94,7 +94,7 @@ def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
 
 
 def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
-    """From a prior that knows next to nothing, against least squares on the two directions."""
+    """With a very weak prior, the result equals a least-squares fit of the two directions."""
     rng = np.random.default_rng(4)
     truth = multiply(from_rotation_vector(np.array([0.01, -0.02, 0.015])), as_array(STATE))
     state, covariance = STATE, np.eye(SIZE)
@@ -103,7 +103,7 @@ def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
         exact = direction(truth, reference)
         noisy = exact.observed + SIGMA * rng.standard_normal(3)
         seen.append(replace(exact, observed=noisy / np.linalg.norm(noisy)))
-    for _ in range(2):  # the second time from where the first has led: least squares is iterated too
+    for _ in range(2):  # the second update starts from the first result, as in an iterated least-squares fit
         covariance = np.eye(SIZE)
         for measurement in seen:
             found = innovation(state, measurement, False)

@@ -1,4 +1,4 @@
-"""The field is off its model: the filter learns by how much, with stars, and claims its attitude by it."""
+"""Tests that the filter learns the error of the field model with stars and includes it in its covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rate from the magnetometer alone: right for a body that tumbles, honest, and able to begin again."""
+"""Tests of the rate by magnetometer alone: accuracy and covariance when tumbling, and restarts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter of a free satellite: honest, learns the dipole, takes late attitudes at their own time."""
+"""Tests that a free satellite's filter is consistent, learns the dipole and uses late attitudes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter of a free satellite among torques that it does not know: of its axes, of its coils' currents."""
+"""Tests of a free satellite's filter with unknown inertia axes and unknown coil currents."""
 
 from __future__ import annotations
 

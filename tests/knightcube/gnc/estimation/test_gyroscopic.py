@@ -1,4 +1,4 @@
-"""The quadratic form of Euler's equations, and the span of its changes with inertia and gyro."""
+"""Tests of the quadratic form of Euler's equations, and of its dependence on inertia and gyro errors."""
 
 from __future__ import annotations
 

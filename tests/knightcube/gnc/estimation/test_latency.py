@@ -1,4 +1,4 @@
-"""Samples that are older than they say: their age is found, and the estimate does not lag behind the body."""
+"""Tests that the age of delayed samples is estimated, so that the estimate does not lag the body."""
 
 from __future__ import annotations
 

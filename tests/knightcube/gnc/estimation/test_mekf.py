@@ -1,4 +1,4 @@
-"""The filter's steps: transition and rows are derivatives, noise is what a Monte Carlo of it gives."""
+"""Tests of the filter's derivatives against differences, and of its noise against Monte Carlo."""
 
 from __future__ import annotations
 

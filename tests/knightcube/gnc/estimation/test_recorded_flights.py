@@ -1,4 +1,4 @@
-"""The estimates of short flights are those of the record."""
+"""Tests that the estimates of short runs equal the record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States of the filters after short made-up flights are those of the record, to five digits."""
+"""Tests that filter states after short artificial runs equal the record to five digits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter's body obeys Euler and the single-axis plant; its derivatives are those of its acceleration."""
+"""Tests that the filter's body obeys Euler's equations and has correct derivatives."""
 
 from __future__ import annotations
 

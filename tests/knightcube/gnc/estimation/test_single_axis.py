@@ -1,4 +1,4 @@
-"""The filter is consistent, puts late measurements where they belong, and refuses outliers."""
+"""Tests that the single-axis filter is consistent, uses late measurements, and rejects outliers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""On the thread the three-axis filter is the single-axis filter: same data through both, same estimates."""
+"""Tests that the three-axis filter on a thread gives the estimates of the single-axis filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""While the coil currents are unknown the filter follows its measurements, and learns nothing false."""
+"""Tests that the filter follows its measurements while coil currents are unknown, and learns nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The oracle itself, against optima computed elsewhere and a closed form."""
+"""Tests of the reference optimiser against published optima and a closed form."""
 
 from __future__ import annotations
 

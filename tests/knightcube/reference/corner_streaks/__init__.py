@@ -1,1 +1,1 @@
-"""Mirrors `knightcube.reference.corner_streaks`."""
+"""Tests of `knightcube.reference.corner_streaks`."""

@@ -1,4 +1,4 @@
-"""Fragments of long streaks that agree by chance are refused: frames on which they once passed for a rate."""
+"""Tests that fragments of long streaks that agree by chance give no rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajkovic and Hedley's cornerness: patches by hand, and the least over all directions by brute force."""
+"""Tests of Trajkovic and Hedley's cornerness against manual patches and an exhaustive search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame to a rate: accuracy, sign, refusal, outliers, covariance."""
+"""Tests of the rate from a frame: accuracy, sign, refusal, outliers and covariance."""
 
 from __future__ import annotations
 

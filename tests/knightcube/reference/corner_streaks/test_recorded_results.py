@@ -1,4 +1,4 @@
-"""Rates from the corners of streaks are those of the record, for each detector."""
+"""Tests that rates from streak corners equal the record for each detector."""
 
 from __future__ import annotations
 

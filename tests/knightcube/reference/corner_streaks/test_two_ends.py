@@ -1,4 +1,4 @@
-"""The thesis's own way: corner detectors' ends, identified, give two attitudes and the rate between them.
+"""Tests of the attitudes at both ends of an exposure and the rate between them (Sease 3.22-3.29).
 
 Attitude at both ends of an exposure, and the rate between them (Sease 3.22-3.29).
 """

@@ -1,4 +1,4 @@
-"""FITS files written by astropy, and mutations of their headers."""
+"""Tests with FITS files written by astropy, and with mutated headers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nadirs from small rendered frames are those of the record, to five digits."""
+"""Tests that nadirs from small rendered frames equal the record to five digits."""
 
 from __future__ import annotations
 

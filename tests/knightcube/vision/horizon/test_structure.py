@@ -1,4 +1,4 @@
-"""Masks of the spacecraft's own structure, and limbs behind them."""
+"""Tests of masks of the spacecraft's own structure, and of limbs behind the structure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects in small simulated frames are those of the record, to five digits."""
+"""Tests that objects in small simulated frames equal the record to five digits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stars are recognised from frame to frame without a catalogue, and the moving objects remain."""
+"""Tests that stars are recognised between frames without a catalogue, and moving objects are detected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The attitudes and detections of small simulated frames are those of the record, to five digits."""
+"""Tests that attitudes and detections of small simulated frames equal the record to five digits."""
 
 from __future__ import annotations
 

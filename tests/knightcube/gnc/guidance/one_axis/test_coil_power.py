@@ -1,4 +1,4 @@
-"""The power of chopped torque coils, from hand-computed values and from the simulated supply."""
+"""Tests of the power of chopped coils against hand-computed values and the simulated supply."""
 
 from __future__ import annotations
 

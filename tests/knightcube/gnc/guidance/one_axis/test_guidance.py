@@ -1,4 +1,4 @@
-"""Which plans are flown and which are refused; each refusal beside the plan that is accepted."""
+"""Tests of accepted and refused plans, with an accepted plan for each refusal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Legendre-Gauss-Lobatto nodes against published values and their own exactness.
+"""Tests of Legendre-Gauss-Lobatto nodes against published values and their exactness.
 
 The cubic prey of 5.35-5.38.
 """

@@ -1,4 +1,4 @@
-"""The single-axis plant's relations against each other and against physics."""
+"""Tests of the relations of the single-axis plant against each other and physics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans about one axis are those of the record, to four digits; and short flights along them."""
+"""Tests that single-axis plans and short runs along them equal the record to four digits."""
 
 from __future__ import annotations
 

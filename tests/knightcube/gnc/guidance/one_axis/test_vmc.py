@@ -1,4 +1,4 @@
-"""The planner: optimal within its horizon, honest beyond it.
+"""Tests that paths are optimal within the planning horizon, and of their values beyond it.
 
 Which horizon a path gets, where it begins, and what it allows for.
 """

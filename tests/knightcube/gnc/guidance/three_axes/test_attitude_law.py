@@ -1,4 +1,4 @@
-"""Attitude laws: the axes point where they should, and rate and acceleration are those of the attitude."""
+"""Tests of attitude laws: pointing axes, and rates and accelerations against the attitude."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slews on few nodes, their first guesses and the attitude laws are those of the record, to five digits."""
+"""Tests that slews on few nodes, initial guesses and attitude laws equal the record to five digits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The derivatives of a satellite's motion.
+"""Tests of cubic Hermite interpolation against scipy and cubic functions.
 
 Cubic Hermite interpolation against scipy's, and exact on cubics.
 """

@@ -1,4 +1,4 @@
-"""Slews with coils alone, against optima of another method and an integrator of the test's own."""
+"""Tests of slews by coils alone against optima of another method and an independent integrator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""First guesses of slews: momenta across the field that end in the target, outside the cones."""
+"""Tests of initial guesses of slews: feasible momenta that end at the target outside the cones."""
 
 from __future__ import annotations
 
