@@ -1,4 +1,4 @@
-"""`fly`: a whole release flies whatever is wrong with releases.py, its record or the current release."""
+"""Tests that `fly` starts an intact release if releases.py, its record or the current release is damaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Releases side by side: built aside, switched by one rename, chosen at the start, taken back."""
+"""Tests of releases: built separately, switched by one rename, chosen at the start, and reverted."""
 
 from __future__ import annotations
 

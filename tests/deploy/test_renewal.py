@@ -1,4 +1,4 @@
-"""Renewal in orbit: what is tried and confirmed stays, everything else gives way to the version before."""
+"""Tests of renewal in orbit: a confirmed version stays, and all others revert to the former version."""
 
 from __future__ import annotations
 

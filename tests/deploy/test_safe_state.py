@@ -1,4 +1,4 @@
-"""The safe state zeroes the coils, answers commands with the standard library, and tries the flight again."""
+"""Tests that the safe state zeroes the coils, answers commands, and restarts the flight process."""
 
 from __future__ import annotations
 

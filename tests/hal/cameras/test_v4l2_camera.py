@@ -1,4 +1,4 @@
-"""The V4L2 driver: which frame it takes for the triggered one, what it drops, what it says when refused."""
+"""Tests of the V4L2 driver: the frame of a trigger, dropped frames, and messages after a refusal."""
 
 from __future__ import annotations
 

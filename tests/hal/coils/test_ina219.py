@@ -1,4 +1,4 @@
-"""The driver of the current monitor against the emulated part, on both buses."""
+"""Tests of the current monitor's driver with the emulated chip, on both buses."""
 
 from __future__ import annotations
 

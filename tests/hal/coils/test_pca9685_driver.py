@@ -1,4 +1,4 @@
-"""The PCA9685's driver: what it writes, what it refuses, what it notices."""
+"""Tests of the PCA9685 driver: its writes, its refusals, and the faults that it detects."""
 
 from __future__ import annotations
 

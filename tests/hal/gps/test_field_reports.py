@@ -1,4 +1,4 @@
-"""What receivers send in the field: unresolved time, rollover, refusals, foreign protocols."""
+"""Tests with the output of real receivers: unresolved time, rollover, refusals, other protocols."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""B-dot in windows takes the rate out of a body, whatever the field does, and never heeds its own coils."""
+"""Tests that windowed B-dot damps a body in a changing field and excludes the field of its own coils."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The declared error state, and the Kalman update that all filters share."""
+"""Tests of the declared error state, and of the Kalman update that all filters use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Targets that define an attitude are accepted, others refused, and each has a text for events."""
+"""Tests that targets which define an attitude are accepted, others refused, and each has a text."""
 
 from __future__ import annotations
 
