@@ -1,4 +1,4 @@
-"""Commands in flight: obeyed or refused with an event and an answer, whatever is sent."""
+"""Tests that every command in flight is executed or refused with an event and an answer."""
 
 from __future__ import annotations
 

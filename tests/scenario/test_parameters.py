@@ -1,4 +1,4 @@
-"""Parameters in flight: a table is flown as a whole, or refused as a whole."""
+"""Tests that a parameter table is used or refused as a whole in flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The coil driver with a faulty PWM chip: errors are read back, reported while they last, then corrected."""
+"""Tests of the coil driver with a faulty PWM chip: errors are detected, reported and corrected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Register upsets and a lagging monitor: their effects, and the repair by the drivers."""
+"""Tests of register upsets and a delayed current monitor: effects, and corrections by the drivers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The free body as a world: its true craft, its rotation, and its configuration."""
+"""Tests of the world `free_body`: true craft, rotation and configuration."""
 
 from __future__ import annotations
 
