@@ -50,7 +50,7 @@ def accepted(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def service(tmp_path: Path) -> dict[str, str]:
-    """Return the environment of a service that has flown the testbed's configuration before."""
+    """Return the environment of a service that has already accepted the testbed's configuration."""
     folder = tmp_path / "state"
     folder.mkdir()
     FlownConfig(TEXT, folder).keep()
@@ -72,7 +72,7 @@ def test_no_single_bit_that_flips_is_flown(accepted: Path, service: dict[str, st
 def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
     accepted: Path, service: dict[str, str]
 ) -> None:
-    """The characters 3 and 7 are one bit apart."""
+    """The characters 3 and 7 differ by one bit."""
     assert ord("3") ^ ord("7") == 4
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7", 1), encoding="utf-8")
     assert as_testbed(configuration.load(accepted)).plant.inertia == 1.05e-7

@@ -31,7 +31,10 @@ def test_it_waits_twice_as_long_each_time_up_to_half_a_minute() -> None:
 
 
 class Attempts:
-    """Attempts that fail in turn; what each opened is closed before the next."""
+    """Attempts that fail one after another.
+
+    The objects that an attempt opened are closed before the next one.
+    """
 
     def __init__(self, *failures: BaseException) -> None:
         self.failures = list(failures)
@@ -89,7 +92,7 @@ def test_a_signal_ends_the_wait() -> None:
 
 @pytest.fixture
 def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the words that fly a board; its pauses are short."""
+    """Return the command line of a run on a board with short pauses."""
     monkeypatch.setattr(patient_start, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(patient_start, "LONGEST_PAUSE_S", 0.05)
     config = write_config(tmp_path)
@@ -102,7 +105,7 @@ def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_the_wait(
     board: list[str], tmp_path: Path
 ) -> None:
-    """On a bench the same is an error at once."""
+    """Without an archive, the same fault is an error at once."""
     bench = [*board[:2], "--out", str(tmp_path / "bench"), "--duration", "1"]
     assert main(bench) == 2
     timer = threading.Timer(0.3, (tmp_path / "later").mkdir)

@@ -136,7 +136,7 @@ def test_an_answer_of_a_mode_that_there_is_not_is_none(
 
 
 BEGINS = IDENTIFIERS[0].to_bytes(2, "big")
-"""A datagram that begins as a command does: the kernel passes no other on."""
+"""Return a datagram with the header of a command, because the kernel drops all others."""
 
 
 def flood(to: Path, count: int, data: bytes) -> None:
@@ -174,7 +174,7 @@ def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_n
 
 
 def test_only_commands_of_a_peer_take_a_place_in_the_queue(place: Path) -> None:
-    """More datagrams than any queue holds, from a stranger's address and from a peer's."""
+    """More datagrams than a queue can hold are sent from an unknown address and from a peer's address."""
     ping = CommandPacker().pack(Ping(5), 1)
     channels = [open_udp("127.0.0.1:0", [IPv4Network("127.0.0.9"), IPv4Network("127.1.0.0/16")])]
     to = channels[0]._socket.getsockname()
@@ -225,7 +225,7 @@ def test_the_socket_is_for_owner_and_group_only(place: Path) -> None:
 
 @pytest.mark.skipif(not os.access("/run", os.W_OK), reason="/run may not be written to: be root")
 def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
-    """Its /tmp is its own: what stands in ours is not there for it."""
+    """The service has a private /tmp and does not see files in the /tmp of the test."""
     with tempfile.TemporaryDirectory(dir="/run", prefix="knightcube-test-") as folder:
         channel = open_unix(Path(folder) / "commands")
         senders: list[str] = []

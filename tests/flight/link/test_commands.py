@@ -111,7 +111,7 @@ def test_values_that_cannot_be_obeyed_are_refused_before_they_are_sent(
 
 
 def test_and_refused_again_where_they_arrive() -> None:
-    """A sender with another idea of the limits makes a packet that is whole all the same."""
+    """A sender with different limits makes a complete packet that is out of range."""
     for packet, fields in (("slew", {"q2": math.nan}), ("mode", {"mode": 99}), ("mode", {"mode": 0})):
         layout = LAYOUTS[packet]
         head = (layout.identifier, 0xC000, layout.length - 7, 1, 0)
@@ -129,7 +129,7 @@ def test_a_packet_cut_short_or_grown_is_refused(cut: int) -> None:
 
 
 def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
-    """A slice of 20,000, half of them behind a header that is right; seed 7."""
+    """A random sample of 20,000 packets (seed 7), half of them with a valid header."""
     generator = np.random.default_rng(7)
     heads = [layout.identifier.to_bytes(2, "big") for layout in LAYOUTS.values()]
     for k in range(20_000):
@@ -161,7 +161,7 @@ def test_a_target_that_nothing_can_point_to_is_refused(
 
 
 def test_each_command_is_printed_with_its_values() -> None:
-    """A ping has the number 0 unless it is given another one."""
+    """A ping has the number 0 by default."""
     table = LoadParameters(0x1234, tuple(float(k + 1) for k in range(len(PARAMETER_FIELDS))))
     assert [
         Ping().text,

@@ -112,7 +112,7 @@ def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vau
     assert cause(entrance, close_frame(third[:6] + b"\7" + third[7:-2])) is Refusal.SPI
     assert cause(entrance, close_frame(third[:2] + bytes([third[2] ^ 4]) + third[3:-2])) is Refusal.MAC
     assert cause(entrance, close_frame(b"\x25" + third[1:-2])) is Refusal.HEADER
-    assert entrance.admit(third).counter == 2  # none of these advanced anything
+    assert entrance.admit(third).counter == 2  # none of these frames advanced a counter
     assert sum(entrance.refused.values()) == 8
     assert entrance.admitted == 2
 
@@ -126,7 +126,7 @@ def test_the_window_reaches_65536_ahead(sky: Vault, ground: Vault) -> None:
 
 
 def skip(at: Vault, count: int) -> None:
-    """Use up counters without a frame."""
+    """Consume counters without sending a frame."""
     entry = at.read(1)
     assert entry is not None
     at.write(replace(entry, unused=entry.unused + count))
@@ -259,7 +259,7 @@ def test_a_fifo_or_an_endless_file_instead_of_a_copy_is_a_lost_copy(sky: Vault, 
     first.unlink()
     os.mkfifo(first)
     assert sky.copies(1) == 1
-    gate(sky)  # tries to make the copy again
+    gate(sky)  # the next call tries to write the copy again
     with second.open("r+b") as file:
         file.truncate(1 << 40)
     assert sky.read(1) is None
@@ -280,7 +280,7 @@ def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(grou
 
 
 def test_a_block_of_counters_ends_when_the_key_was_changed(ground: Vault) -> None:
-    """Also if the counters of the new key have come to the end of the block."""
+    """Keys are also replaced if the counters of the new key are at the end of their block."""
     sealer = Sealer(ground, 1, bytes(5), 64, shared=True)
     sealer.seal(bytes(5), b"x")
     old = ground.read(1)

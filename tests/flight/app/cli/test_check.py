@@ -68,7 +68,7 @@ def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path)
 
 
 def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
-    """The coils carry a hundredth of what the configuration says."""
+    """The coils carry a hundredth of the configured current."""
     world = {**yaml.safe_load(DEMO.read_text())["simulation"], "truth": {"resistance": [2300.0] * 3}}
     steps = [{"at": 0.0, "q2": 0.0}]
     done = command("check", write(tmp_path, DEMO, camera="none", duration=6.0, steps=steps, simulation=world))
@@ -162,7 +162,7 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
 
 
 def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) -> None:
-    """The emulated unit stands for a receiver that sends by itself; a port that nobody feeds is silent."""
+    """The emulated IMU replaces a GPS receiver that sends without request; an unconnected port is silent."""
     strings = [
         {"normal": normal, "address": address, "channel": channel}
         for normal, address, channel in (

@@ -107,9 +107,9 @@ def test_a_command_goes_by_each_line_and_each_stage_is_shown(
 def test_authentic_frames_with_any_counter_end_no_process(
     lines: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A recording of such a frame would end the link after every restart: a refused frame is not stored.
+    """A refused frame is not stored, because its replay would end the link after every restart.
 
-    The highest come first, because four refusals a second are reported.
+    The highest numbers come first, because only four refusals a second are reported.
     """
     assert command(lines, "udp", "ping") == 0  # uses counter 0
     vault = Vault(Path(lines["place"]) / "keys" / "ground")
@@ -152,7 +152,7 @@ def test_a_key_is_changed_at_both_ends_also_when_the_answer_was_lost(
     assert new is not None
     assert old is not None
     assert new.generation == old.generation + 1
-    # The ground as it was before the satellite's answer came: the old key in force, the new one next.
+    # Ground keys before the satellite's answer: the old key is active, the new key is the next one.
     vault.write(new, "1-next")
     vault.write(replace(new, generation=1, key=bytes(32)))
     assert command(lines, "udp", "new-key", "1") == 0
@@ -175,7 +175,10 @@ def test_a_ground_station_without_keys_commands_by_the_gateway_and_knows_its_com
     layout = TELECOMMANDS[PING.name]
     raw = bytearray(CommandPacker().pack(Ping(3), 1))
     raw[2:4] = (0xC000 | 77).to_bytes(2, "big")
-    raw[7:15], raw[-CRC_BYTES:] = bytes(8), bytes(CRC_BYTES)  # as a client of the XTCE form leaves them
+    raw[7:15], raw[-CRC_BYTES:] = (
+        bytes(8),
+        bytes(CRC_BYTES),
+    )  # as XTCE clients leave them
     reports: list[Report] = []
     came = b""
     with socket.create_connection(("127.0.0.1", gateway.port)) as station:
@@ -221,7 +224,7 @@ def test_wrong_use_is_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(os, "nice", int)  # the link's low priority would be that of all later tests
+    monkeypatch.setattr(os, "nice", int)  # otherwise all later tests would run with the link's low priority
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     keys = f"{lines['place']}/keys/ground"
     assert main([word.format(keys=keys) for word in words]) == 2

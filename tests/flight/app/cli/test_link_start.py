@@ -36,19 +36,19 @@ class Service:
         )
 
     def says(self, words: str) -> str:
-        """Return the next line on standard error, which must have these words."""
+        """Return the next line on standard error, which must contain the given text."""
         assert self.process.stderr is not None
         line = self.process.stderr.readline()
         assert words in line
         return line
 
     def notifies(self, word: str) -> None:
-        """Wait until the service manager is notified of this."""
+        """Wait until the service manager receives the given notification."""
         while word not in self.line.recv(4096).decode():
             pass
 
     def silent(self, seconds: float) -> bool:
-        """Return whether the service manager is notified of nothing for this time."""
+        """Return whether the service manager receives no notification for the given time."""
         self.line.settimeout(0.0)
         while True:
             try:
@@ -71,7 +71,7 @@ class Service:
 
 @pytest.fixture
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a short name: sockets are in it."""
+    """Return a folder with a short name, because the paths of sockets are limited."""
     return tmp_path_factory.mktemp("s")
 
 
@@ -132,7 +132,7 @@ def test_no_line_is_opened_during_the_separation_inhibit(
 
 
 def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callable[[Path], Service]) -> None:
-    """The configuration, then the keys, whose folder is empty until they are mounted, then an old process."""
+    """The start waits for the configuration, for keys that are not mounted yet, and for an old process."""
     whole = write_linked_config(place, udp="127.0.0.1:0")
     config = place / "later.yaml"
     keys, away = place / "keys" / "satellite", place / "away"
@@ -170,7 +170,7 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
 
 
 def test_each_call_of_a_start_fails_once_and_the_whole_disk_for_a_while(tmp_path: Path) -> None:
-    """As the campaign `start` does it with a flight; waits are without pauses here."""
+    """The test makes calls fail like the campaign `start`, but without pauses."""
     words = [sys.executable, "-m", "tests.flight.app.cli.failing_starts", str(tmp_path)]
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT, timeout=_LONGEST_S)
     starts = [json.loads(line) for line in done.stdout.splitlines()]

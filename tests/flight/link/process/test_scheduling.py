@@ -307,7 +307,7 @@ def test_a_line_that_an_earlier_release_stored_has_angles_in_rad() -> None:
 
 
 def label(link: BothEnds, utc_ns: int) -> bytes:
-    """Return the packet of a run that began now, at a UTC."""
+    """Return the packet of a run that begins at the present time with the given UTC."""
     fields: dict[str, Any] = {field.name: [0.0] * 3 if field.count == 3 else 0 for field in RUN.fields}
     fields |= {"config_name": "orbit", "software": "1", "utc_ns": utc_ns - link.clock.now_ns()}
     return link.packer.pack(RUN, link.clock.now_ns(), fields)
