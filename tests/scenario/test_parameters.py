@@ -66,7 +66,7 @@ def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
 
 
 def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
-    """And the configuration's own value lies within them: it flies where nothing is loaded."""
+    """The configured value, used without a loaded table, is also within the bounds."""
     config = commanded(4.0)
     for (key, value), field in zip(configured().items(), PARAMETER_FIELDS, strict=True):
         assert field.valid is not None

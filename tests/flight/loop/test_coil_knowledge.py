@@ -52,5 +52,5 @@ def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None
 
 
 def test_no_guardian_acts_in_a_gap_that_is_not_seen() -> None:
-    """From heartbeat to heartbeat it may be longer than from look to look by nearly two cycles."""
+    """The interval between heartbeats may exceed the interval between checks by nearly two cycles."""
     assert STOOD_NS + 2 * 25 * MS < SILENCE_NS

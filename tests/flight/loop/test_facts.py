@@ -67,9 +67,9 @@ PERSISTENCE = {
     **{f"battery-{level}": (3, 3, "") for level in ("low", "very-low", "critical")},
     **{f"{rail}-monitor-lost": (3, 3, "") for rail in ("battery", "bus")},
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
-"""Updates until a fact counts and until it ends, None for a latching fact, and the modes that watch it.
+"""Number of updates until a fact counts and until it ends (None if it latches), and the modes that watch it.
 
-Every other fact counts and ends at once, and is watched in all modes.
+All remaining facts count and end at once, and are watched in all modes.
 """
 
 EVENTS_OF = {

@@ -56,7 +56,7 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
 
 
 def test_the_simulation_case_is_the_thesis_s() -> None:
-    """Ch. 5, Simulation Results: the loop of step_thesis.yaml, from another state, no thread, no camera."""
+    """Configuration of the thesis, ch. 5: step_thesis.yaml with another state, without thread and camera."""
     loop, case = (
         as_testbed(reader.load(FOLDER / name)) for name in ("step_thesis.yaml", "step_simulation.yaml")
     )
@@ -253,7 +253,7 @@ def test_no_text_whatever_makes_a_traceback(text: str) -> None:
 @given(st.integers(min_value=0, max_value=len(DEMO) - 1), st.characters(), st.integers(0, 20))
 def test_a_damaged_configuration_is_valid_or_refused_clearly(place: int, letter: str, cut: int) -> None:
     damaged = DEMO[:place] + letter + DEMO[place + cut :]
-    with contextlib.suppress(ConfigError):  # anything else is a failure
+    with contextlib.suppress(ConfigError):  # any other exception is a failure
         reader.parse(damaged)
 
 
@@ -290,7 +290,7 @@ def test_a_configuration_is_written_in_its_order_and_read_back_the_same() -> Non
 
 
 def test_what_a_lens_differs_by_from_a_pinhole_counts_as_unknown_to_the_streaks() -> None:
-    """An axis 3 and 4 px off, and distortion that moves the corner by 1 % of its radius."""
+    """The axis has an offset of 3 and 4 px, and the distortion moves the corner by 1 % of its radius."""
     demo = reader.load(FOLDER / "step_demo.yaml").camera
     assert demo is not None
     assert camera_knowledge(demo) == EXACT

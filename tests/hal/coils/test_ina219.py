@@ -102,7 +102,7 @@ def test_a_chopped_current_is_averaged_over_several_conversions(
 
 
 def test_a_negative_shunt_voltage_is_a_negative_current() -> None:
-    """A monitor with its shunt the other way round must not read 6.5 kA."""
+    """A monitor with a reversed shunt must not read 6.5 kA."""
     clock = ManualClock()
     rig = Rig(clock=clock)
     rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, -0.12)))
@@ -126,7 +126,10 @@ def test_no_conversion_is_counted_twice() -> None:
 
 
 def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
-    """A short: 1 A through a range of 0.8 A. Without a reading, its coil would never be found."""
+    """A short circuit gives 1 A, beyond the range of 0.8 A.
+
+    Without a reading, the shorted coil would not be found.
+    """
     clock = ManualClock()
     rig = Rig(clock=clock)
     amps = [0.2]
@@ -135,7 +138,7 @@ def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
     found = []
     for current in (0.2, 1.0, 0.1):
         amps[0] = current
-        clock.advance(1400 * MS)  # until the mean is whole again
+        clock.advance(1400 * MS)  # until the mean includes only valid samples again
         reading = monitor.latest()
         assert reading is not None
         assert monitor.error() == ""
@@ -144,7 +147,7 @@ def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
 
 
 def test_an_overflow_of_the_chips_mathematics_is_an_error() -> None:
-    """Somebody else has written Calibration: 7000 x 65534 / 4096 does not fit into Current."""
+    """Another program has written Calibration: 7000 x 65534 / 4096 exceeds the register Current."""
     clock = ManualClock()
     rig = Rig(clock=clock)
     rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, 0.7)))
@@ -211,7 +214,7 @@ def test_a_monitor_that_stops_converting_is_an_error() -> None:
 
 
 def test_the_newest_conversion_is_returned_with_the_time_that_it_averages(rig: Rig) -> None:
-    """A step of the current, to fully on: no conversion that was begun before it counts as one of after."""
+    """After a step of the current, an ADC sample that began before the step is not used."""
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.clock.advance(2000 * MS)
@@ -232,7 +235,7 @@ def test_the_newest_conversion_is_returned_with_the_time_that_it_averages(rig: R
 
 @pytest.mark.parametrize("amps", [0.0, 0.05])
 def test_a_monitor_that_always_gives_the_same_is_reported_at_any_current(rig: Rig, amps: float) -> None:
-    """Its ready bit stays although the conversion was read; so even where the current is constant."""
+    """The ready bit stays set although the sample was read; this is detected even at a constant current."""
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)
 

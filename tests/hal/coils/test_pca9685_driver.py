@@ -18,7 +18,7 @@ from tests.manual_clock import ManualClock
 
 
 class Recorder(EmulatedI2cBus):
-    """An emulated bus that logs all writes."""
+    """An emulated bus that records all writes."""
 
     def __init__(self, chip: EmulatedPca9685, clock: ManualClock) -> None:
         super().__init__([chip])
@@ -65,7 +65,7 @@ def test_set_up_follows_the_data_sheet_with_all_off_first(
     pca.configure()
     assert [(register, values) for register, values, _ in bus.written] == [
         (0xFD, [0x10]),
-        (0x00, [0x11]),  # power-on MODE1 is asleep already and keeps ALLCALL until waking
+        (0x00, [0x11]),  # after power-on, MODE1 has SLEEP set and keeps ALLCALL until wake-up
         (0xFE, [0x79]),
         (0x00, [0x20]),
         (0x01, [0x04]),
@@ -78,7 +78,7 @@ def test_set_up_follows_the_data_sheet_with_all_off_first(
 def test_a_chip_left_running_is_switched_off_before_anything_else(
     recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
 ) -> None:
-    """A dead process leaves MODE1 = 0x20 and channels driven."""
+    """A dead process has left MODE1 = 0x20 and driven channels."""
     pca, bus, chip = recorder
     pca.configure()
     pca.write_channels(0, [FULL_ON, (0, 100)])
@@ -128,13 +128,16 @@ def test_a_brown_out_is_noticed_and_mended(rig: Rig) -> None:
 
 
 def test_another_part_at_the_address_is_refused_with_the_cure(rig: Rig) -> None:
-    """Both parts leave the factory at 0x40; an INA219 acknowledges every write and keeps none of these."""
+    """Both chips have the default address 0x40.
+
+    An INA219 acknowledges each write but keeps no such register.
+    """
     with pytest.raises(Refused, match="another part at this address"):
         Pca9685(rig.bus, INA, rig.clock).configure()
 
 
 def test_an_outer_clock_that_an_upset_has_chosen_is_cleared_by_a_software_reset(rig: Rig) -> None:
-    """The bit is sticky: no write clears it. Nothing is driven on the way."""
+    """The bit is sticky: no write clears it. No channel is driven during the set-up."""
     rig.pca.configure()
     rig.wire.chip.flip(0x00, 6)
     rig.pca.write_channels(0, [FULL_ON])
@@ -163,7 +166,7 @@ def test_a_silent_chip_is_named_with_what_to_check(rig: Rig) -> None:
 
 
 def test_switch_off_works_in_every_state_of_the_chip(rig: Rig) -> None:
-    switch_off(rig.bus, PCA)  # fresh from power-on, asleep
+    switch_off(rig.bus, PCA)  # after power-on, with SLEEP set
     rig.pca.configure()
     rig.pca.write_channels(0, [FULL_ON] * 8)
     rig.pca.write_channels(8, [(0, 2000)] * 8)

@@ -44,7 +44,7 @@ NAV_SAT: Kind = (0x01, 0x35)
 
 
 class OneWayPort:
-    """Serial port that delivers given bytes, one piece each poll, and keeps what is sent."""
+    """Serial port that delivers one portion of given bytes per poll, and stores the sent bytes."""
 
     def __init__(self, pieces: Iterable[bytes], clock: SimClock) -> None:
         self.baud_rate = 115200
@@ -66,7 +66,7 @@ class OneWayPort:
 
 
 def received(pieces: list[bytes], step: float = 0.1) -> tuple[list[GpsReading], UbloxReceiver, OneWayPort]:
-    """Return the readings of a driver that polls once for each piece, the driver, and its port."""
+    """Return the readings of a driver that polls once for each portion, the driver, and its port."""
     clock = SimClock()
     port = OneWayPort(pieces, clock)
     driver = UbloxReceiver(port, clock)
