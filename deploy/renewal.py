@@ -515,7 +515,7 @@ class Renewal:
         state, board = self._state, self._board
         if state.trial is not None:
             raise Refused(
-                f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw it first"
+                f"{state.trial.kind} {state.trial.version} is on trial: confirm or withdraw this trial first"
             )
         hours = float(request["hours"])
         if not 0.0 < hours <= MOST_HOURS:
@@ -613,7 +613,9 @@ class Renewal:
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
-            if not self._go_back(what, name, "withdraw", f"the previous {what} flies, as the ground asked"):
+            if not self._go_back(
+                what, name, "withdraw", f"the previous {what} returned at the ground's request"
+            ):
                 raise Refused(f"there is no previous {what}")
             return
         if trial.kind != kind:
@@ -632,7 +634,7 @@ class Renewal:
                 self._revert(trial)
         except (Refused, OSError) as error:
             if trial.stage == "install":
-                self._begin_revert(f"it cannot be installed: {error}")
+                self._begin_revert(f"the artefact cannot be installed: {error}")
             else:  # the new version stays installed until a later run succeeds
                 sys.stderr.write(f"renewal: cannot revert yet: {error}\n")
 
@@ -645,7 +647,7 @@ class Renewal:
             if not trial.new:
                 trial.tries += 1
                 if trial.tries > MOST_TRIES:
-                    raise Refused(f"its build did not end {MOST_TRIES} times")
+                    raise Refused(f"the build of the release did not end {MOST_TRIES} times")
                 self._save()
                 trial.new = self._built()
                 self._save()
@@ -675,7 +677,7 @@ class Renewal:
         dropin = Path(__file__).resolve().with_name("board_dropin.py")
         checked = board.run([board.python(name), "-I", "-B", dropin, board.configuration()], 120.0)
         if checked.returncode != 0:
-            raise Refused(f"it does not accept the present configuration: {checked.stderr.strip()[-60:]}")
+            raise Refused(f"the release refuses the present configuration: {checked.stderr.strip()[-60:]}")
         return name
 
     def _begin_revert(self, problem: str) -> None:
@@ -704,7 +706,7 @@ class Renewal:
                 board.point("current", trial.old)
             if trial.before:
                 board.point("previous", trial.before)
-        text = f"{trial.kind} {trial.version}: {trial.problem}; the previous one flies"
+        text = f"{trial.kind} {trial.version}: {trial.problem}; the previous version is in use"
         self._note(text)
         state.trial = None
         self._report(trial.request, "failed", "activate", text)
@@ -729,7 +731,7 @@ class Renewal:
         elif contact.get("fault") and contact["session"] != trial.session and not trial.despite_faults:
             self._begin_revert(f"the flight reported a fault: {contact['fault']}")
         elif trial.left_s <= 0.0:
-            self._begin_revert("the ground did not confirm it")
+            self._begin_revert("the ground did not confirm the trial")
 
     def _other_release(self, trial: Trial) -> str:
         """Return the release that flight or link run instead of the one on trial, or an empty text."""
@@ -869,11 +871,11 @@ def main(words: Sequence[str]) -> int:
     """Execute one run, and return the exit status."""
     parser = argparse.ArgumentParser(description="Execute one step of the renewal (docs/fly/renewal.md).")
     parser.add_argument("--root", type=Path, default=Path("/"), help="folder of the board's files")
-    parser.add_argument("--now", type=float, help="assumed time since boot, s, for tests")
+    parser.add_argument("--now", type=float, help="time since boot (s) to assume, for tests")
     parser.add_argument(
         "--accepted", action="store_true", help="keep the configuration that install.sh accepted"
     )
-    parser.add_argument("--restart", action="store_true", help="restart what a run has asked for")
+    parser.add_argument("--restart", action="store_true", help="restart the services as requested by a run")
     options = parser.parse_args(words)
     board = Board(options.root)
     board.own.mkdir(parents=True, exist_ok=True)

@@ -92,7 +92,7 @@ class SafeState:
         elif name == "safe":
             self.due = now + LONGEST_S
         elif name != "ping":
-            obeyed, text = False, "the board is in its safe state: ping, safe and mode are obeyed"
+            obeyed, text = False, "the board is in its safe state and executes only ping, safe and mode"
         self._seen = [*self._seen[-63:], data]
         self._count += 1
         left = max(0.0, self.due - now)
@@ -182,10 +182,10 @@ def main() -> int:
     now = time.monotonic()
     tries = Tries(os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], now)
     state = SafeState(tries, now)
-    say(f"the flight was given up; try {tries.number} in {state.due - now:.0f} s")
+    say(f"the start of the flight failed; attempt {tries.number} in {state.due - now:.0f} s")
     serve(state, os.environ.get("KNIGHTCUBE_COMMANDS", ""))
     tries.keep(time.monotonic())
-    say(f"the flight is tried again, try {tries.number}")
+    say(f"the flight is started again, attempt {tries.number}")
     return 0
 
 

@@ -139,7 +139,7 @@ def read_run(folder: Path) -> Run:
     """Read a run's folder. Raises UsageError if the folder has no flight log with a valid packet."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise UsageError(f"{folder}: no such folder; give the folder that a run was written to (--out)")
+        raise UsageError(f"{folder}: no such folder; give the folder of a run (option --out of the run)")
     if not find_segments(folder, "flight"):
         raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder")
     flight, truth, performance = (_read_log(folder, stem) for stem in ("flight", "truth", "performance"))

@@ -299,9 +299,9 @@ _FRUGAL = ("-XX:TieredStopAtLevel=1", "-XX:+UseSerialGC")
 def missing() -> str:
     """Return what this machine lacks to run Yamcs, or an empty text."""
     if shutil.which("java") is None:
-        return "there is no Java: apt-get install default-jre-headless"
+        return "Java is missing: apt-get install default-jre-headless"
     if importlib.util.find_spec(_BUNDLE) is None:
-        return "there is no Yamcs: pip install 'knightcube-flight[interop]'"
+        return "Yamcs is missing: pip install 'knightcube-flight[interop]'"
     return ""
 
 
@@ -341,7 +341,7 @@ def main() -> None:
         type=Path,
         default=KEYS,
         metavar="FOLDER",
-        help=f"the gateway's, for its token (default {KEYS})",
+        help=f"folder of the gateway's keys, for its token (default {KEYS})",
     )
     parser.add_argument("--http", type=int, default=HTTP_PORT, metavar="PORT", help=f"default {HTTP_PORT}")
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")

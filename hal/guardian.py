@@ -274,7 +274,7 @@ class GuardianLine:
                 received = self._line.recv(1)
         if received != READY and not patient:
             raise NotResponding(
-                DEVICE, "it cannot reach the coils' PWM chip, see above: the flight does not start"
+                DEVICE, "the guardian cannot reach the coils' PWM chip (see above): the flight does not start"
             )
 
     def beat(self) -> None:

@@ -46,7 +46,7 @@ class Ina226:
         """Return the die's identifier as text. Raises NotResponding without an answer, and Refused."""
         word = self._word(DIE_ID)
         if word >> 4 != 0x226:
-            raise Refused(self.name, f"its identifier is 0x{word:04x}: is another part at this address?")
+            raise Refused(self.name, f"its identifier is 0x{word:04x}: is another chip at this address?")
         return f"answers: die 0x{word:04x}"
 
     def latest(self) -> PowerReading | None:

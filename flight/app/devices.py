@@ -331,7 +331,7 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
         part = imported(f"{key}.part", sensor.part, SENSOR_PARTS, os.environ)
         if (sensor.spi is not None) != hasattr(part, "SPEED_HZ"):
             problem = (
-                "goes with a sensor on an SPI bus" if sensor.spi else "is missing: this is an SPI device"
+                "is only for a sensor on an SPI bus" if sensor.spi else "is missing: this is an SPI device"
             )
             raise ConfigError(f"{key}.spi", problem)
         axes: dict[str, FloatArray] = {
@@ -340,7 +340,7 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
         parts.append(SensorPart(sensor.part, partial(_started, part, rig, sensor), axes))
         measured |= set(axes)
     if "magnetic" not in measured:
-        raise ConfigError(f"{kind}.sensors", "measure no magnetic field: add a sensor of `magnetic`")
+        raise ConfigError(f"{kind}.sensors", "lack the magnetic field: add a sensor of `magnetic`")
     known = unit.calibration
     settings = SensorUnitSettings(
         mounting=attitude_matrix(np.array(unit.mounting)),
@@ -468,7 +468,7 @@ def probe_ublox(rig: Rig, gps: Gps) -> str:
         if port.receive():
             return "sends"
         rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
-    silence = f"opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
+    silence = f"the port the port opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
     raise NotResponding(gps.device, f"{silence}: check power, the cable and the baud rate")
 
 

@@ -315,9 +315,9 @@ def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) 
     if config.simulation is not None:
         return simulated_rig(request, text, config, stack)
     if request.seed is not None:
-        raise UsageError("--seed: this configuration flies real devices, whose noise has no seed")
+        raise UsageError("--seed: this configuration has real devices, whose noise has no seed")
     if request.devices is not None:
-        raise UsageError("--devices: this configuration flies real devices, not simulated ones")
+        raise UsageError("--devices: this configuration has real devices, not simulated devices")
     return linux_rig(config, stack, request.archive is not None)
 
 
@@ -590,7 +590,7 @@ def _shedding(
 
     if imaging is None:
         return Shedding(signs, plans, apply, lambda: (0, 0), services)
-    signs.append(OverloadSign("frames wait or take too long", lambda: imaging.workload()[1], 2))
+    signs.append(OverloadSign("frames are processed too late", lambda: imaging.workload()[1], 2))
     return Shedding(signs, plans, apply, imaging.workload, services)
 
 

@@ -104,7 +104,7 @@ class StartRetry:
 
     def summary(self) -> str:
         """Return number and duration of the attempts; empty if the first attempt succeeded."""
-        begun = f"begun at attempt {self._failed + 1} after {self._waited:.1f} s"
+        begun = f"started at attempt {self._failed + 1} after {self._waited:.1f} s"
         return f"{begun}: {self._problem}" if self._failed else ""
 
     def wait(self, problem: str, pause: float) -> None:
@@ -113,16 +113,16 @@ class StartRetry:
         self._waited += pause
         self._problem = problem
         with suppress(OSError):
-            sys.stderr.write(f"knightcube: cannot begin yet: {problem}; tried again in {pause:g} s\n")
+            sys.stderr.write(f"knightcube: cannot start yet: {problem}; tried again in {pause:g} s\n")
             sys.stderr.flush()
-        self._overseer.status(f"waiting to begin, {self._failed} attempts: {problem}")
+        self._overseer.status(f"waiting to start, {self._failed} attempts: {problem}")
         until_ns = self._clock.now_ns() + round(pause * SECOND_NS)
         while not self._interrupted() and (now_ns := self._clock.now_ns()) < until_ns:
             self._overseer.feed_watchdog()
             self._overseer.extend_start(_ATTEMPT_S)
             self._clock.sleep_until_ns(min(now_ns + _MEAL_NS, until_ns))
         if self._interrupted():
-            raise StoppedError(f"stopped before it could begin: {problem}")
+            raise StoppedError(f"stopped before the start: {problem}")
 
     def close(self) -> None:
         """Close the connection to the service manager. Safe to call twice."""
@@ -615,10 +615,10 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
         except ConfigError:  # the stored configuration flew with another software version
             continue
         return Chosen(
-            one.path, one.text, f"{path}: {problem}: the last configuration that flew is flown; {_CURE}"
+            one.path, one.text, f"{path}: {problem}: the last accepted configuration is used; {_CURE}"
         )
     if os.path.lexists(sum_file(path)) or folder is not None:
-        problem += f", and no configuration that flew is stored; {_CURE}"
+        problem += f", and no accepted configuration is stored; {_CURE}"
     raise UnreadConfigError(str(path), problem)
 
 
@@ -635,7 +635,7 @@ def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes |
         dangling = os.path.lexists(sum_file(path))
         return data, f"{sum_file(path).name} leads nowhere" if dangling else "", False
     accepted = expected.split()[:1] == [hashlib.sha256(data).hexdigest().encode()]
-    return data, "" if accepted else "is not what was accepted (sha256)", accepted
+    return data, "" if accepted else "differs from the accepted configuration (SHA-256)", accepted
 
 
 def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | None:
@@ -672,7 +672,7 @@ def requested_config(request: RunRequest, text: str | None = None) -> tuple[str,
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))
     if request.faults and config.simulation is None:
-        raise UsageError("--fault: this configuration flies real devices, in which no fault can be injected")
+        raise UsageError("--fault: this configuration has real devices, into which no fault can be injected")
     if request.faults:
         spoiled = corrupted_text(request, text)
         if spoiled != text:

@@ -64,7 +64,7 @@ def problem_of(values: Mapping[str, float]) -> str:
     A problem is a missing key, an unknown key or a value out of range.
     """
     if lacking := [key for key in PARAMETER_KEYS if key not in values]:
-        return f"{lacking[0]} is missing: a table is loaded as a whole"
+        return f"{lacking[0]} is missing: give all parameters of the table"
     if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
         return f"{unknown[0]} is not a parameter: use {', '.join(PARAMETER_KEYS)}"
     for key, parameter in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
@@ -643,7 +643,7 @@ class DatagramChannel:
             bound = _bound_unix(path)
         except OSError as error:
             if self._file is not None:
-                self._news = f"{path} is gone and cannot be bound again: {error.strerror or error}"
+                self._news = f"{path} was removed and cannot be bound again: {error.strerror or error}"
             self._file = None
             return
         bound.setblocking(False)
@@ -655,8 +655,8 @@ class DatagramChannel:
 def open_unix(path: Path) -> DatagramChannel:
     """Bind a UNIX datagram socket that owner and group may write to.
 
-    A stale socket file without a listening process is replaced. Raises UsageError if another file has this
-    path, if a process listens at this path, or if the socket cannot be bound.
+    A stale socket file without a listening process is replaced. Raises UsageError if a file that is not a
+    socket has this path, if a process listens at this path, or if the socket cannot be bound.
     """
     try:
         bound = _bound_unix(path)
@@ -672,7 +672,7 @@ def _bound_unix(path: Path) -> socket.socket:
     try:
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISSOCK(path.lstat().st_mode):
-                raise OSError("another file has this path")
+                raise OSError("a file that is not a socket has this path")
             if _is_served(path):
                 raise OSError("another flight listens there")
             path.unlink()

@@ -63,7 +63,7 @@ CRASHED_OFTEN = _warning(
 BOOT_WAITS = _warning(7, "boot-waits", "the flight is still booting because the devices give no valid data")
 TASK_FAILING = _fault(8, "task-failing", "the control task fails in every cycle", Reaction.SAFE)
 NO_PROGRESS = _fault(
-    9, "no-progress", "a rate group or worker makes no progress, so the watchdog is no longer fed"
+    9, "no-progress", "a rate group or worker makes no progress, so the watchdog is not reset"
 )
 SERVICE_FAILING = _fault(
     96, "service-failing", "a background job, such as writing the log, fails or makes no progress"
@@ -74,7 +74,7 @@ IMU_CORRUPT = _warning(11, "imu-corrupt", "the inertial unit sends bytes that fo
 IMU_IMPLAUSIBLE = _warning(
     12, "imu-implausible", "the inertial unit sends values that are out of range or not finite"
 )
-IMU_LINE_LOST = _fault(13, "imu-line-lost", "the serial port of the inertial unit is lost")
+IMU_LINE_LOST = _fault(13, "imu-line-lost", "the serial port of the inertial unit has disappeared")
 IMU_RECOVERED = _info(14, "imu-recovered", "the inertial unit sends valid packets again")
 IMU_REFUSED = _warning(
     15, "imu-refused", "inertial measurements that disagree with the estimate are rejected"
@@ -86,7 +86,7 @@ CONTROL_LOST = _fault(
     20, "control-lost", "the coils are set to zero because there is no valid estimate", Reaction.COILS_OFF
 )
 CONTROL_REGAINED = _info(21, "control-regained", "the estimate is valid again")
-BLIND = _fault(22, "blind", "there has been no valid or accurate estimate for too long", Reaction.SAFE)
+BLIND = _fault(22, "blind", "the estimate has been invalid or inaccurate for too long", Reaction.SAFE)
 TUMBLING = _warning(
     23, "tumbling", "the body rotates too fast for any mode but detumbling", Reaction.DETUMBLE
 )
@@ -107,7 +107,7 @@ COIL_TRUSTED = _info(35, "coil-trusted", "an isolated coil is used again, by com
 COIL_CORRECTED = _warning(
     143, "coil-corrected", "a coil is used with another sign or gain, because the motion shows it"
 )
-COIL_TESTED = _info(144, "coil-tested", "short currents have tested coils that pointing hardly uses")
+COIL_TESTED = _info(144, "coil-tested", "coils that pointing hardly uses were tested by short currents")
 COIL_SUSPECT = _warning(
     36, "coil-suspect", "the supply current does not match the commanded currents; the faulty coil is unknown"
 )
@@ -147,7 +147,7 @@ FRAME_UNUSED = _info(69, "frame-unused", "a frame of the rotating body gave neit
 CAMERA_LATE = _warning(66, "camera-late", "a frame arrived late or is overdue")
 LOG_FAULT = _fault(60, "log-fault", "the flight log cannot be written")
 LOG_RECOVERED = _info(65, "log-recovered", "the flight log is written again")
-RECORD_LOST = _fault(110, "record-lost", "a record was lost because its values did not fit their packet")
+RECORD_LOST = _fault(110, "record-lost", "a record was lost because values were out of the packet's range")
 STATE_RECOVERED = _warning(
     61, "state-recovered", "one copy of the stored state is damaged; the other copy is used"
 )
@@ -155,7 +155,7 @@ STATE_LOST = _warning(
     62, "state-lost", "both copies of the stored state are damaged; default values are used"
 )
 STATE_UNWRITTEN = _warning(63, "state-unwritten", "the state cannot be written to disk")
-STATE_OLD = _warning(98, "state-old", "the stored state misses boots, which counts as an unclean shutdown")
+STATE_OLD = _warning(98, "state-old", "the stored state lacks boots, which counts as an unclean shutdown")
 PARAMETERS_LEFT = _warning(
     115, "parameters-left", "the loaded parameter table is rejected and the previous table is used"
 )
@@ -164,7 +164,7 @@ CONFIG_DAMAGED = _warning(
     67, "config-damaged", "the configuration is not the accepted one; the last flown configuration is used"
 )
 LENS_CHANGED = _warning(157, "lens-changed", "a frame contradicts the learned lens, which is learned again")
-LEARNED_REFUSED = _warning(68, "learned-refused", "learned values were rejected: implausible or contradicted")
+LEARNED_REFUSED = _warning(68, "learned-refused", "implausible or contradicted learned values were rejected")
 UNCLEAN_SHUTDOWN = _warning(64, "unclean-shutdown", "the previous boot did not end cleanly")
 CLOCK_STEP = _warning(70, "clock-step", "the wall clock was changed; control does not use it")
 CPU_HIGH = _warning(71, "cpu-high", "the control process uses too much processor time")
@@ -193,7 +193,7 @@ GUARDIAN_ACTED = _warning(
     92, "guardian-acted", "the heartbeats stopped and the guardian held the coils at zero"
 )
 GUARDIAN_BLIND = _fault(93, "guardian-blind", "the guardian cannot reach the PWM chip and keeps trying")
-REAL_TIME = _info(94, "real-time", "the real-time scheduling and locked memory that were obtained")
+REAL_TIME = _info(94, "real-time", "the text lists the obtained real-time scheduling and locked memory")
 REAL_TIME_REFUSED = _warning(95, "real-time-refused", "real-time scheduling or locked memory was refused")
 
 ATTITUDE_KNOWLEDGE = _info(100, "attitude-knowledge", "the quality of the attitude estimate changed")
@@ -202,7 +202,7 @@ GPS_RECOVERED = _info(102, "gps-recovered", "the GPS receiver delivers usable fi
 GPS_REFUSED = _warning(103, "gps-refused", "a GPS fix was refused; the text gives the reason")
 GPS_SET_UP = _warning(153, "gps-set-up", "the GPS receiver refused a command of its configuration")
 FIELD_EXTRAPOLATED = _warning(152, "field-extrapolated", "the date is outside the years of the field model")
-GPS_LINK = _warning(151, "gps-link", "frames of the GPS receiver were corrupt, implausible or moved in date")
+GPS_LINK = _warning(151, "gps-link", "frames of the GPS receiver were corrupt, implausible or corrected")
 STRINGS_LOST = _warning(104, "strings-lost", "the solar strings deliver no readings")
 STRINGS_RECOVERED = _info(105, "strings-recovered", "the solar strings deliver readings again")
 SUN_UNCLEAR = _warning(106, "sun-unclear", "the solar strings detect no Sun although the satellite is sunlit")
@@ -234,7 +234,7 @@ OBJECT_ESCAPES = _warning(
 )
 
 SUN_FOUND = _info(140, "sun-found", "the Sun was detected in safe mode and the body turns towards it")
-SUN_MISSED = _warning(141, "sun-missed", "no Sun was detected in safe mode, so the body is only held still")
+SUN_MISSED = _warning(141, "sun-missed", "no Sun was detected in safe mode, so the body is only damped")
 ASTRAY = _warning(142, "astray", "the body is far from its path and is slowed down before a new plan")
 
 BATTERY_LOW = _warning(160, "battery-low", "the battery is low, so the currents of the coils are limited")

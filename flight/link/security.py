@@ -182,7 +182,7 @@ class Vault:
             raise UsageError(f"{folder}: no such folder; `knightcube keys` makes keys")
         for path in folder.glob("spi-*"):
             if stat.S_IMODE(path.stat().st_mode) & 0o077:
-                raise UsageError(f"{path}: others may read this key: chmod 600, or make new keys")
+                raise UsageError(f"{path}: other users may read this key: run chmod 600, or make new keys")
         self.restored = False
         """Whether the primary command SPI is refused because its association is outdated."""
         if self._witness is not None:
@@ -222,7 +222,7 @@ class Vault:
 
         Raises UsageError if another link process uses it.
         """
-        with locked(self._folder / _OWNER, f"{self._folder}: another link process has these counters"):
+        with locked(self._folder / _OWNER, f"{self._folder}: another link process uses these counters"):
             yield
 
     def read(self, name: int | str) -> Association | None:

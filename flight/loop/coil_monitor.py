@@ -794,7 +794,7 @@ class CoilMonitor:
         if not works and self._is_contradicted(axis, fault):
             if self._begin_comparison(axis, fault, now_ns):
                 return
-            why = f"{self._strangeness}; yet the motion shows no change of coil {COIL_NAMES[axis]}"
+            why = f"{self._strangeness}; but the motion shows no change of coil {COIL_NAMES[axis]}"
             self._witness.doubt_monitor(why, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)

@@ -106,7 +106,7 @@ class OnboardParameters:
         Return why the new table is rejected, or an empty text.
         """
         if replaced != self._crc:
-            return f"the table in force is {self._crc:08x}, not {replaced:08x}: dump it and check again"
+            return f"the table in use is {self._crc:08x}, not {replaced:08x}: dump it and check again"
         before = self._table.values if self._table.proven else self._table.before
         if problem := problem_of(values) or self._adopt(values):
             return problem
@@ -285,7 +285,7 @@ class CommandTask:
     def _clear(self, event: str, now_ns: int) -> str:
         if not self._facts.clear(event):
             latched = [fact.begins.name for fact in self._facts.held() if fact.latching]
-            return f"nothing is latched under {event!r}; latched: {', '.join(latched) or 'nothing'}"
+            return f"no event is latched as {event!r}; latched: {', '.join(latched) or 'nothing'}"
         if event == events.COIL_BROKEN.name:
             self._drive.trust(now_ns)
         return ""

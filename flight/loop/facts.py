@@ -78,7 +78,7 @@ class EventLog:
         """Write the events that are still held back at the end of the flight."""
         by_code = {kind.code: kind for kind in EVENTS}
         for code, held_back in list(self._held_back.items()):
-            self._sink(by_code[code], time_ns, held_back - 1, "the last one held back by the throttle")
+            self._sink(by_code[code], time_ns, held_back - 1, "the last event suppressed by the rate limit")
         self._held_back.clear()
 
 

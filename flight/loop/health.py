@@ -137,12 +137,12 @@ class ResourceMonitor:
             return
         slope = self.state.memory_slope * _HOUR
         for fact, value, limit, text in (
-            (facts.CPU_HIGH, self.state.cpu_share, limits.cpu_share, "{:.2f} of a core, {:g} allowed"),
-            (facts.MEMORY_GROWS, slope, limits.memory_slope, "{:.3g} bytes an hour, {:g} allowed"),
+            (facts.CPU_HIGH, self.state.cpu_share, limits.cpu_share, "{:.2f} of a core, limit {:g}"),
+            (facts.MEMORY_GROWS, slope, limits.memory_slope, "growth of {:.3g} bytes an hour, limit {:g}"),
             (facts.MEMORY_HIGH, sample.proportional, limits.memory, "{:.4g} bytes, {:g} allowed"),
-            (facts.DISK_LOW, -sample.disk_free, -limits.disk_free, "{:.3g} bytes free, {:g} wanted"),
-            (facts.HOT, sample.temperature, limits.temperature, "{:.1f} deg C, {:g} is warm"),
-            (facts.TOO_HOT, sample.temperature, limits.hottest, "{:.1f} deg C, {:g} allowed"),
+            (facts.DISK_LOW, -sample.disk_free, -limits.disk_free, "{:.3g} bytes free, {:g} required"),
+            (facts.HOT, sample.temperature, limits.temperature, "{:.1f} deg C, warning above {:g}"),
+            (facts.TOO_HOT, sample.temperature, limits.hottest, "{:.1f} deg C, limit {:g}"),
         ):
             known = not math.isnan(value)
             facts_.update(fact, value > limit if known else None, now_ns, text.format(abs(value), abs(limit)))

@@ -221,7 +221,11 @@ class Navigation:
         if doubted and not self._doubted:
             self._estimation.coil_monitor.test_soon()
         self._doubted = doubted
-        text = "the body rate contradicts the commands" if doubted else "the rate follows the commands"
+        text = (
+            "the body rate contradicts the commands"
+            if doubted
+            else "the body rate agrees with the commands again"
+        )
         self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
         return used
 

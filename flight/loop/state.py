@@ -511,7 +511,7 @@ def decode(data: bytes) -> _StateCopy:
     try:
         copy = msgspec.json.decode(line, type=_StateCopy)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise ValueError(f"holds another kind of state: {str(error)!r}") from error
+        raise ValueError(f"contains another kind of state: {str(error)!r}") from error
     check(copy.state)
     return copy
 

@@ -250,7 +250,7 @@ class Steering:
         """
         control = self._body.control
         reference = control.paths.sample(now_ns)
-        reason = "no measurement fresh enough or no estimate accurate enough to steer by: coils to zero"
+        reason = "measurement too old or estimate too inaccurate for control: coils set to zero"
         text = "steering again" if estimate else reason
         self._facts.update(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
         state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
@@ -265,7 +265,10 @@ class Steering:
             self._drive.send(wanted.currents, lambda: field(estimate), testable=True)
             adrift = not following and control.paths.is_adrift(now_ns)
         self._facts.update(
-            facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"
+            facts.HOLDING,
+            adrift,
+            now_ns,
+            "no newer path: holding the attitude at the end of the last path path",
         )
         return self._steered(state, now_ns, reference, dipole, saturated)
 
@@ -305,9 +308,9 @@ class Steering:
             known = None if reading.has_rate else self._body.estimation.rate_without_gyro(now_ns)
             self._has_rate = reading.has_rate or known is not None
             law.sample(reading.time_ns, reading.field, reading.rate if known is None else known)
-        text = "braking again" if current else "no reading fresh enough to brake by: coils to zero"
+        text = "braking again" if current else "readings too old for detumbling: coils set to zero"
         if current and needs_rate and not self._has_rate:
-            current, text = False, "neither gyro nor estimate gives the rate for turning: coils to zero"
+            current, text = False, "neither gyro nor estimate gives the rate: coils set to zero"
         self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)
         if not current:
             return self.rest(now_ns)
@@ -344,6 +347,6 @@ class Steering:
     ) -> Steered:
         """Check the PWM chip, whose fault switches the coils off, and return the result of this cycle."""
         error = self._drive.fault()
-        text = error or "the PWM chip takes commands again"
+        text = error or "the PWM chip accepts commands again"
         self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)
         return Steered(state, reference, dipole, self._drive.command, saturated)

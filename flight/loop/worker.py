@@ -140,7 +140,7 @@ def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
     if math.prod(shape) * kind.itemsize != len(buffer):
         raise FlightError(f"an array of {dtype} and shape {shape} does not fill {len(buffer)} bytes")
     if kind.kind == "b" and buffer.translate(None, b"\0\1"):
-        raise FlightError("a truth value is neither 0 nor 1")
+        raise FlightError("a boolean is neither 0 nor 1")
     return np.frombuffer(buffer, kind).reshape(shape) if buffer else np.zeros(shape, kind)
 
 
@@ -170,7 +170,7 @@ def _class(name: str) -> type:
     module, _, qualified = name.partition(":")
     found = getattr(sys.modules.get(module), qualified, None)
     if not isinstance(found, type):
-        raise FlightError(f"{name!r} is not a class that the control process has")
+        raise FlightError(f"{name!r} is not a class that the control process has defined defined")
     return found
 
 

@@ -191,10 +191,10 @@ class Winding(Section, frozen=True, kw_only=True):
         given = self.dipole_per_ampere
         if self.turns is not None and self.area is not None:
             if given is not None:
-                raise ConfigError("dipole_per_ampere", "is given: leave `turns` and `area` out")
+                raise ConfigError("dipole_per_ampere", "is given: omit `turns` and `area`")
             return self.turns * self.area
         if given is None:
-            raise ConfigError("dipole_per_ampere", "is missing: give it, or `turns` and `area`")
+            raise ConfigError("dipole_per_ampere", "is missing: give the dipole, or `turns` and `area`")
         return given
 
 

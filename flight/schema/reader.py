@@ -162,7 +162,7 @@ def _check_craft(craft: Craft, refuse: Refuse) -> None:
     try:
         problem = inertia_problem(craft.inertia_matrix())
     except ValueError:
-        problem = "mixes moments and rows: give three moments, or three rows of three values"
+        problem = "mixes numbers and rows: give three moments, or three rows of three values"
     if problem:
         refuse("craft.inertia", problem)
     for offset, edge, axis in zip(craft.centre_of_mass, craft.size, "xyz", strict=True):
@@ -231,7 +231,7 @@ def _check_strings(strings: SolarStringsSection, refuse: Refuse) -> None:
     for index, string in enumerate(strings.strings):
         place = f"solar_strings.strings[{index}]"
         if (string.address, string.channel) in inputs:
-            refuse(f"{place}.channel", f"is {string.channel}: this ADC channel measures another string")
+            refuse(f"{place}.channel", f"is {string.channel}: this ADC channel is used for another string")
         inputs.add((string.address, string.channel))
         if abs(math.hypot(*string.normal) - 1.0) > 1e-6:
             refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
@@ -253,7 +253,7 @@ def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
         refuse("power.low_battery", f"has {order} as critical, very_low and low: must be in rising order")
     if limits.low + limits.hysteresis > 1.0:
         top = f"is {limits.low:g}: with the hysteresis {limits.hysteresis:g}"
-        refuse("power.low_battery.low", f"{top} the charge would have to exceed 1")
+        refuse("power.low_battery.low", f"{top} the charge cannot reach it: reduce the limit")
     if config.camera is not None and limits.camera_period < config.camera.period:
         period = f"is {limits.camera_period:g} s: must be at least `camera.period`"
         refuse("power.low_battery.camera_period", f"{period}, {config.camera.period:g} s")
@@ -341,14 +341,14 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
     if commands.socket is None:
         refuse("link", "needs `commands.socket`, through which it passes commands to the flight")
     if link.udp is None and link.tcp is None and link.serial is None and link.kiss is None:
-        refuse("link", "has no line: give `udp`, `tcp`, `serial` or `kiss`")
+        refuse("link", "has no communication line: give `udp`, `tcp`, `serial` or `kiss`")
     depth = link.coding.reed_solomon
     if depth is not None and (link.frame_bytes % depth or link.frame_bytes > _DATA_SYMBOLS * depth):
         most = _DATA_SYMBOLS * depth
         cure = f"must be a multiple of `link.coding.reed_solomon` ({depth}), at most {most}"
         refuse("link.frame_bytes", f"is {link.frame_bytes}: {cure}")
     if link.call_signs is not None and link.kiss is None and not (link.serial and link.serial.kiss):
-        refuse("link.call_signs", "goes with `link.kiss` or `link.serial.kiss`")
+        refuse("link.call_signs", "needs `link.kiss` or `link.serial.kiss`")
     if link.idle_rate > link.rate:
         refuse("link.idle_rate", f"is {link.idle_rate:g}: must not be above `link.rate` ({link.rate:g})")
     if link.telemetry_to is not None and link.udp is None:
@@ -406,7 +406,7 @@ def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
                 f"{host} is not an IPv4 address: list the permitted senders in `link.peers`"
             ) from error
         if own.is_unspecified:
-            raise ValueError(f"{host} listens on every network: list the permitted senders in `link.peers`")
+            raise ValueError(f"{host} accepts every network: list the permitted senders in `link.peers`")
         networks.append(LOOPBACK if own.is_loopback else IPv4Network((own, _PREFIX), strict=False))
     return tuple(dict.fromkeys(networks))
 

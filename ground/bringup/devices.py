@@ -119,7 +119,7 @@ def _wrong_part(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Fi
         chip = chip_at(rig.wires.i2c(section.bus), section.address)
         if chip != named and chip:
             text = f"a chip of type {chip} answers at 0x{section.address:02x}"
-            return Finding(kind, "exchanged", text, f"exchange the addresses; this section expects a {named}")
+            return Finding(kind, "exchanged", text, f"exchange the addresses; expected here is a {named}")
     if kind == "gps":
         return _serial_finding(kind, section, rig, serial)
     return None

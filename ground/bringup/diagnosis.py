@@ -39,7 +39,7 @@ ALIKE = math.radians(15.0)
 _AXES = "xyz"
 _NEAR = 0.15
 """Relative difference up to which a measured value agrees with its expected value."""
-UNRECOGNISED = "unlike the configuration, cause not recognised"
+UNRECOGNISED = "different from the configuration, cause unknown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ def _noise_findings(part: str, values: FloatArray, sigma: float, unit: str) -> l
     if noise.max() > 3.0 * sigma:
         axis = _AXES[int(np.argmax(noise))]
         text = f"noise {noise.max():.2g} {unit} on {axis}, expected {sigma:.2g}"
-        cure = "keep the unit still and away from supplies and fans; replace it if the noise stays"
+        cure = "keep the unit still and away from supplies and fans; replace the unit if the noise stays"
         return [Finding(part, "noisy", text, cure)]
     if noise.min() < 1e-3 * sigma:
         axes = ", ".join(axis for axis, value in zip(_AXES, noise, strict=True) if value < 1e-3 * sigma)
@@ -200,7 +200,7 @@ def _rest_values(samples: Samples, strongest: float) -> list[Finding]:
             Finding(
                 f"{part}.magnetometer",
                 "wrong scale",
-                f"it measures {1e6 * field:.3g} uT at rest, the site has 15 to {1e6 * strongest:.0f} uT",
+                f"it measures {1e6 * field:.3g} uT at rest, expected are 15 to {1e6 * strongest:.0f} uT",
                 "check the unit and the range of its driver, and remove magnets and iron",
             )
         )
@@ -291,7 +291,7 @@ def _common(found: dict[str, FloatArray]) -> FloatArray | None:
 def _wrong_axes(part: str, axes: FloatArray) -> Finding:
     """Return the finding about a sensor, or the whole unit, with other axes than the configured ones."""
     whole, proper = part == "inertial_unit", np.linalg.det(axes) > 0
-    sensors = "all sensors have other axes" if whole else "its axes differ from the body's"
+    sensors = "the axes of all sensors are wrong" if whole else "its axes differ from the body's"
     if not np.allclose(np.abs(axes).max(axis=1), 1.0):
         vector = -to_rotation_vector(from_matrix(axes if proper else -axes))
         about = ", ".join(f"{value:.2f}" for value in vector / np.linalg.norm(vector))
@@ -303,7 +303,7 @@ def _wrong_axes(part: str, axes: FloatArray) -> Finding:
     elif proper or not whole:
         cure = "correct `sensors[].measures`; reset registers 23 and 26 of a VN-100 to the identity"
     else:
-        cure = "correct the axes in the driver, because no mounting mirrors a unit"
+        cure = "correct the axes in the driver: they are mirrored, which no mounting can cause"
     return Finding(part, "rotated" if proper else "mirrored", text, cure)
 
 
@@ -343,7 +343,7 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
     if (sizes < 0.2 * QUARTER).any():
         for axis in np.flatnonzero(sizes < 0.2 * QUARTER):
             text = f"a turn of 90 deg about {_AXES[axis]} gave {math.degrees(sizes[axis]):.1f} deg"
-            findings.append(Finding(part, "dead", text, "repeat the turn; replace the gyro if it stays so"))
+            findings.append(Finding(part, "dead", text, "repeat the turn; replace the gyro if this recurs"))
         return None
     ratio = sizes / QUARTER
     if (np.abs(np.log(ratio)) > math.log(1.35)).any():
@@ -599,7 +599,7 @@ def _without_field(part: str, name: str, drawn: float) -> Finding:
     text = f"coil {name}: no field, but {drawn:.2f} times the commanded current"
     if drawn > 1.2:
         return Finding(part, "short", text, "separate the coil's wires: the bridge drives a short circuit")
-    return Finding(part, "current without field", text, "check the plug: the current flows past the coil")
+    return Finding(part, "current without field", text, "check the plug: the current bypasses the coil")
 
 
 def _wrong_size(part: str, name: str, size: float, drawn: float) -> list[Finding]:
@@ -611,7 +611,7 @@ def _wrong_size(part: str, name: str, size: float, drawn: float) -> list[Finding
     text = f"coil {name}: field {size:.2f} times the expected one"
     text += f", current {drawn:.2f} times the commanded one" if known else ""
     if right_current:
-        cure = f"check turns and place of the coil; multiply its dipole moment per ampere by {size:.2f}"
+        cure = f"check turns and position of the coil; multiply its dipole moment per ampere by {size:.2f}"
         return [Finding(part, "wrong strength", text, cure)]
     if drawn > 0.0 and abs(drawn / size - 1.0) <= _NEAR:
         cure = f"multiply `resistance` by {1.0 / drawn:.2f}"

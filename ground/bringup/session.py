@@ -136,7 +136,7 @@ class Session:
             try:
                 self._open[kind] = self._opened(kind)
             except DeviceError as error:
-                finding = Finding(kind, "refused", error.message, "check power and wiring, and find it again")
+                finding = Finding(kind, "refused", error.message, "check power and wiring; repeat the step")
                 raise StepSkipped(f"{kind} could not be opened", finding) from error
         return self._open[kind]
 
@@ -357,7 +357,7 @@ def step_coils(session: Session) -> Outcome:
         "current": [[None if math.isnan(v) else round(v, 5) for v in row] for row in test.current.tolist()],
         "expected": "configured"
         if given is not None
-        else "along each coil's axis, of the coils' median size",
+        else "along each coil's axis, relative to the coils' median field",
     }
     arrays = {"response": found.response, "expected": found.expected, "strength": found.strength}
     arrays |= {"current": test.current, "commanded": commanded}
@@ -572,9 +572,9 @@ def step_lens(session: Session) -> Outcome:
         text = f"{field_deg:.3f} deg across the columns, configured {camera.field_of_view_deg:g}"
         findings.append(Finding("camera", "wrong field of view", text, "use the fragment's `camera`"))
     if found.mirrored:
-        text = "the frames show the mirrored sky"
+        text = "the frames are mirrored"
         findings.append(
-            Finding("camera", "mirrored", text, "read the rows in their order, or remove the mirror")
+            Finding("camera", "mirrored", text, "correct the order of the rows, or remove the mirror")
         )
     values = {"stars": calibration.stars, "rms_px": calibration.rms_after, "field_of_view_deg": field_deg}
     changes: dict[str, Any] = {}

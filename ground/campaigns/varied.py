@@ -155,7 +155,7 @@ def _case(
             "seed": int(chance.integers(2**31)),
         }
         return Case(f"flight-{seed[1]:05d}", seed, parameters)
-    raise UsageError(f"{_DRAWS} draws in a row were refused, the last one because {refusal}: vary less")
+    raise UsageError(f"{_DRAWS} draws in a row were refused, the last draw because {refusal}: vary less")
 
 
 def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, str]]:

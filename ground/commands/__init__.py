@@ -7,7 +7,7 @@ COMMANDS = {
         "show, change, save and load a flight's parameters",
         "satellite:configure_parameters",
     ),
-    "keys": ("operate", "make the keys of an authenticated link", "station:configure_keys"),
+    "keys": ("operate", "make keys for an authenticated link", "station:configure_keys"),
     "files": ("operate", "list, get and put the files of a satellite", "satellite:configure_files"),
     "renewal": ("operate", "sign, activate and confirm a renewal of a satellite", "renewal:configure"),
     "gateway": (
@@ -28,11 +28,11 @@ COMMANDS = {
     ),
     "report": ("fly", "report the performance of a run", "runs:configure_report"),
     "export": ("fly", "write a run's packets as CSV, Parquet or SQLite", "runs:configure_export"),
-    "campaign": ("fly", "fly a configuration many times with drawn values", "campaign:configure"),
-    "orbit": ("sky", "determine first orbits of the objects that a flight tracked", "runs:configure_orbit"),
+    "campaign": ("fly", "run a configuration many times with random values", "campaign:configure"),
+    "orbit": ("sky", "determine initial orbits of the objects that a flight tracked", "runs:configure_orbit"),
     "new-satellite": (
         "make",
-        "write the configuration of a satellite of one's own",
+        "write a configuration for your own satellite",
         "new_satellite:configure",
     ),
     "passes": ("plan", "predict the passes of a satellite over ground stations", "passes:configure_passes"),

@@ -58,16 +58,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=config_path, metavar="CONFIG", help="file or installed name")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the results (default: bringup)")
     parser.add_argument(
-        "--only", action="append", choices=tuple(STEPS), help="do this step again, and no other; repeatable"
+        "--only", action="append", choices=tuple(STEPS), help="repeat only this step (repeatable)"
     )
     parser.add_argument("--again", action="store_true", help="do all steps again")
     parser.add_argument(
         "--wired",
         type=config_path,
         metavar="CONFIG2",
-        help="emulate devices that are wired as this configuration describes, and differ from CONFIG",
+        help="emulate devices with the wiring of this configuration, which may differ from CONFIG",
     )
-    parser.add_argument("--yes", action="store_true", help="do not wait for answers of a person")
+    parser.add_argument("--yes", action="store_true", help="do not wait for a person's answers")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run, out=Path("bringup"))
 

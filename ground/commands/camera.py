@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
     if options.exposure is not None and not 0.0 < options.exposure <= 10.0:
         raise UsageError(f"--exposure {options.exposure}: give seconds, up to 10")
     if options.out is not None and options.out.suffix.lower() != ".png":
-        raise UsageError(f"--out {options.out}: frames are kept as PNG: give a name that ends in .png")
+        raise UsageError(f"--out {options.out}: frames are written as PNG: give a name that ends in .png")
     facts = []
     rate = None if options.rate is None else np.array(options.rate)
     with opened_camera(options.config, rate) as lone:
@@ -153,7 +153,7 @@ def _keep(out: Path, frame: Frame, count: int) -> Path:
 def _truth(frame: Frame, lone: OpenCamera, rate: FloatArray) -> dict[str, Any]:
     from ground.samples import sky_truth  # noqa: PLC0415 - loads the simulator
 
-    assert lone.attitude is not None, "only a simulated camera rotates"
+    assert lone.attitude is not None, "only a simulated camera can be rotated"
     middle_ns = frame.exposure_start_ns + frame.exposure_ns // 2
     focal_length = camera_model(lone.section).focal_length
     return sky_truth(rate, frame.exposure_ns * 1e-9, lone.attitude(middle_ns), focal_length)

@@ -17,7 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube campaign` to the parser."""
     parser.description = (
         "Fly a simulated configuration many times, each time with values that are drawn from stated "
-        "distributions, and with noise of its own. Prints a table of the figures that the report judges, "
+        "distributions, and with its own noise. Prints a table of the figures that the report judges, "
         "with the drawn value of the strongest influence, and lists failed flights with the command that "
         "flies each again. Draws the figures over the drawn values (extra `plots`). All cores fly, or a Dask "
         "cluster (extra `dask`). An interrupted campaign continues with the same command. Exit status 0 if "
@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         required=True,
         metavar="KEY=SPREAD",
-        help="value to draw, may be repeated: 10%% (uniform, relative), +-0.5 (uniform), 'normal 10%%' or "
+        help="random value, may be repeated: 10%% (uniform, relative), +-0.5 (uniform), 'normal 10%%' or "
         "'normal 0.5' (standard deviation), 1..5 (uniform), 'log 1..100' (uniform in the logarithm), 'a|b|c' "
         "(one of these). Each number of a list is drawn on its own",
     )
@@ -42,7 +42,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all draws (default 1)")
     parser.add_argument("--duration", type=positive, metavar="S", help="duration of each flight")
-    parser.add_argument("--only", default="", metavar="TEXT", help="only flights whose name contains it")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="run only flights with this text in their name"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
     parser.add_argument("--workers", type=count, metavar="N", help="processes (default: the cores)")
     parser.add_argument(

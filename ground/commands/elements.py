@@ -63,7 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
-        "--altitude", type=finite, metavar="KM", help="semi-major axis minus 6378 km, of an orbit"
+        "--altitude", type=finite, metavar="KM", help="altitude of an orbit: semi-major axis minus 6378 km"
     )
     source.add_argument(
         "--config", type=config_path, metavar="CONFIG", help="configuration with a simulated orbit"
@@ -142,7 +142,7 @@ def read_file(path: Path, satellite: int | None) -> NamedElements:
     chosen = [each for each in found if satellite in {None, each.number}]
     if len({each.number for each in chosen}) != 1:
         numbers = ", ".join(f"{each.number} {each.name}".strip() for each in found[:_LISTED])
-        cure = f"give one of them by --satellite: {numbers}{', ...' if len(found) > _LISTED else ''}"
+        cure = f"give one satellite by --satellite: {numbers}{', ...' if len(found) > _LISTED else ''}"
         raise UsageError(f"{path}: {len(chosen)} of {len(found)} element sets match: {cure}")
     return max(chosen, key=lambda each: TwoLineElements(*each.lines).epoch)
 

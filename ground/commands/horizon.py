@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     altitude = None if options.altitude is None else 1e3 * options.altitude
     if altitude is not None and altitude < LEAST_ALTITUDE:
         least = f"{1e-3 * LEAST_ALTITUDE:g} km"
-        raise UsageError(f"--altitude {options.altitude:g}: the method needs at least {least}")
+        raise UsageError(f"--altitude {options.altitude:g}: this method needs at least {least}")
     if options.method != "default":
         return _run_paper(options, pixels, camera)
     response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
@@ -149,7 +149,7 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
     rows, columns = pixels.shape
     if options.camera is None:
         if not 1.0 <= options.fov <= 150.0:
-            raise UsageError(f"--fov {options.fov:g}: a pinhole camera sees 1 to 150 degrees")
+            raise UsageError(f"--fov {options.fov:g}: a pinhole camera can have 1 to 150 degrees")
         return Pinhole.from_field_of_view(columns, rows, math.radians(options.fov))
     model = camera_model(configuration.load_camera(options.camera))
     if (rows, columns) != (model.rows, model.columns):
@@ -232,7 +232,7 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
         "--second",
         type=Path,
         metavar="IMAGE",
-        help="graphic: picture of the other camera; vector: the earlier picture",
+        help="graphic: image of the second camera; vector: earlier image",
     )
     paper.add_argument(
         "--turned",

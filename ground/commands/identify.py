@@ -105,7 +105,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--duration", type=positive, metavar="S", help=f"duration of the flight, s (default {DURATION:g})"
     )
-    parser.add_argument("--seed", type=seed_number, metavar="N", help="another seed of the simulation")
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation")
     parser.add_argument(
         "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
     )

@@ -72,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--link", metavar="ADDRESS", help=text)
     text = "show the packets of a recorded run, without a link; RUN is a folder that `run --out` wrote"
     way.add_argument("--recorded", type=Path, metavar="RUN", help=text)
-    text = "fly the simulation of CONFIG in real time with its link, which write below --out"
+    text = "run the simulation of CONFIG and its link in real time, with output below --out"
     way.add_argument("--fly", action="store_true", help=text)
     text = "with --recorded: replay S seconds of the run per second, instead of all packets at once"
     parser.add_argument("--speed", type=positive, metavar="S", help=text)
@@ -145,7 +145,7 @@ def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess
     until = time.monotonic() + _START_S
     while link.poll() is None and "link open" not in (folder / "link.log").read_text(encoding="utf-8"):
         if time.monotonic() > until:
-            raise FlightError(f"the link does not open: see {folder / 'link.log'}")
+            raise FlightError(f"the link could not be opened: see {folder / 'link.log'}")
         time.sleep(_ASK_S)
     words = ["run", str(config), "--realtime", "--archive", str(runs)]
     return {"the link": link, "the flight": _process([*command, *words], folder / "flight.log", stack)}

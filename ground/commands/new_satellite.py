@@ -80,7 +80,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         )
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default NAME.yaml)")
     parser.add_argument("--force", action="store_true", help="replace the file if it exists")
-    parser.add_argument("--json", action="store_true", help="print one JSON object, and ask nothing")
+    parser.add_argument("--json", action="store_true", help="print one JSON object without asking questions")
     parser.set_defaults(command=run)
 
 

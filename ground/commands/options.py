@@ -25,7 +25,7 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
         "--raw",
         type=raw_shape,
         metavar="CxRxB",
-        help="IMAGE is bare pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16",
+        help="IMAGE is raw pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16",
     )
 
 
@@ -37,7 +37,7 @@ def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> Non
         "--camera",
         type=config_path,
         metavar="YAML",
-        help="configuration (file or carried name) or calibration of the camera",
+        help="configuration (file or packaged name) or calibration of the camera",
     )
 
 

@@ -213,7 +213,7 @@ def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
         help="start at the best time within this time after --at, s (default 0)",
     )
     group.add_argument(
-        "--least-time", action="store_true", help="plan the shortest slew instead of that of least energy"
+        "--least-time", action="store_true", help="plan the slew of least duration instead of least energy"
     )
     for name in BODIES:
         group.add_argument(

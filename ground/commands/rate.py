@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
         "JPEG or FITS of 8 or 16 bits. The rate is of the camera, in its frame: boresight +z, x right, y "
         "down. "
-        "One picture leaves the sign of the rate open: --prior gives the approximate rate."
+        "A single picture does not determine the sign of the rate: --prior gives the approximate rate."
     )
     parser.epilog = "example: knightcube rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
     add_picture(parser)
@@ -107,7 +107,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
             )
         return camera_model(camera).ideal, exposure
     if not 0.1 <= fov_deg <= 120.0:
-        raise UsageError(f"--fov {fov_deg}: a pinhole camera sees 0.1 to 120 degrees")
+        raise UsageError(f"--fov {fov_deg}: a pinhole camera can have 0.1 to 120 degrees")
     return Pinhole.from_field_of_view(columns, rows, math.radians(fov_deg)), exposure
 
 

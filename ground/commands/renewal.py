@@ -66,9 +66,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signed.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the keys and the metadata")
     signed.add_argument("kind", choices=KINDS, help="kind of the artefact")
     signed.add_argument(
-        "path", type=Path, metavar="FILE", help="the artefact; for a release its folder of sources"
+        "path", type=Path, metavar="FILE", help="the artefact to sign; for a release, its folder of sources"
     )
-    text = "its version, above the last one (for a release by default 200 for 0.2.0, 10203 for 1.2.3)"
+    text = "version, above the last version (for a release by default 200 for 0.2.0, 10203 for 1.2.3)"
     signed.add_argument("--version", type=int, metavar="N", help=text)
     signed.add_argument("--back", action="store_true", help="permit a version that is not newer")
     signed.add_argument(
@@ -144,7 +144,7 @@ def replace_signing_key(folder: Path, also_root: bool) -> int:
     old = [_read_key(path) for path in sorted(folder.glob("root-*.pem"))]
     old = [signer for signer in old if signer.public_key.keyid in root.roles["root"].keyids]
     if not old:
-        raise UsageError(f"{folder}: no root-*.pem is a root key: bring one of them there")
+        raise UsageError(f"{folder}: no root-*.pem is a root key: copy a root key into this folder")
     new = _new_key(folder / "signing.pem", replaced=True)
     for role in _SIGNED_BY_ONE:
         for keyid in list(root.roles[role].keyids):
@@ -263,7 +263,7 @@ def _two_lines(data: bytes, path: Path) -> bytes:
 def _release_version(kind: str, source: Path) -> int:
     """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError for another kind."""
     if kind != "release":
-        raise UsageError(f"{kind}: needs its version, --version N")
+        raise UsageError(f"{kind}: give its version with --version N")
     text = read_text(source / "pyproject.toml")
     found = re.search(r'^version = "(\d+)\.(\d\d?)\.(\d\d?)"$', text, re.MULTILINE)
     if found is None:

@@ -28,7 +28,7 @@ def configure_report(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or of an archive of runs")
     parser.add_argument("other", type=Path, nargs="?", metavar="OTHER", help="a second run for a comparison")
-    parser.add_argument("--json", action="store_true", help="print one JSON object, and draw nothing")
+    parser.add_argument("--json", action="store_true", help="print one JSON object without drawing figures")
     parser.add_argument(
         "--figures", type=Path, metavar="DIR", help="folder of the figures (default RUN/figures)"
     )
@@ -117,7 +117,7 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
 def run_export(options: argparse.Namespace) -> int:
     """Write the exported files and print their paths."""
     if options.xml and options.tdm is None and options.aem is None:
-        raise UsageError("--xml is for a message: give it with --tdm FILE or --aem FILE")
+        raise UsageError("--xml needs a message: add --tdm FILE or --aem FILE")
     if options.tdm is not None:
         paths = write_tracking_data(read_run(options.run), options.tdm, options.xml)
     elif options.aem is not None:

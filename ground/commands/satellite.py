@@ -160,9 +160,9 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     deleted = words.add_parser("unschedule", help="with --link: delete a scheduled command")
     deleted.add_argument("number", type=int, metavar="N", help="number in list-schedule; 0 deletes all")
     words.add_parser("list-schedule", help="with --link: show the scheduled commands")
-    restarted = words.add_parser("restart", help="with --link: restart flight, link or board")
+    restarted = words.add_parser("restart", help="with --link: restart a process or the board")
     restarted.add_argument("part", choices=PARTS, metavar="PART", help=" or ".join(PARTS))
-    key = words.add_parser("new-key", help="with --link: change a key at both ends")
+    key = words.add_parser("new-key", help="with --link: change a key of ground and satellite")
     key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
     _allow_behind(words)
     parser.set_defaults(command=run_command)
@@ -502,7 +502,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
     got.add_argument("names", nargs="+", metavar="NAME", help="name in the list")
     for word, purpose, text in (
         ("put", "put a file on the satellite", "the file"),
-        ("use", "use a file that was put on the satellite", "local copy of the file, whose SHA-256 is sent"),
+        ("use", "use a file uploaded to the satellite", "local copy of the file, whose SHA-256 is sent"),
     ):
         placed = words.add_parser(word, help=purpose)
         placed.add_argument("kind", choices=KINDS, help="purpose of the file")
@@ -511,7 +511,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
             placed.add_argument(
                 "--replace", action="store_true", help="delete a file of this name on board first"
             )
-    deleted = words.add_parser("delete", help="delete a file that was put on the satellite")
+    deleted = words.add_parser("delete", help="delete a file that was uploaded to the satellite")
     deleted.add_argument("name", metavar="NAME", help="name in the list")
     for word in _OF_TRANSFERS:
         placed = words.add_parser(word, help=f"{word} a transfer on board")

@@ -325,5 +325,5 @@ def _coil_problem(coils: list[Coil]) -> str:
             f"{voltage:.3g} V at the current limit, above {_HIGHEST_VOLTAGE:g} V: give a lower current limit"
         )
     if largest_dipole(tuple(coils)) == 0.0:
-        return "these coils control one axis only: give coils on other axes too, such as axis=xyz"
+        return "these coils control only one axis: give also coils on other axes, such as axis=xyz"
     return ""

@@ -87,7 +87,7 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=tuple(METHODS),
         default=DEFAULT_METHOD,
-        help="of identification; all but the default need the field to 1.8 %%: see --fov-error",
+        help="identification; all methods except the default need the field to 1.8 %%: see --fov-error",
     )
     parser.add_argument(
         "--attitude",
@@ -100,8 +100,10 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
         "--centroid",
         choices=CENTROIDS,
         default=CENTROIDS[0],
-        help="of points: psf fits the point spread (default), window is the centre of mass, the others weigh "
-        "its pixels otherwise",
+        help=(
+            "centroid method for points: psf fits the point spread (default), window is the centre "
+            "of mass, the other methods weigh the pixels differently"
+        ),
     )
 
 
@@ -233,7 +235,7 @@ def _text(solution: StarSolution, seconds: float) -> str:
         f"by chance:        10^{solution.log10_false_alarm:.0f}",
     ]
     if solution.mirrored:
-        lines.append("mirrored:         yes; the attitude is that of the picture mirrored back")
+        lines.append("mirrored:         yes; the attitude belongs to the picture after mirroring")
     named = [PROPER_NAMES.get(hip) or f"HIP {hip}" for hip in stars.hip[:8].tolist()]
     lines.append(f"brightest:        {', '.join(named)}")
     lines += _motion_text(solution)

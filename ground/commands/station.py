@@ -140,7 +140,7 @@ def run_watch(options: argparse.Namespace) -> int:
     if folder.is_socket() or (":" in options.flight and not folder.exists()):
         return _watch_socket(options)
     runs = find_runs(folder)
-    return _watch(options, LogTail(runs[-1] if runs else folder), 0.0, "and no stop event in the log")
+    return _watch(options, LogTail(runs[-1] if runs else folder), 0.0, "and the log has no stop event")
 
 
 def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: str) -> int:
@@ -335,7 +335,7 @@ def run_console(options: argparse.Namespace) -> int:
         shown = _shown(options, stack)
         shown.read()
         page = f"http://127.0.0.1:{address.getsockname()[1]}/"
-        access = Access(lambda token: _print(f"for one more browser: {page}?token={token}"))
+        access = Access(lambda token: _print(f"for another browser: {page}?token={token}"))
         url = f"{page}?token={access.token}"
         _print(f"console of {shown.name}, for one browser: {url} (Ctrl-C ends)")
         if options.open:

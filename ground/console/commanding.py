@@ -149,7 +149,7 @@ class CommandForms:
                 raise UsageError(f"schedule: {fields['at']} has passed")
             command = commands.command_of_words(fields["words"])
             if command.packet.name not in layouts_for(self.body, self._layouts):
-                raise UsageError(f"schedule: this body does not obey {command.packet.name}")
+                raise UsageError(f"schedule: this body does not accept {command.packet.name}")
             self._check(command.packet.name, command.fields)
 
 
@@ -283,7 +283,7 @@ def flying(config: Path, out: Path) -> Iterator[str]:
     text = merged_text(read_text(config), str(config))
     parsed = parse(text, str(config))
     if parsed.simulation is None:
-        raise UsageError(f"{config}: flies real devices; start the flight separately and give its run folder")
+        raise UsageError(f"{config}: has real devices; start the flight separately and give its run folder")
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         socket = f"{place}/commands"
         if parsed.commands != Commands():

@@ -71,7 +71,7 @@ class RunFiles:
 
     def put(self, kind: str, name: str, data: bytes) -> Object:
         """Raise UsageError, because files are put on a satellite over its link."""
-        raise UsageError(f"{kind}/{name}: files are put on a satellite over its link: start with --link")
+        raise UsageError(f"{kind}/{name}: uploading files to a satellite needs its link: start with --link")
 
 
 class LinkFiles:

@@ -179,12 +179,12 @@ def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
     """
     host, origin = headers.get("Host", ""), headers.get("Origin")
     if not _OWN_HOST.fullmatch(host):
-        return "this console answers on loopback only"
+        return "this console accepts requests on loopback only"
     if origin is None:
         if not origin_required:
             return ""
-        return "this console answers its own page only: the request states no Origin"
-    return "" if origin == f"http://{host}" else "this console answers its own page only"
+        return "this console accepts requests of its own page only: the request states no Origin"
+    return "" if origin == f"http://{host}" else "this console accepts requests of its own page only"
 
 
 def application(console: Console, access: Access) -> web.Application:
@@ -471,9 +471,9 @@ async def _command_of(request: web.Request) -> tuple[str, dict[str, Any]]:
         body = await request.json()
         name, given = body["command"], body.get("values", {})
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise UsageError('a command is {"command": NAME, "values": {...}}') from error
+        raise UsageError('a command has the form {"command": NAME, "values": {...}}') from error
     if not isinstance(name, str) or not isinstance(given, dict):
-        raise UsageError('a command is {"command": NAME, "values": {...}}')
+        raise UsageError('a command has the form {"command": NAME, "values": {...}}')
     return name, given
 
 

@@ -135,11 +135,11 @@ class CommandStream:
         size = len(self._line)
         line = bytes(self._arrived[:size])
         if any(byte not in _TOKEN_CHARACTERS for byte in line[: size - 1]):
-            raise StreamError("its first bytes are not the token")
+            raise StreamError("the first bytes of the connection are not the token")
         if len(line) < size:
             return False
         if not hmac.compare_digest(line, self._line):
-            raise StreamError("its first bytes are not the token")
+            raise StreamError("the first bytes of the connection are not the token")
         del self._arrived[:size]
         self.authenticated = True
         return True
@@ -255,7 +255,7 @@ class Gateway:
             self._flush(line)
         for line, connection in self._without_token():
             if time.monotonic() - connection.opened > _TOKEN_S:
-                self._refuse(line, f"it did not send the token within {_TOKEN_S:g} s")
+                self._refuse(line, f"the client did not send the token within {_TOKEN_S:g} s")
 
     def close(self) -> None:
         """Close the listener and its connections; the terminal stays open."""

@@ -35,7 +35,7 @@ class Adis16470:
         if product in {0x0000, 0xFFFF}:
             raise NotResponding("ADIS16470", "the SPI line is silent: check power, wiring and chip select")
         if product != PRODUCT:
-            raise Refused("ADIS16470", f"PROD_ID is {product}: is another part connected?")
+            raise Refused("ADIS16470", f"PROD_ID is {product}: is another chip connected?")
         self.decimation = 24
 
     @property

@@ -355,7 +355,7 @@ class CoilOutputs:
         elif held:
             self.count(self.not_kept())
         else:
-            self.count(Refused(self._pca.name, "has lost its set-up (brown-out?)"))
+            self.count(Refused(self._pca.name, "has lost its register settings (brown-out?)"))
         return kept
 
     def keeps_written(self) -> bool:
@@ -365,7 +365,7 @@ class CoilOutputs:
 
     def not_kept(self) -> DeviceError:
         """Return an error that states that the outputs differ from the written counts."""
-        return Refused(self._pca.name, "does not keep what is written to its outputs")
+        return Refused(self._pca.name, "does not keep the values written to its output registers")
 
     def write(self, counts: Counts, braked: Axes) -> None:
         """Write signed counts and brakes without retries. Raises DeviceError."""

@@ -175,8 +175,8 @@ class Ina219:
         if found != self._config:
             raise Refused(
                 self.name,
-                f"Config reads 0x{found:04x} after 0x{self._config:04x} was written: is another part at this"
-                " address?",
+                f"Config reads 0x{found:04x} after 0x{self._config:04x} was written: is another chip "
+                "at this address?",
             )
         self._conversion_ns = self._clock.now_ns()
         lost, self._set_up_before = self._set_up_before, True

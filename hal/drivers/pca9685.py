@@ -113,8 +113,8 @@ class Pca9685:
             if found != wanted:
                 raise Refused(
                     self.name,
-                    f"{name} reads 0x{found:02x} after 0x{wanted:02x} was written: is another part at this"
-                    " address, or does the chip need a power cycle?",
+                    f"{name} reads 0x{found:02x} after 0x{wanted:02x} was written: is another chip at "
+                    "this address, or does the chip need a power cycle?",
                 )
 
     def is_configured(self) -> bool:

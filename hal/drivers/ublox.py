@@ -419,7 +419,7 @@ class UbloxReceiver:
         if pvt.valid & DATE_AND_TIME != DATE_AND_TIME:
             self._unresolved += 1
             self._cause = (
-                f"the receiver does not know date, time and leap seconds yet (valid {pvt.valid:#05b})"
+                f"the receiver has not yet determined date, time and leap seconds (valid {pvt.valid:#05b})"
             )
         elif not reading.valid:
             self._no_fix += 1
@@ -438,7 +438,7 @@ class UbloxReceiver:
         if not self._protocol and command in NAMES:
             self._use_valset(command != CFG_VALSET)
         version = f"{self._protocol:g}" if self._protocol else "unknown"
-        cure = "CFG-VALSET is needed from version 27 on, and CFG-PRT and CFG-MSG before"
+        cure = "versions from 27 on need CFG-VALSET, older versions CFG-PRT and CFG-MSG"
         self._refusal = f"the receiver refused {name} (ACK-NAK, protocol version {version}): {cure}"
 
     def _use_valset(self, wanted: bool) -> None:

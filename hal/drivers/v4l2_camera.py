@@ -491,7 +491,7 @@ class ExposureTiming:
                 self._absurd = self._stamp_ns = 0
                 raise CorruptData(
                     self._name,
-                    f"{_ABSURD} frames in a row have absurd time stamps, the last one "
+                    f"{_ABSURD} frames in a row have impossible time stamps, the last one "
                     f"{ahead_ns * 1e-9:.3f} s ahead of the monotonic clock: has uvcvideo been "
                     "loaded with clock=CLOCK_REALTIME?",
                 )
@@ -521,7 +521,7 @@ class ExposureTiming:
             raise Refused(
                 self._name,
                 f"frames come every {interval_ns * 1e-6:.1f} ms, so none is exposed for the "
-                f"{exposure_ns * 1e-6:.1f} ms that the camera claims: ask for a shorter exposure",
+                f"{exposure_ns * 1e-6:.1f} ms that the camera reports: configure a shorter exposure",
             )
         return True
 
@@ -612,7 +612,7 @@ def manual_exposures(name: str, device: VideoDevice, card: str) -> ControlRange:
     """
     exposures = device.control_range(EXPOSURE_ABSOLUTE)
     if exposures is None:
-        raise Refused(name, f"{card} has no exposure to be set in units of time (exposure_absolute)")
+        raise Refused(name, f"{card} has no exposure control in units of time (exposure_absolute)")
     if device.control_range(EXPOSURE_AUTO) is not None:
         device.set_control(EXPOSURE_AUTO, EXPOSURE_MANUAL)
     return exposures

@@ -140,7 +140,7 @@ def orbit_state(
     if semi_major_axis * (1.0 - eccentricity) <= EARTH_RADIUS:
         raise UsageError(
             f"the perigee lies {semi_major_axis * (1.0 - eccentricity):.0f} m from the Earth's centre:"
-            f" it must lie above {EARTH_RADIUS:.0f} m"
+            f" it must be above {EARTH_RADIUS:.0f} m"
         )
     latus_rectum = semi_major_axis * (1.0 - eccentricity**2)
     cosine, sine = math.cos(true_anomaly), math.sin(true_anomaly)

@@ -99,7 +99,7 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
     """
     points = np.asarray(points, dtype=float)
     if len(points) < 3:
-        raise NoCircleError(f"{len(points)} points: a circle needs three")
+        raise NoCircleError(f"{len(points)} points: a circle needs at least three")
     following = np.roll(points, -1, axis=0)
     squares = np.sum(points**2, axis=1)
     differences = points - following

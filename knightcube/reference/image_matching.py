@@ -66,7 +66,7 @@ def _match(observed: FloatArray, predicted: FloatArray, weight: FloatArray) -> F
         weight: (n,) weights of the stars with a sum of one.
     """
     if min(observed[:, 2].min(), predicted[:, 2].min()) <= 0.0:
-        raise AttitudeError("image matching needs all stars in front of the camera, seen and predicted")
+        raise AttitudeError("image matching needs all observed and predicted stars in front of the camera")
     image, catalogue = (vectors[:, :2] / vectors[:, 2:] for vectors in (observed, predicted))
     image_centre, catalogue_centre = weight @ image, weight @ catalogue
     u, v = image - image_centre, catalogue - catalogue_centre

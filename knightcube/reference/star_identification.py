@@ -188,8 +188,8 @@ def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField
     if steps > settings.scales:
         known = 100.0 * settings.scales * settings.scale_step
         raise FieldUnknown(
-            f"scale known to {50.0 * (high - low):.1f} %: the classical methods need {known:.1f} %;"
-            " the default method takes any scale"
+            f"scale known to {50.0 * (high - low):.1f} %: the classical methods need {known:.1f} %; "
+            "the default takes any scale"
         )
     edges = np.linspace(low, high, steps + 1)
     middles = 0.5 * (edges[1:] + edges[:-1])

@@ -80,7 +80,7 @@ class KVector:
     def _below(self, value: FloatArray) -> IntArray:
         """Return the number of keys below each value (m,)."""
         if np.isnan(value).any():
-            raise ValueError("a range of NaN: its ends must be numbers")
+            raise ValueError("a range has NaN as a bound: give two numbers")
         if not len(self.key):
             return np.zeros(len(value), dtype=np.int64)
         last = len(self.count) - 2

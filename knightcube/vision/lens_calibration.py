@@ -76,7 +76,7 @@ _FIRST_SETTINGS = SolveSettings()
 """Settings of the star tracker in the first pass, which recognises mirrored images."""
 _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
 """Settings of the star tracker in later passes, which do not accept mirrored images."""
-_REVERSED = "it shows the mirrored sky, but the other pictures do not"
+_REVERSED = "it is mirrored, but the other pictures are not"
 _MIN_USED = 0.5
 """Minimum fraction of accepted star matches for a frame to be included in the fit of the common lens."""
 
@@ -257,7 +257,7 @@ def _result(
     try:
         lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2, *shape)
     except LensError as error:
-        raise CalibrationError(f"the fitted parameters are not those of a lens: {error}") from error
+        raise CalibrationError(f"the fitted parameters do not describe a lens: {error}") from error
     offset = last.fit.parameters - expected
     squares = [
         length[chosen] ** 2 for length, chosen in zip(residual_lengths(frames, last.fit), used, strict=True)
@@ -521,7 +521,7 @@ def calibrate_lens(
     """
     images = [grey_image(image) for image in images]
     if len({image.shape for image in images}) != 1:
-        raise UsageError("a calibration needs images of one camera, all of one shape")
+        raise UsageError("a calibration needs images of one camera with the same shape")
     sky = default_index()
     model: CameraModel
     model, scale = camera_of_field(fov_deg, None, images[0].shape)

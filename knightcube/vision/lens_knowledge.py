@@ -618,7 +618,7 @@ class _FrameFit:
         if cut:
             (used,) = accepted_matches(residual_lengths([frame], fit))
         if np.count_nonzero(used) < _LEAST_MATCHED:
-            raise CalibrationError("fewer stars agree than a lens needs")
+            raise CalibrationError("too few stars agree for a fit of the lens")
         for _ in range(_MOST_ROUNDS):
             last = step([frame], fit, [used.astype(np.float64)], prior, expected)
             fit = last.fit

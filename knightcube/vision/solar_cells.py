@@ -145,7 +145,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     total = np.linalg.pinv(normals.T @ normals) @ normals.T @ np.maximum(shares, 0.0)
     length = float(np.linalg.norm(total))
     if not length > 0.5 * strings.dark:
-        return CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the currents cancel one another")
+        return CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the currents of opposite strings cancel")
     direction = total / length
     for _ in range(_MOST_STEPS):
         basis = tangent_basis(direction)

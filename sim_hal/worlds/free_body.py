@@ -694,7 +694,7 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
             inertia = inertia_matrix(craft.inertia)
             problem = inertia_problem(inertia)
         except ValueError:
-            problem = "mixes moments and rows: give three moments, or three rows of three values"
+            problem = "mixes numbers and rows: give three moments, or three rows of three values"
         if problem:
             raise ConfigError("simulation.free_body.craft.inertia", problem)
     coils = config.coils

@@ -151,7 +151,7 @@ def _damaged(service: Service) -> dict[str, Any]:
     config.write_text(corrupted(whole, 1, 1), encoding="utf-8")
     restarts = service.show("NRestarts")
     systemctl("start", "--no-block", SERVICE)
-    wait(lambda: service.show("StatusText").startswith("waiting to begin, 4 attempts"), 30.0)
+    wait(lambda: service.show("StatusText").startswith("waiting to start, 4 attempts"), 30.0)
     seen = {"driven": service.driven(), "state": service.show("ActiveState")}
     config.write_text(whole, encoding="utf-8")
     wait(service.driven, 30.0)

@@ -149,8 +149,12 @@ def test_a_damaged_record_keeps_releases_py_from_nothing(
     ("damage", "reason"),
     [
         pytest.param(_sparse, "is not a regular file of at most", id="sparse"),
-        pytest.param(_fifo, f"the link current names no complete release; {FIRST} flies", id="a FIFO"),
-        pytest.param(Path.unlink, f"the link current names no complete release; {FIRST} flies", id="missing"),
+        pytest.param(
+            _fifo, f"the symbolic link `current` names no complete release; {FIRST} flies", id="a FIFO"
+        ),
+        pytest.param(
+            Path.unlink, f"the symbolic link `current` names no complete release; {FIRST} flies", id="missing"
+        ),
     ],
 )
 def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_given(

@@ -43,8 +43,8 @@ def test_its_packets_are_those_of_the_tables() -> None:
         (Ping(7), 1, 130.0, "ping: safe state, flight tried in 20 s, try 1"),
         (ChangeMode(Mode.HOLD), 1, 110.0, "mode: safe state, flight tried in 0 s, try 1"),
         (ChangeMode(Mode.SAFE), 1, 3710.0, "safe: safe state, flight tried in 3600 s, try 1"),
-        (Slew(0.1), 0, 130.0, "the board is in its safe state: ping, safe and mode are obeyed"),
-        (Clear("x"), 0, 130.0, "the board is in its safe state: ping, safe and mode are obeyed"),
+        (Slew(0.1), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
+        (Clear("x"), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
     ],
 )
 def test_a_command_is_answered_once_and_mode_tries_the_flight(
@@ -109,5 +109,5 @@ def test_the_process_zeroes_the_coils_answers_and_ends_when_the_flight_is_to_be_
     assert (tmp_path / "calls").read_text(encoding="ascii") == "off\n"
     assert "try 1 in 30 s" in said
     assert "coils at zero" in said
-    assert "the flight is tried again, try 1" in said
+    assert "the flight is started again, attempt 1" in said
     assert (tmp_path / "tries").read_text(encoding="ascii").startswith("1 ")

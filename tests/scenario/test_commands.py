@@ -79,7 +79,7 @@ def test_nothing_latched_is_nothing_to_clear(tmp_path: Path) -> None:
     (clear,) = packed(Clear("too-hot"))
     run, _ = said(tmp_path, (1.0, clear))
     (row,) = run["command"]
-    assert to_text(row["text"]) == "clear too-hot: nothing is latched under 'too-hot'; latched: nothing"
+    assert to_text(row["text"]) == "clear too-hot: no event is latched as 'too-hot'; latched: nothing"
 
 
 def test_a_defect_of_a_command_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

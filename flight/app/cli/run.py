@@ -92,10 +92,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
     place.add_argument(
-        "--archive", type=Path, metavar="DIR", help="folder of a board's runs, to which this run is added"
+        "--archive", type=Path, metavar="DIR", help="folder of all runs of a board; this run is added"
     )
     parser.add_argument("--duration", type=float, metavar="S", help="another duration")
-    parser.add_argument("--seed", type=seed_number, metavar="N", help="another seed of the simulation")
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation")
     parser.add_argument(
         "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
     )
@@ -103,7 +103,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--devices",
         type=Path,
         metavar="FILE",
-        help="fly the simulated devices that `python -m sim_hal serve --facts FILE` serves; with --realtime",
+        help="fly the simulated devices of `python -m sim_hal serve --facts FILE`; with --realtime",
     )
     parser.add_argument(
         "--fault",

@@ -127,7 +127,7 @@ class PointingPaths:
         """
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
-            return "it holds values that are not finite"
+            return "the path contains values that are not finite"
         flown = table.below(self._fastest)
         if flown is None:
             turn, most = np.rad2deg([table.fastest, self._fastest])
@@ -233,7 +233,7 @@ class PointingTargetLaw:
 def target_of(target: Target) -> PointingTarget:
     """Return the pointing target of a satellite's numbered target."""
     law = target.law
-    assert isinstance(law, PointingTargetLaw), "only the satellite's own targets reach its planner"
+    assert isinstance(law, PointingTargetLaw), "the planner accepts only targets of a satellite"
     return law.target
 
 
@@ -259,9 +259,9 @@ class PointingTargets:
         Raises UsageError if the command gives a q2, as for the testbed.
         """
         if not isinstance(wanted, PointingTarget):
-            raise UsageError("a satellite points to a goal, not to a q2")
+            raise UsageError("a satellite accepts a pointing goal, not a q2")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
-            raise UsageError("no star camera looks for objects: `camera: {objects: {}}`")
+            raise UsageError("no star camera searches for objects: add `camera: {objects: {}}`")
         return Target(COMMANDED + number, PointingTargetLaw(wanted, self._paths))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:

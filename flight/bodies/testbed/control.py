@@ -169,7 +169,7 @@ class ThreadLaw:
 def law_of(target: Target) -> ThreadLaw:
     """Return the law of a target, which must be a target of the testbed."""
     law = target.law
-    assert isinstance(law, ThreadLaw), "only the testbed's own targets reach its planner"
+    assert isinstance(law, ThreadLaw), "the planner accepts only targets of the testbed"
     return law
 
 
@@ -465,7 +465,7 @@ class ThreadTargets:
         Raises UsageError if q2 is beyond its limit.
         """
         if isinstance(wanted, PointingTarget):
-            raise UsageError("the testbed goes to a q2, not to a direction")
+            raise UsageError("the testbed accepts a q2, not a direction")
         if not abs(wanted) <= Q2_LIMIT:  # NaN compares false
             raise UsageError(f"q2 {wanted} is not within +-{Q2_LIMIT}")
         return Target(COMMANDED + number, ThreadLaw(wanted))

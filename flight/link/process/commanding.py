@@ -194,7 +194,7 @@ class ControlLine(Generic[T]):
     def send(self, command: T, data: bytes, now_ns: int) -> str:
         """Send a command without waiting. Return the problem, or an empty text on success."""
         if len(self._waiting) >= AT_MOST:
-            return f"{AT_MOST} commands wait for their answers already"
+            return f"{AT_MOST} commands are already waiting for answers"
         self._count += 1
         path = self._folder / f"answer-{self._count}"
         with ExitStack() as stack:
@@ -335,7 +335,7 @@ class Timetable:
         """
         left = tuple(entry for entry in self._now.entries if number and entry.number != number)
         if number and len(left) == len(self._now.entries):
-            raise TimetableError(f"no command is scheduled under {number}")
+            raise TimetableError(f"no command is scheduled with the number {number}")
         self._store(left, self._now.last)
 
     def forget(self, number: int) -> None:

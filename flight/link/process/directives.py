@@ -42,7 +42,7 @@ LIST_FILES = telecommand(
     0x223,
     "Send the list of files on board, as the file listing.json",
     _ENTITY,
-    Field("under", f"S{LONGEST_NAME}", "-", "beginning of the listed names; empty lists all files"),
+    Field("under", f"S{LONGEST_NAME}", "-", "prefix of the listed names; an empty prefix lists all files"),
 )
 SEND_FILE = telecommand("send-file", 0x224, "Send a file down, or the missing parts of it", _ENTITY, _NAME)
 CANCEL_FILE = telecommand(
@@ -72,11 +72,11 @@ _KIND = Field("kind", "u1", "-", "kind of the artefact", states=tuple(enumerate(
 ACTIVATE = telecommand(
     "activate",
     0x2B0,
-    "Try a received and signed artefact until it is confirmed, and return to the previous one otherwise",
+    "Start the trial of a received, signed artefact; unless it is confirmed, the previous artefact returns",
     _NAME,
     Field("sum", "u1", "-", "SHA-256 of the bundle", SUM_BYTES),
     Field("hours", "f4", "h", "powered time within which the ground must confirm"),
-    Field("despite_faults", "u1", "-", "1 if a fault that the flight reports does not end the trial"),
+    Field("despite_faults", "u1", "-", "1 if the trial continues after a fault that the flight reports"),
     hazard="restarts flight and link with another configuration or release",
 )
 CONFIRM = telecommand("confirm", 0x2B1, "End the trial of an artefact and keep the artefact", _KIND)
@@ -204,7 +204,7 @@ class Activate:
         name: name of the bundle in the list of files.
         sum: SHA-256 of the bundle.
         hours: powered time (h) within which the ground must confirm the artefact.
-        despite_faults: 1 if a fault that the flight reports does not end the trial.
+        despite_faults: 1 if the trial continues after a fault that the flight reports.
     """
 
     name: str
@@ -424,7 +424,7 @@ def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
     """
     total = -(-len(packet) // _PORTION_BYTES)
     if len(packet) > LONGEST_IN_PORTIONS:
-        raise CommandError(f"{len(packet)} bytes are longer than any command")
+        raise CommandError(f"{len(packet)} bytes exceed the longest command")
     for number in range(total):
         data = packet[_PORTION_BYTES * number : _PORTION_BYTES * (number + 1)]
         portion = Portion(total, number + 1, data.ljust(_PORTION_BYTES, b"\0"))

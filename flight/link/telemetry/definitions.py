@@ -142,7 +142,7 @@ HOUSEKEEPING = Packet(
     "Counters and measurements of the devices and the loop",
     (
         Field("state", "u1", "-", "use of the coils", states=STEERING),
-        counter("imu_packets", "packets of the inertial unit accepted since start"),
+        counter("imu_packets", "accepted packets of the inertial unit since start"),
         counter("imu_bad_checksum", "packets of the inertial unit with a wrong checksum"),
         counter("imu_discarded_bytes", "bytes from the inertial unit that belonged to no packet"),
         counter("imu_out_of_range", "packets of the inertial unit with values out of range"),
@@ -156,7 +156,7 @@ HOUSEKEEPING = Packet(
         counter("frames", "frames received since start"),
         counter("streak_rates", "rates from star streaks that the estimate used"),
         counter("events", "events since start, including suppressed events"),
-        counter("records_lost", "records lost since start because their values did not fit their packet"),
+        counter("records_lost", "records lost since start because values were out of the packet's range"),
     ),
     version=2,
 )
@@ -176,7 +176,7 @@ HEALTH = Packet(
         Field("camera", "u1", "-", "frames of the camera", states=STREAMS, alarms=STREAM_ALARMS),
         Field("facts", "u8", "-", "conditions that the monitors found", bits=FACTS, alarms=FACT_ALARMS),
         Field("coils_in_use", "u1", "-", "coils in use by control", bits=COILS),
-        counter("fed", "number of times the watchdog was fed"),
+        counter("fed", "number of times the watchdog was reset"),
         counter("slips", "control cycles skipped since start"),
         counter("clock_steps", "number of changes of the wall clock"),
         Field("cpu_share", "f8", "-", "processor load of the control process; NaN if unknown"),
@@ -411,7 +411,7 @@ SPIN = Packet(
     "4 Hz",
     "Rate of a satellite in orbit from the magnetometer alone",
     (
-        flag("known", "whether enough samples of the field agree"),
+        flag("known", "whether enough samples of the field agree for a valid rate"),
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
         Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate about its worst axis"),
         Field("field", "f8", "T", "magnetic field, body axes", 3),
@@ -525,7 +525,7 @@ GPS_LINK = Packet(
 DIRECTIONS = Packet(
     "directions",
     0x117,
-    "each round of the wide cameras",
+    "each set of images of the wide cameras",
     "Directions of the Sun and nadir from the wide cameras of a satellite in orbit",
     (
         Field("middle_ns", "i8", "ns", "mission time of the middle of the exposures"),
@@ -544,7 +544,7 @@ DIRECTIONS = Packet(
 SEPARATE_ATTITUDES = Packet(
     "separate_attitudes",
     0x144,
-    "each round of the wide cameras, with `estimation.compare` only",
+    "each set of images of the wide cameras, with `estimation.compare` only",
     "Attitudes determined as by Meller et al., for comparison; quaternions rotate ICRS into body axes",
     (
         Field("middle_ns", "i8", "ns", "mission time of the attitudes"),

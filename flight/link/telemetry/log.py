@@ -357,14 +357,14 @@ class FlightLog:
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
             raise UsageError(
-                f"log budget of {budget_bytes} bytes: it must hold two segments of {segment_bytes} bytes"
+                f"log budget of {budget_bytes} bytes: give at least two segments of {segment_bytes} bytes"
             )
         self._stem = stem
         self._clock = clock
         self._queue_packets = queue_packets
         self._sync_period_ns = sync_period_ns
         self._queue: deque[bytes] = deque()
-        self._refused = 0  # packets lost because the queue was full or the log closed
+        self._refused = 0  # packets lost because the queue was full or the log was closed
         self._unwritten = 0  # packets lost after they were queued
         self._refused_ns = 0  # time at which `write` last lost a packet
         self._failure = ""  # reason why packets cannot be written now
@@ -430,7 +430,7 @@ class FlightLog:
         if busy_since_ns is not None and now_ns - busy_since_ns > _HUNG_DISK_S * 1e9:
             return "the disk does not answer"
         if self._refused and (self._closed or now_ns - self._refused_ns <= _RECENT_NS):
-            return self._past_failure or "the queue was full or the log closed"
+            return self._past_failure or "the queue was full or the log was closed"
         return ""
 
     def close(self) -> None:

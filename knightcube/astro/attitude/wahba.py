@@ -265,7 +265,9 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
         x, y, z = step.tolist()
         # The quaternion is not normalised, because its length error is below the rounding error.
         return multiply(np.array([0.5 * x, 0.5 * y, 0.5 * z, 1.0]), quaternion), loss
-    raise AttitudeError(f"no convergence in {_MAXIMUM_STEPS} steps: the directions may fit no attitude")
+    raise AttitudeError(
+        f"no convergence in {_MAXIMUM_STEPS} steps: the directions may not be consistent with any attitude"
+    )
 
 
 def adjugate(rows: Rows) -> Rows:

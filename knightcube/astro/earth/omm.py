@@ -105,7 +105,7 @@ def _two_lines(text: str) -> list[NamedElements]:
         line = lines.pop(0)
         if not line.startswith("1 "):
             if line.startswith("2 ") or name:
-                raise UsageError(f"{line!r}: line 1 of a two-line element set must stand here, or an OMM")
+                raise UsageError(f"{line!r}: expected line 1 of a two-line element set, or an OMM")
             name = line.removeprefix("0 ").strip()
             continue
         second = lines.pop(0) if lines else ""

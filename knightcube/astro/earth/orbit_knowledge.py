@@ -344,8 +344,8 @@ def _check_line(number: int, line: str) -> None:
     for column in _BLANKS[number - 1]:
         if line[column - 1] != " ":
             raise UsageError(
-                f"{line!r}: line {number}, column {column}: must be blank, but is {line[column - 1]!r}: the "
-                "fields stand in fixed columns"
+                f"{line!r}: line {number}, column {column}: must be blank, but is "
+                f"{line[column - 1]!r}: fields have fixed columns"
             )
     for field in _LINES[number - 1]:
         _check_field(number, line, field)

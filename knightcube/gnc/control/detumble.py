@@ -42,7 +42,7 @@ class WindowSchedule:
     def __post_init__(self) -> None:
         """Raise UsageError for a window without time to measure the field or to drive the coils."""
         if self.settle_ns < 0 or self.measure_ns <= 0 or self.act_ns <= 0:
-            raise UsageError(f"detumble window {self}: measuring and acting need time")
+            raise UsageError(f"detumble window {self}: `measure` and `act` must be above zero")
 
     @property
     def period_ns(self) -> int:

@@ -398,7 +398,7 @@ def pointing_table(
     count = len(ahead.initial.times) - 1
     if count < 2 or len(steps) <= count or not np.allclose(steps, steps[0], rtol=1e-6):
         raise UsageError(
-            "a pointing table needs three or more equally spaced times and a preview beyond them"
+            "a pointing table needs at least three equally spaced times, and predictions beyond the last time"
         )
     dt = float(steps[0])
     state, dipole = step_costs(weights, dt)

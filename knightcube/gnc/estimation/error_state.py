@@ -72,7 +72,7 @@ class ErrorState:
         """Place the blocks one after the other. Raises UsageError for two blocks with one name."""
         self.sizes = {block.name: len(block.prior) for block in blocks}
         if len(self.sizes) < len(blocks):
-            raise UsageError(f"two blocks of the error state have one name: {[b.name for b in blocks]}")
+            raise UsageError(f"two blocks of the error state have the same name: {[b.name for b in blocks]}")
         self.size = sum(self.sizes.values())
         self.prior: FloatArray = np.zeros((self.size, self.size))
         self.walks: FloatArray = np.zeros(self.size)

@@ -141,7 +141,7 @@ def rotation_axis(
     Raises ValueError for fewer than two streaks.
     """
     if len(first) < 2:
-        raise ValueError(f"an axis needs two streaks or more, not {len(first)}")
+        raise ValueError(f"a rotation axis needs at least two streaks, not {len(first)}")
     chord = second - first
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)
     i, j = np.triu_indices(min(len(chord), _MOST_PROPOSERS), k=1)

@@ -169,7 +169,7 @@ def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixe
         return f"the darkest pixels have {100.0 * samples.floor:.0f} % of the brightness of its bright side"
     level = float(np.median(samples.level[sky]))
     if level > _DARKEST:
-        return f"half of its dark side is brighter than {100.0 * level:.0f} % of its bright side"
+        return f"half of the dark side of the limb is brighter than {100.0 * level:.0f} % of its bright side"
     # The median absolute value of Gaussian noise is 0.6745 standard deviations.
     mottle = float(np.median(np.abs(samples.mottle[sky]))) / 0.6745
     if mottle > max(_SMOOTHEST, _NOISES * samples.noise):
@@ -381,7 +381,7 @@ def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: Fl
     lit = within & (sine > math.sin(_DAY))
     dark = beyond | (within & (sine < -math.sin(_TWILIGHT + _MARGIN)))
     if mostly(~look.bright[lit]):
-        return "it is dark where the sunlit Earth is"
+        return "the image is dark where the sunlit Earth should be"
     if float((look.rays @ sun).max()) < math.cos(_STRAY_LIGHT) and mostly(look.bright[dark]):
-        return "it is bright where there is only sky or night"
+        return "the image is bright where only sky or night should be"
     return ""

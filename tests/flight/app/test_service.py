@@ -73,8 +73,8 @@ def test_what_may_pass_is_waited_for_and_reported(
         assert attempts.open == 1
     assert attempts.open == 0
     assert clock.now_ns() == pytest.approx(3e9)
-    assert retry.summary() == "begun at attempt 5 after 3.0 s: commands.udp: not up yet"
-    assert capsys.readouterr().err.count("knightcube: cannot begin yet: ") == 4
+    assert retry.summary() == "started at attempt 5 after 3.0 s: commands.udp: not up yet"
+    assert capsys.readouterr().err.count("knightcube: cannot start yet: ") == 4
 
 
 @pytest.mark.parametrize("error", [ConfigError("flight.yaml:3", "`coils` is wrong"), ZeroDivisionError()])
@@ -114,7 +114,7 @@ def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_th
     timer.join()
     (run,) = (tmp_path / "runs").iterdir()
     events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(run)["event"]}
-    assert events["start-waited"].startswith("begun at attempt ")
+    assert events["start-waited"].startswith("started at attempt ")
     assert StateStore(tmp_path / "state", lambda *_: None).load().boot_count == 1
 
 

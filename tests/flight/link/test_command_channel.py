@@ -250,7 +250,7 @@ def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(pla
         open_unix(place)
     second.close()
     place.write_text("precious")
-    with pytest.raises(UsageError, match="another file has this path"):
+    with pytest.raises(UsageError, match="a file that is not a socket has this path"):
         open_unix(place)
     assert place.read_text() == "precious"
 

@@ -343,6 +343,6 @@ def test_the_throttle_writes_one_event_of_a_kind_in_its_time_with_the_number_hel
     assert log.count == 6
     assert log.counts == {events.CYCLE_SLIP: 5, events.BLIND: 1}
     log.flush(200)
-    assert written[3:] == [("cycle-slip", 200, 0, "the last one held back by the throttle")]
+    assert written[3:] == [("cycle-slip", 200, 0, "the last event suppressed by the rate limit")]
     log.flush(300)
     assert len(written) == 4

@@ -140,7 +140,7 @@ def test_pictures_that_an_attitude_denies_are_reported_where_one_judges_them() -
     bench.denied = None
     bench.fly(11)
     assert bench.false == []
-    bench.denied = {1: "it is dark where the sunlit Earth is"}
+    bench.denied = {1: "the image is dark where the sunlit Earth should be"}
     bench.fly(11)
     assert bench.false
     assert all(bench.false)

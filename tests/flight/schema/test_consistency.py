@@ -48,7 +48,7 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
     [
         (
             "udp: '0.0.0.0:5000'",
-            r"`link.udp` 0\.0\.0\.0 listens on every network: list the permitted senders",
+            r"`link.udp` 0\.0\.0\.0 accepts every network: list the permitted senders",
         ),
         ("tcp: 'board:5000'", r"`link.tcp` board is not an IPv4 address: list the permitted senders"),
         ("udp: '10.0.0.1:5000', peers: [10.0.0.5/24]", r"`link.peers` 10\.0\.0\.5/24 has host bits"),
@@ -73,7 +73,7 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
         ("kiss: '0.0.0.0:8001'", "`link.kiss` 0.0.0.0"),
         (
             "serial: {device: /dev/ttyS1}, call_signs: [A, B]",
-            "`link.call_signs` goes with `link.kiss` or `link.serial.kiss`",
+            "`link.call_signs` needs `link.kiss` or `link.serial.kiss`",
         ),
         ("kiss: '127.0.0.1:8001', call_signs: [OK0GND, OK0SAT-16]", "`link.call_signs"),
     ],

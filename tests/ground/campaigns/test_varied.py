@@ -133,7 +133,7 @@ def test_a_key_that_holds_no_number_is_refused(text: str, reason: str) -> None:
 
 def test_draws_that_are_always_refused_end_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(varied, "_DRAWS", 3)
-    with pytest.raises(UsageError, match=r"3 draws in a row were refused, the last one because .*inertia"):
+    with pytest.raises(UsageError, match=r"3 draws in a row were refused, the last draw because .*inertia"):
         cases(DEMO, "plant.inertia=-2..-1")
 
 

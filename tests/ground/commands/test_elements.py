@@ -132,7 +132,7 @@ def test_an_omm_is_read_into_a_configuration(tmp_path: Path) -> None:
     several = command("elements", "--read", path)
     assert several.returncode == 2
     assert (
-        "2 of 2 element sets match: give one of them by --satellite: 123456 MINE, 5 OTHER" in several.stderr
+        "2 of 2 element sets match: give one satellite by --satellite: 123456 MINE, 5 OTHER" in several.stderr
     )
     absent = command("elements", "--read", path, "--satellite", "7")
     assert (absent.returncode, "0 of 2 element sets match" in absent.stderr) == (2, True)

@@ -88,7 +88,7 @@ def test_a_mistake_is_one_line_and_exit_status_2(flown: tuple[Path, dict[str, ob
 def test_a_flight_too_short_to_fit_is_one_line_and_exit_status_1(tmp_path: Path) -> None:
     done = command("identify", DEMO, "--duration", "3", "--run", tmp_path / "run", "--out", tmp_path / "x")
     assert done.returncode == 1
-    assert "the flight is too short" in done.stderr
+    assert "the run is too short" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "x").exists()
 

@@ -102,7 +102,7 @@ def test_a_saved_table_is_loaded_again_as_a_whole(
     assert flight.modes[-1] == demo_config(4.0).modes
     saved.write_text(saved.read_text().replace("hold_error", "#"))
     assert main(["parameters", "--to", str(tmp_path / "s"), "--load", str(saved)]) == 2
-    assert "modes.hold_error is missing: a table is loaded as a whole" in capsys.readouterr().err
+    assert "modes.hold_error is missing: give all parameters of the table" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -263,6 +263,6 @@ def test_the_command_obeys_whoever_has_read_its_file_and_nobody_else(opened: Ope
         assert opened.command() is not None
     opened.process.terminate()
     assert opened.process.wait(PATIENCE_S) == 0
-    reason = "connection closed: its first bytes are not the token (closed so far: 1)"
+    reason = "connection closed: the first bytes of the connection are not the token (closed so far: 1)"
     assert opened.errors.read_text() == f"knightcube: gateway: {reason}\n"
     assert not path.exists()

@@ -41,14 +41,16 @@ class Goal(IntEnum):
         for goal in cls:
             if goal.label == label:
                 return goal
-        raise UsageError(f"{label!r} is not a goal: choose one of {', '.join(goal.label for goal in cls)}")
+        raise UsageError(
+            f"{label!r} is not a pointing goal: choose one of {', '.join(goal.label for goal in cls)}"
+        )
 
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
 """Permitted numbers of arguments for goals that have arguments, the largest number last."""
 ROLLS = {
-    Goal.INERTIAL: "an inertial attitude has its roll in its quaternion",
-    Goal.OBJECT: "an object is followed with a free roll",
+    Goal.INERTIAL: "an inertial attitude includes its roll: omit the roll",
+    Goal.OBJECT: "an object is tracked with a free roll: omit the roll",
 }
 """Goals for which a roll cannot be given, each with the reason."""
 

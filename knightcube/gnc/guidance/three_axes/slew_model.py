@@ -590,7 +590,7 @@ def check(task: SlewTask) -> None:
     if not np.all(craft.limit > 0.0):
         raise PlanningError(f"the dipole limits are {craft.limit.tolist()} A m^2: all must be above zero")
     if np.linalg.eigvalsh(heat_matrix(craft.weights)).min() <= 0.0:
-        raise PlanningError("the heat of every dipole moment must be above zero")
+        raise PlanningError("the heating power of every dipole moment must be above zero")
     if np.linalg.eigvalsh(craft.inertia).min() <= 0.0:
         raise PlanningError("the inertia must be positive definite")
     low, high = HORIZON_RANGE

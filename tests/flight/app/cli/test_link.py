@@ -201,7 +201,7 @@ def test_a_ground_station_without_keys_commands_by_the_gateway_and_knows_its_com
 
 def test_one_link_at_a_time_has_the_counters(lines: dict[str, str]) -> None:
     with (
-        pytest.raises(UsageError, match="another link process has these counters"),
+        pytest.raises(UsageError, match="another link process uses these counters"),
         Vault(Path(lines["place"]) / "keys" / "satellite").owned(),
     ):
         pytest.fail("two at a time")

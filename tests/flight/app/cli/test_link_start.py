@@ -101,7 +101,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
         service.notifies("EXTEND_TIMEOUT_USEC=")
     while "link open on UDP" not in (line := service.says("")):
         assert "cannot begin yet" in line
-    assert "begun at attempt" in line
+    assert "started at attempt" in line
     service.notifies("READY=1")
     for _ in range(2):
         service.notifies("WATCHDOG=1")
@@ -148,7 +148,7 @@ def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callabl
     with Vault(away).owned():
         keys.rmdir()
         away.rename(keys)
-        while "another link process has these counters" not in (line := service.says("cannot begin yet")):
+        while "another link process uses these counters" not in (line := service.says("cannot begin yet")):
             assert "no such folder" in line or "no key can be read" in line
     while "link open on UDP" not in (line := service.says("")):
         assert "cannot begin yet" in line
@@ -166,7 +166,7 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
     service.process.terminate()
     assert service.process.wait(_LONGEST_S) == 0
     assert service.process.stderr is not None
-    assert "stopped before it could begin: link.tcp" in service.process.stderr.read()
+    assert "stopped before the start: link.tcp" in service.process.stderr.read()
 
 
 def test_each_call_of_a_start_fails_once_and_the_whole_disk_for_a_while(tmp_path: Path) -> None:

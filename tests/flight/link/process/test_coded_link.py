@@ -206,7 +206,7 @@ def test_a_portion_without_the_portion_before_it_is_refused(short: BothEnds, por
     counter = short.terminal.send(directives.pack(portion, 1))
     short.turn()
     assert short.stages(counter) == ["refused"]
-    with pytest.raises(FlightError, match="600 bytes are longer than any command"):
+    with pytest.raises(FlightError, match="600 bytes exceed the longest command"):
         short.terminal.send(bytes(600))
 
 

@@ -153,7 +153,7 @@ def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> 
     assert "is not a UTC" in refused("tomorrow", "ping 1")
     assert "is not a command" in refused(later, "schedule x ping")
     assert "must lie within" in refused(later, "slew 3")
-    assert "no command is scheduled under 5" in texts(link, send(link, Deletion(5)))[-1]
+    assert "no command is scheduled with the number 5" in texts(link, send(link, Deletion(5)))[-1]
     for _ in range(MOST_ENTRIES):
         link.terminal.send(directives.pack(Scheduled(later, "ping 1"), 1))
     link.turn()
