@@ -27,7 +27,7 @@ ExecStart=/bin/sh -c ": </dev/net/tun"
 
 
 class Service:
-    """The service as systemctl shows it, and the coils of the emulated devices."""
+    """State of the service by systemctl, and the coils of the emulated devices."""
 
     def __init__(self, bus: RemoteI2cBus) -> None:
         self._bus = bus
@@ -39,14 +39,14 @@ class Service:
         return int(self.show("MainPID"))
 
     def driven(self) -> bool:
-        """Return whether a coil carries current; the devices of a busy machine may take a moment to say."""
+        """Return whether a coil carries current; the answer may be delayed on a busy machine."""
         for _ in range(50):
             with contextlib.suppress(TimeoutError):
                 return any(self._bus.call("currents"))
         raise TimeoutError("the emulated devices do not answer")
 
     def hurt(self, act: Callable[[int], None]) -> dict[str, Any]:
-        """Do something to the running service; return when the coils went to zero and when it flew again."""
+        """Disturb the running service, and return the times of zero current and of the next start."""
         wait(self.driven, 20.0)
         old = self.pid()
         begun = time.monotonic()
@@ -54,7 +54,7 @@ class Service:
         zero = again = None
         while (since := time.monotonic() - begun) < 30.0 and again is None:
             if self.driven():
-                # The next process drives the coils again by right, from its first cycle on.
+                # The next process may drive the coils again from its first cycle on.
                 if self.pid() in (old, 0):
                     zero = None
                 elif self.show("ActiveState") == "active":
@@ -71,7 +71,7 @@ def systemctl(*words: str) -> str:
 
 
 def wait(condition: Callable[[], bool], patience: float) -> float:
-    """Wait for a condition; return how long. Raises TimeoutError."""
+    """Wait for a condition, and return the duration. Raises TimeoutError."""
     begun = time.monotonic()
     while not condition():
         if time.monotonic() - begun > patience:
@@ -81,7 +81,7 @@ def wait(condition: Callable[[], bool], patience: float) -> float:
 
 
 def _last_words() -> str:
-    """Return why systemd ran the last ExecStopPost, as the stand-in for i2cset has noted."""
+    """Return the reason for the last ExecStopPost that the replacement of i2cset has recorded."""
     results = [
         word for word in Path("/share/result.txt").read_text(encoding="ascii").split() if word != "before"
     ]
@@ -89,7 +89,7 @@ def _last_words() -> str:
 
 
 def play(facts: Path) -> dict[str, Any]:
-    """Play the whole scenario; return what was seen."""
+    """Run the whole scenario, and return the observations."""
     systemctl("start", "knightcube-devices.service")
     wait(facts.exists, 20.0)
     service = Service(open_bus(json.loads(facts.read_text(encoding="utf-8"))["socket"]))
@@ -117,7 +117,7 @@ def play(facts: Path) -> dict[str, Any]:
 
 
 def _flight(*words: str) -> str:
-    """Return what a command of the flight software printed."""
+    """Return the output of a command of the flight software."""
     done = subprocess.run(
         [sys.executable, "-m", "flight", *words], capture_output=True, text=True, check=False
     )
@@ -161,7 +161,7 @@ def _damaged(service: Service) -> dict[str, Any]:
 
 
 def _devices_closed() -> bool:
-    """Return whether the service's device policy keeps a unit from a device that others may open."""
+    """Return whether the service's device policy refuses a device that other processes may open."""
 
     def opens(policy: str) -> bool:
         Path("/run/systemd/system/probe.service").write_text(_PROBE.format(policy), encoding="ascii")
@@ -173,7 +173,10 @@ def _devices_closed() -> bool:
 
 
 def _broken(service: Service) -> dict[str, Any]:
-    """Take the releases away: the safe state takes over; give them back: the safe state tries the flight."""
+    """Remove the releases, so that the safe state starts.
+
+    Restore them, so that it starts the flight again.
+    """
     systemctl("reset-failed", SERVICE)
     systemctl("start", SERVICE)
     wait(service.driven, 20.0)

@@ -39,7 +39,7 @@ def updated(tmp_path_factory: pytest.TempPathFactory) -> FakeBoard:
 
 @pytest.fixture
 def board(updated: FakeBoard, tmp_path: Path) -> FakeBoard:
-    """Return a copy of a board whose current release flies as "new" and whose previous one as "old"."""
+    """Return a copy of a board with the current release "new" and the previous release "old"."""
     shutil.copytree(updated.root, tmp_path / "root", symlinks=True)
     (tmp_path / "root/state").mkdir()
     return FakeBoard(tmp_path / "root")
@@ -54,7 +54,7 @@ def _python(board: FakeBoard, link: str) -> Path:
 
 
 def _replace(path: Path, content: str | bytes) -> None:
-    """Put another file of the same size, or a longer one, in a file's place."""
+    """Replace a file by a file of the same size or by a longer file."""
     size = path.stat().st_size
     path.unlink()
     path.write_bytes((content if isinstance(content, bytes) else content.encode()).ljust(size, b"\n"))
@@ -119,7 +119,7 @@ def test_without_a_usable_answer_of_releases_py_the_current_release_flies_and_sa
 
 
 def test_an_answer_counts_although_releases_py_does_not_end(board: FakeBoard) -> None:
-    """The count of the start waits for a disk, which may hang."""
+    """The program that counts the start waits for a disk, which may hang."""
     _chooser(board).write_text(
         f"import time\nprint('{FIRST} as asked', flush=True)\ntime.sleep(600)", encoding="ascii"
     )
@@ -167,7 +167,7 @@ def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_giv
 
 
 _NO_IMPORT = '    *"import flight"*) exit 1 ;;'
-"""Line of the stand-in for Python by which it cannot import the flight."""
+"""Line of the replacement of Python that makes the import of the flight fail."""
 
 PYTHONS: dict[str, Callable[[Path], None]] = {
     "missing": Path.unlink,
@@ -198,7 +198,7 @@ def test_a_release_that_cannot_start_gives_way_to_the_other(
 
 
 def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
-    """Starts of a proven release are not counted."""
+    """Starts of an accepted release are not counted."""
     (board.root / "state" / TRIALS).write_bytes(starts_record({}, SECOND))
     PYTHONS["cannot import the flight"](_python(board, "current"))
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4
@@ -275,7 +275,7 @@ def _start(board: FakeBoard) -> subprocess.Popen[str]:
     ],
 )
 def test_the_flight_is_the_process_that_systemd_started(board: FakeBoard, chooser: str, note: str) -> None:
-    """Type=notify, the watchdog and SIGTERM go by the main process."""
+    """Type=notify, the watchdog and SIGTERM need the flight as the main process."""
     python = _python(board, "current")
     flight = 'echo "$$ $9 $KNIGHTCUBE_RELEASE $KNIGHTCUBE_RELEASE_NOTE"; exec sleep 600'
     ordinary = 'echo "flies $(cat "$packages/flight/label")"'
@@ -337,7 +337,7 @@ def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBo
 
 
 def _damaged_copy(board: FakeBoard, name: str) -> str:
-    """Start the flight as its unit does; return what flew and whether the damage of a file was reported."""
+    """Start the flight as its unit does, and return the release and whether a damaged file was reported."""
     (board.root / "state" / TRIALS).unlink(missing_ok=True)
     label, said = board.fly(*board.unit_words("knightcube.service"))
     folder = board.prefix / name.partition("/")[0]

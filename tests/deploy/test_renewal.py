@@ -63,7 +63,7 @@ def test_without_confirmation_the_time_with_power_decides(board: RenewedBoard) -
     before, request = board.flown(), activated(board, hours=1.0)
     board.step(3500.0)
     assert board.flown() == "second"
-    board.now = 0.0  # another boot: its time counts from the beginning
+    board.now = 0.0  # new boot: its powered time counts from zero
     board.step(60.0)
     assert board.flown() == "second"
     board.step(200.0)

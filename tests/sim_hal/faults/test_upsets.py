@@ -114,12 +114,12 @@ def test_the_monitors_calibration_is_used_by_nobody() -> None:
     [
         (75, 0),  # no port
         (75, 9),  # ports that there are not
-        (75, 20),  # more often than the line carries
+        (75, 20),  # rate above the capacity of the line
         (75, 24),  # too seldom for anybody
         (75, 32),  # without a group
-        (75, 41),  # a group that the unit does not have
+        (75, 41),  # group that the VN-100 does not have
         (75, 52),  # without the attitude
-        (75, 62),  # fields that the unit does not have
+        (75, 62),  # fields that the VN-100 does not have
     ],
 )
 def test_a_unit_whose_output_is_upset_is_set_up_again_within_two_seconds(register: int, bit: int) -> None:
@@ -135,7 +135,7 @@ def test_a_unit_whose_output_is_upset_is_set_up_again_within_two_seconds(registe
 
 @pytest.mark.parametrize(
     ("register", "bit"),
-    # Another rate, another field, and lines beside packets.
+    # Upsets that change the rate, a field, or add lines to the packets.
     [*((75, bit) for bit in (16, 17, 18, 19, 21, 22, 23, 48)), (6, 1), (6, 3)],
 )
 def test_a_unit_that_says_more_or_less_than_it_was_asked_is_set_up_again(register: int, bit: int) -> None:
@@ -162,7 +162,7 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
 
 @pytest.mark.parametrize("name", UPSETS)
 def test_what_is_not_said_is_drawn(name: str) -> None:
-    """Of many draws some change the registers, and not all the same way."""
+    """Of many random upsets, some change the registers in different ways."""
     lock = build_lockstep(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
     hardware = lock.hardware
     assert hardware.monitor is not None

@@ -104,7 +104,7 @@ def test_the_errors_of_craft_and_coils_are_as_large_as_asked_for() -> None:
 
 
 def test_drag_on_a_box_is_its_arm_across_the_force_on_its_shadow() -> None:
-    """For a convex box the torque of the flow is that of the whole force at the middle of the box."""
+    """For a convex box, the aerodynamic torque equals that of the total force at the centre of the box."""
     arm, flow = np.array([0.01, -0.005, 0.015]), np.array([5000.0, 4000.0, -3000.0])
     faces = box((0.3, 0.1, 0.2), arm, np.zeros(6))
     shadow = np.array([0.02, 0.06, 0.03]) @ np.abs(flow)
@@ -285,7 +285,7 @@ FOLDER = Path(__file__).resolve().parents[3] / "config"
 
 @pytest.mark.parametrize("name", ["orbit.yaml", "orbit_3u.yaml", "orbit_object.yaml", "orbit_object_1u.yaml"])
 def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
-    """Errors of a few per cent are drawn by the seed; other coils than believed are a wrong configuration."""
+    """The seed draws errors of a few per cent; entirely different coils would be a wrong configuration."""
     config = as_orbit(reader.load(FOLDER / name))
     text = (FOLDER / name).read_text(encoding="utf-8")
     section = reader.simulation_section(text, name, Simulation)
