@@ -146,7 +146,7 @@ def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
         (Goal.GROUND, (2.0, 0.0), None, "beyond a pole"),
         (Goal.GROUND, (math.nan, 0.0), None, "finite"),
         (Goal.INERTIAL, (1.0, 1.0, 0.0, 0.0), None, "length 1"),
-        (Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8), 0.1, "its roll in its quaternion"),
+        (Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8), 0.1, "an inertial attitude includes its roll"),
         (Goal.SUN, (), math.inf, "finite"),
         (Goal.OBJECT, (1.0,), None, "takes 0 or 2 numbers"),
         (Goal.OBJECT, (0.0, 2.0), None, "beyond a pole"),

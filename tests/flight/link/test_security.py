@@ -338,7 +338,7 @@ def test_keys_are_for_their_owner_only_and_not_in_what_is_printed(sky: Vault, tm
     assert KEYS[1].hex() not in repr(sky.read(1))
     assert repr(KEYS[1]) not in repr(sky.read(1))
     path.chmod(0o640)
-    with pytest.raises(UsageError, match="others may read"):
+    with pytest.raises(UsageError, match="other users may read"):
         Vault(tmp_path / "sky")
 
 

@@ -148,7 +148,7 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
         (
             "point: sun}",
             "point: inertial, quaternion: [0, 0, 0, 1], roll_deg: 1.0}",
-            "has its roll in its quaternion",
+            "includes its roll",
         ),
         (
             "\n  axis: [0.0, 0.0, 1.0]",
@@ -316,7 +316,7 @@ COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, chan
             COIL.replace("dipole_per_ampere: 0.648, ", ""),
             r"windings\[2\].dipole_per_ampere` is missing",
         ),
-        (COIL.replace("648", "648, turns: 80, area: 0.0081"), "leave `turns` and `area` out"),
+        (COIL.replace("648", "648, turns: 80, area: 0.0081"), "omit `turns` and `area`"),
         (COIL.replace("dipole_per_ampere: 0.648", "turns: 80"), r"windings\[2\].turns` needs both"),
         (COIL.replace("23.0", "46.0"), "`coils.current_limit` is 0.148: the supply drives 0.0739 A"),
         (

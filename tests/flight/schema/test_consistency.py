@@ -149,7 +149,7 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
         (
             "  inertia: [1.10e-3, 1.05e-3, 0.99e-3]",
             "  inertia: [1.10e-3, 1.05e-3, [0, 0, 0.99e-3]]",
-            "`craft.inertia` mixes moments and rows: give three moments, or three rows",
+            "`craft.inertia` mixes numbers and rows: give three moments, or three rows",
         ),
         (
             "  inertia: [1.10e-3, 1.05e-3, 0.99e-3]",

@@ -76,7 +76,7 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path, capsys: pytest.Capt
         (["run", DEMO, "--duration", "nan", "--out", "/tmp/never"], "--duration nan: must be a positive"),
         (
             ["run", "config/testbed.yaml", "--seed", "3", "--out", "{tmp}"],
-            "--seed: this configuration flies real",
+            "--seed: this configuration has real",
         ),
         (["report", "/nowhere"], "/nowhere: no such folder"),
         (["export", "/nowhere"], "/nowhere: no such folder"),

@@ -139,7 +139,7 @@ def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
     [
         (["--fov", "170"], "1 to 150 degrees"),
         (["--fov", "67", "--altitude", "-3"], "not a positive number"),
-        (["--fov", "67", "--altitude", "5"], "--altitude 5: this method needs an altitude of at least 50 km"),
+        (["--fov", "67", "--altitude", "5"], "--altitude 5: this method needs at least 50 km"),
         (["--fov", "67", "--altitudes", "900", "300"], "altitudes of 900 to 300 km"),
         (["--fov", "67", "--altitude", "600", "--altitudes", "300", "900"], "not allowed with"),
         ([], "--fov --camera"),

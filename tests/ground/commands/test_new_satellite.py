@@ -183,7 +183,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
             ("--coil", _coil(0.2, 1.0, 40.0)),
             "40 V at the current limit, above 36 V: give a lower current limit",
         ),
-        (("--coil", "axis=x,dipole=1,current=1,resistance=5"), "these coils control one axis only"),
+        (("--coil", "axis=x,dipole=1,current=1,resistance=5"), "these coils control only one axis"),
         (("--coil", "axis=x,turns=9,current=1,resistance=5"), "give either `dipole`"),
         (
             (

@@ -372,7 +372,7 @@ def test_what_the_camera_cannot_do_is_said(
 
 @pytest.mark.parametrize(
     ("missing", "message"),
-    [(v4l2.EXPOSURE_ABSOLUTE, "no exposure to be set in units of time"), (v4l2.GAIN, "omit `gain`")],
+    [(v4l2.EXPOSURE_ABSOLUTE, "no exposure control in units of time"), (v4l2.GAIN, "omit `gain`")],
 )
 def test_a_camera_without_the_control_is_refused(
     kernel: IoctlCamera, clock: ManualClock, missing: int, message: str

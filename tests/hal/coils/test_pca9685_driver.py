@@ -132,7 +132,7 @@ def test_another_part_at_the_address_is_refused_with_the_cure(rig: Rig) -> None:
 
     An INA219 acknowledges each write but keeps no such register.
     """
-    with pytest.raises(Refused, match="another part at this address"):
+    with pytest.raises(Refused, match="another chip at this address"):
         Pca9685(rig.bus, INA, rig.clock).configure()
 
 

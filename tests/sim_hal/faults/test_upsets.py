@@ -53,7 +53,7 @@ def test_a_bit_of_the_chips_set_up_is_measured_and_mended_within_half_a_second(
     for _ in range(60):
         drive(rig)
         errors.append(rig.coils.state().error)
-    assert any("lost its set-up" in error for error in errors[:22])
+    assert any("lost its register settings" in error for error in errors[:22])
     assert not any(errors[44:])
     assert rig.wire.chip.register(register) == sound
     assert rig.currents() == pytest.approx(rig.coils.state().current.tolist(), abs=1e-3)
@@ -87,7 +87,7 @@ def test_a_bit_of_the_monitors_set_up_is_measured_and_mended(bit: int) -> None:
     rig.wire.monitor.upset(CONFIG, bit)
     assert rig.wire.monitor.register(CONFIG) != sound
     rig.clock.sleep_until_ns(3250 * MS)
-    assert "lost its set-up" in monitor.error()
+    assert "lost its register settings" in monitor.error()
     rig.clock.sleep_until_ns(5000 * MS)
     assert not monitor.error()
     assert rig.wire.monitor.register(CONFIG) == sound

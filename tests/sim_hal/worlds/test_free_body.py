@@ -314,7 +314,7 @@ def test_the_true_body_has_the_described_tensor_unless_it_is_given_another() -> 
     np.testing.assert_allclose(inertia_matrix(body), np.diag([1.0, 1.0, 1.5]))
     with pytest.raises(ConfigError, match=r"craft.inertia: has the principal moments 1, 1, 5: the largest"):
         craft_model(FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, 5.0))), config)
-    with pytest.raises(ConfigError, match=r"craft.inertia: mixes moments and rows"):
+    with pytest.raises(ConfigError, match=r"craft.inertia: mixes numbers and rows"):
         craft_model(
             FreeBodySection(craft=CraftSection(size=size, inertia=(1.0, 1.0, (0.0, 0.0, 1.0)))), config
         )

@@ -267,4 +267,4 @@ def test_a_file_that_is_not_what_was_accepted_is_refused(tmp_path: Path) -> None
     (tmp_path / "mine.yaml.sha256").write_text("00  mine.yaml\n")
     done = command("check", path)
     assert done.returncode == 2
-    assert "is not what was accepted" in done.stderr
+    assert "differs from the accepted configuration" in done.stderr

@@ -96,7 +96,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", port))
         service = start(config)
-        service.says(f"cannot begin yet: link.udp: 127.0.0.1:{port} cannot be listened to")
+        service.says(f"cannot start yet: link.udp: 127.0.0.1:{port} cannot be listened to")
         service.notifies("STATUS=waiting to begin")
         service.notifies("EXTEND_TIMEOUT_USEC=")
     while "link open on UDP" not in (line := service.says("")):
@@ -124,7 +124,7 @@ def test_no_line_is_opened_during_the_separation_inhibit(
         file.write("separation: {inhibit: 86400.0}\n")
     service = start(config)
     for _ in range(2):
-        service.says("cannot begin yet: separation inhibit of 86400 s")
+        service.says("cannot start yet: separation inhibit of 86400 s")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", port))
     service.process.terminate()

@@ -88,7 +88,7 @@ def test_the_blocks_stand_one_after_the_other_and_a_fixed_one_is_known() -> None
 
 
 def test_two_blocks_with_one_name_and_a_role_without_a_block_are_refused() -> None:
-    with pytest.raises(UsageError, match="two blocks of the error state have one name"):
+    with pytest.raises(UsageError, match="two blocks of the error state have the same name"):
         ErrorState([BLOCKS[0], BLOCKS[0]])
     with pytest.raises(UsageError, match="has no block camera"):
         with_role(BLOCKS, {"camera": Role.FIXED})
