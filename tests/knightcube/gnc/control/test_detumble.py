@@ -27,13 +27,13 @@ TURN = np.array([0.05, 0.0, 0.0])
 IN_TURNING_FIELD = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, share_in_rotating_field(0.05, SCHEDULE))
 CYCLE = 0.025
 NOISE = 1.0e-7
-"""T: a VN-100's magnetometer at 40 Hz, 140 microgauss per sqrt(Hz), rounded up (its datasheet)."""
+"""Noise (T) of a VN-100 magnetometer at 40 Hz, from 140 microgauss per sqrt(Hz) (data sheet), rounded up."""
 OWN_FIELD = 1e-3
-"""T per ampere that the coils make at the magnetometer: more than the field itself at full current."""
+"""Field of the coils at the magnetometer (T/A), which exceeds the Earth's field at full current."""
 
 
 class FreeBody:
-    """A rigid body in a field that turns in space; the magnetometer measures the coils too."""
+    """A simulated rigid body in a rotating field; the magnetometer also measures the field of the coils."""
 
     def __init__(
         self, rate: FloatArray, field: float, turn: FloatArray, inertia: FloatArray, seed: int
@@ -57,7 +57,7 @@ class FreeBody:
         return float(0.5 * self.rate @ self._inertia @ self.rate)
 
     def advance(self) -> None:
-        """Carry the body over one cycle by the midpoint rule, in steps of a thirtieth of a radian at most."""
+        """Integrate the body over one cycle by the midpoint rule, in steps of at most 1/30 rad."""
         steps = max(int(30.0 * CYCLE * np.linalg.norm(self.rate)), 1)
         for _ in range(steps):
             dt = CYCLE / steps
@@ -108,7 +108,7 @@ def test_an_uneven_body_loses_energy_monotonically_and_ends_below_the_limit() ->
 
 
 def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> None:
-    """Avanzini and Giulietti 2012: the component along the field goes fastest at k = 2 Omega J."""
+    """The component along the field decays fastest at k = 2 Omega J (Avanzini and Giulietti 2012)."""
     left = {}
     for share in (share_in_rotating_field(0.05, SCHEDULE), 0.3):
         body = FreeBody(np.array([0.3, -0.25, 0.31]), 4.5e-4, TURN, 1.05e-3 * np.eye(3), 3)
@@ -119,7 +119,7 @@ def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> No
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 2.0, 5.0, 10.0])
 def test_a_fast_body_is_braked_not_pushed(speed: float) -> None:
-    """The field is carried on between windows: at 10 rad/s it turns by 2.5 rad from one to the next."""
+    """The field is extrapolated between windows: at 10 rad/s it rotates by 2.5 rad in between."""
     body = FreeBody(np.array([0.0, speed, 0.0]), 4.5e-4, np.zeros(3), 1.05e-3 * np.eye(3), 4)
     rates, _ = fly(body, 15.0, Detumbler(SCHEDULE, BRAKING))
     # 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time: 0.37 rad/s, as long as the field is known that well.
@@ -191,7 +191,7 @@ def test_a_window_without_time_to_measure_is_refused() -> None:
 
 @pytest.mark.parametrize("length_ms", [20, 40, 100, 99, 300])
 def test_an_exposure_waits_until_no_step_of_the_coils_falls_within(length_ms: int) -> None:
-    """The coils rest for 100 of 250 ms; a command may reach them 50 ms late."""
+    """The coils are off for 100 of 250 ms, and a command may arrive 50 ms late."""
     steps = np.arange(0, 2_000, 250)[:, None] + np.array([0, 100])
     for begin_ms in range(0, 500, 10):
         found = SCHEDULE.calm(begin_ms * 1_000_000, length_ms * 1_000_000) // 1_000_000
