@@ -33,7 +33,7 @@ AVERAGES = (1, 4, 16, 64, 128, 256, 512, 1024)
 
 
 class Ina226:
-    """The driver. It knows registers, and reads them in a job of its own, never in the control loop."""
+    """The driver. The driver knows registers, and reads them in its own job, never in the control loop."""
 
     def __init__(self, bus: I2cBus, clock: Clock, section: Ina226Section) -> None:
         self.name = f"ina226 at 0x{section.address:02x}"
@@ -114,7 +114,7 @@ def check(section: Ina226Section) -> None:
 
 # --8<-- [start:emulator]
 class EmulatedIna226:
-    """The part at the other end of the wire: it holds registers and answers bytes."""
+    """Emulator of the chip, which stores registers and answers with bytes."""
 
     def __init__(self, emulation: Emulation, section: Ina226Section) -> None:
         self._emulation, self._section = emulation, section

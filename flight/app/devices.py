@@ -150,7 +150,7 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 class Devices:
     """The open devices; devices that the configuration does not have are None or empty.
 
-    The monitors `supply` of the power system begin with that of the battery.
+    The first monitor in `supply` of the power system is the battery monitor.
     """
 
     unit: InertialUnit
@@ -165,7 +165,7 @@ class Devices:
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
-    """Open the devices, beginning with the coils, so that these are at zero before anything else happens.
+    """Open the devices, beginning with the coils, so that the coils are at zero before any other action.
 
     Raises DeviceError for a device that does not answer, unless the flight is `patient` and retries.
     """

@@ -171,7 +171,7 @@ _GRID_NS = 25_000_000
 
 
 def next_whole_second(clock: Clock) -> int:
-    """Return mission time zero in lock-step: the next whole second at least half a second ahead."""
+    """Return mission time zero in lock-step: the first whole second that is at least 0.5 s in the future."""
     return -(-(clock.now_ns() + SECOND_NS // 2) // SECOND_NS) * SECOND_NS
 
 

@@ -1,11 +1,11 @@
 """The flight as a service: configuration, retries of its start, signals, proof of its release, supervisors.
 
 Nobody can restart a flight or the link on a board, so the start is retried until it succeeds. An invalid
-configuration ends the start, because waiting would not help. Other problems may pass: a disk error, a missing
-address or folder, or a bus that another flight uses. After each failed attempt, everything that was opened is
-closed, with the coils at zero. The first pause before the next attempt is 0.2 s, and each later pause is
-twice as long, up to 30 s. An unexpected exception ends the process, and the service manager starts a new
-process.
+configuration ends the start, because waiting would not help. Other problems may be temporary: a disk error, a
+missing address or folder, or a bus that another flight uses. After each failed attempt, everything that was
+opened is closed, with the coils at zero. The first pause before the next attempt is 0.2 s, and each later
+pause is twice as long, up to 30 s. An unexpected exception ends the process, and the service manager starts a
+new process.
 
 The configuration to fly is the accepted file or, if it is damaged, the last configuration that flew. The
 script `deploy/install.sh` writes the SHA-256 checksum of an accepted configuration beside its file. A flight

@@ -14,7 +14,7 @@ higher counter is used. One folder holds the security associations of one end of
 folder's owner may read them.
 
 A folder of keys that was restored from a backup contains old counters, with which old commands would be
-obeyed again. The satellite therefore keeps a witness: a second folder that no backup may contain, with the
+executed again. The satellite therefore keeps a witness: a second folder that no backup may contain, with the
 newest association of each SPI and the digests of all replaced keys. An association is outdated if the witness
 has the same key with a higher counter, or if its key was replaced. A new key that the witness does not know
 is accepted from any folder. If the association of the primary command SPI is outdated, its commands are

@@ -249,7 +249,7 @@ class Navigation:
         return self._is_fresh(self._received_ns, now_ns)
 
     def is_measured(self, estimate: Estimate | None, now_ns: int) -> bool:
-        """Return whether the estimate will be good enough for driving the coils until the next cycle.
+        """Return whether the estimate will be accurate enough for driving the coils until the next cycle.
 
         The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
         An estimate that is only propagated by the model is recorded, but not used for steering. Without a

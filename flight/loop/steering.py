@@ -71,7 +71,7 @@ class CoilDrive:
         self._events = services.events
         self._reported: set[int] = set()  # axes whose verdict was reported
         self._braked = NO_AXES
-        self._has_rate = True  # without a rate, a self-test of the coils shows nothing
+        self._has_rate = True  # without a rate, a self-test of the coils has no result
         self.available = watch.available
         self._nothing: FloatArray = np.zeros(len(settings.limits))
         self._limits, self._share = settings.limits, 1.0
@@ -104,7 +104,7 @@ class CoilDrive:
 
     @property
     def is_suspect(self) -> bool:
-        """Whether a coil without a verdict may carry another current than commanded."""
+        """Whether a coil without a verdict may carry a current that differs from its command."""
         return self._watch.doubts_currents
 
     def look(

@@ -159,10 +159,10 @@ class Winding(Section, frozen=True, kw_only=True):
 
     A positive current makes a dipole moment along `axis`, which may have any length. The dipole moment per
     ampere is `dipole_per_ampere` (m^2), or `turns` times `area` (m^2) of an air coil. On the testbed, these
-    values stand in the section `plant`. The value `current_limit` (A) replaces that of the section `coils`.
-    The values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them, the coils
-    use the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are swapped.
-    The `position` (m, body axes) of the coil's centre relative to the inertial unit gives the field that
+    values are in the section `plant`. The value `current_limit` (A) replaces that of the section `coils`. The
+    values `channels` are the PWM channels of the inputs A and B of the H-bridge; without them, the coils use
+    the channels 0 and 1, 2 and 3, and so on. The value `sign` is -1 for a coil whose leads are swapped. The
+    `position` (m, body axes) of the coil's centre relative to the inertial unit gives the field that
     `knightcube bringup` expects at the magnetometer.
     """
 
@@ -700,11 +700,12 @@ class Driver:
         section: type of the section, which adds the driver's own keys to those of the kind's base section.
         open: function that takes the rig and the section, and returns the driver (`hal.interfaces.devices`).
             A driver of coils must be passive until its method `start` is called.
-        probe: function that takes a rig and the section, asks the device for a sign of life without changing
-            its state, and returns the answer as text. It raises DeviceError without an answer.
+        probe: function that takes a rig and the section, queries the device without changing its state, and
+            returns its answer as text. It raises DeviceError without an answer.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
             device to the emulated wires, and returns the device. A camera needs none, because the simulator
-            emulates the cameras of all drivers. Without an emulator, another device flies on hardware only.
+            emulates the cameras of all drivers. A device of another package without an emulator can only be
+            used on hardware.
         files: function that returns the device files that the section names.
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils

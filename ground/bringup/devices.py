@@ -113,7 +113,7 @@ def _place(config: Config, kind: str, section: Any, driver: Any) -> str:
 
 
 def _wrong_part(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Finding | None:
-    """Return a finding if another kind of device answers in the place of a section, else None."""
+    """Return a finding if a different kind of device answers at the address of a section, else None."""
     named = getattr(section, "driver", "")
     if named in {"pca9685", "ina219"}:
         chip = chip_at(rig.wires.i2c(section.bus), section.address)

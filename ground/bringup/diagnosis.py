@@ -289,7 +289,7 @@ def _common(found: dict[str, FloatArray]) -> FloatArray | None:
 
 
 def _wrong_axes(part: str, axes: FloatArray) -> Finding:
-    """Return the finding about a sensor, or the whole unit, with other axes than the configured ones."""
+    """Return the finding about a sensor, or the whole IMU, whose axes differ from the configured axes."""
     whole, proper = part == "inertial_unit", np.linalg.det(axes) > 0
     sensors = "the axes of all sensors are wrong" if whole else "its axes differ from the body's"
     if not np.allclose(np.abs(axes).max(axis=1), 1.0):
@@ -312,7 +312,7 @@ def _is_identity(axes: FloatArray) -> bool:
 
 
 def _angle(first: FloatArray, second: FloatArray) -> float:
-    """Return the angle (rad) between two orthogonal matrices; pi if one mirrors and the other does not."""
+    """Return the angle (rad) between two orthogonal matrices, or pi if only one of them is a reflection."""
     product = first @ second.T
     if np.linalg.det(product) < 0:
         return math.pi
@@ -603,7 +603,7 @@ def _without_field(part: str, name: str, drawn: float) -> Finding:
 
 
 def _wrong_size(part: str, name: str, size: float, drawn: float) -> list[Finding]:
-    """Return the finding about a coil whose field or current has another size than expected."""
+    """Return the finding about a coil whose field or current differs in size from the expected value."""
     allowed, known = _NEAR + 0.05, not math.isnan(drawn)
     right_current = not known or abs(drawn - 1.0) <= allowed
     if abs(size - 1.0) <= allowed and right_current:

@@ -106,7 +106,7 @@ class Session:
         config: configuration of the devices.
         rig: hardware or emulated devices.
         stack: closes every device that was opened.
-        ask: function that asks the person at the bench for an action and waits until it is done.
+        ask: function that requests an action of the person at the bench and waits for its completion.
         hand: the emulated hand (`sim_hal.rig.EmulatedBench`), or None at a real bench.
         guardian: guardian of the coils, or None with emulated devices.
         coil_field: expected field of each coil (n, 3) at the magnetometer, T/A, body axes, or None.

@@ -108,7 +108,7 @@ _TURN_S = 0.01
 _SHOW_S = 1.0
 """Time (s) between two lines of progress."""
 _LINGER_S = 0.5
-"""Time (s) after a transfer during which the other end may request the last answer again."""
+"""Time (s) after a transfer in which the other end may request a repetition of the last answer."""
 
 
 def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:

@@ -299,7 +299,7 @@ def _camera(found: LearnedDescription) -> list[str]:
         largest = min(math.degrees(_UNIFORM * one.claim.max()), camera.accuracy.mounting_deg)
         accuracies = [f"mounting_deg: {_above(largest)}"]
     if found.lens is not None:
-        # The mounting refers to the optical axis, which is another one with the learned lens.
+        # The mounting refers to the optical axis, which the learned lens displaces.
         focal, (k1, k2) = found.lens["focal_length_px"][0], found.lens["distortion"]
         learned = Lens(camera.columns, camera.rows, focal, tuple(found.lens["centre_px"]), k1, k2)
         mounting = multiply(axes_turn(camera_model(camera), learned), mounting)

@@ -231,7 +231,7 @@ class Timeline:
         sample = np.append(np.arange(1, samples + 1), np.full(len(times) - samples, -1))
         jump = np.zeros(len(times))
         jump[samples : len(times) - len(divided)] = np.diff(record.current, prepend=0.0)[inside]
-        order = np.lexsort((sample < 0, times))  # at equal times the sample comes before the switch
+        order = np.lexsort((sample < 0, times))  # at equal times the sample precedes the current change
         times = times[order]
         # A current that is switched at the time of an event flows only after the event.
         flowing = np.searchsorted(switch, times, side="left")

@@ -29,7 +29,10 @@ class Adis16470:
     SPEED_HZ, MODE = 1_000_000, 3
 
     def __init__(self, device: SpiDevice) -> None:
-        """Check the product number. Raises NotResponding without an answer, and Refused for another part."""
+        """Check the product number.
+
+        Raises NotResponding without an answer, and Refused if a different chip answers.
+        """
         self._device = device
         (product,) = self._read([PROD_ID])
         if product in {0x0000, 0xFFFF}:

@@ -1,4 +1,4 @@
-"""Driver of up to six torque coils on a PCA9685 and SN754410 H-bridges. Any failure leads to zero current.
+"""Driver of up to six torque coils on a PCA9685 and SN754410 H-bridges, with zero current after a failure.
 
 Each coil is driven by an H-bridge with two inputs A and B (Sease 2013, Table 5.2, eq. 5.33). A signed count n
 from -4096 to 4096 gives the direction and the duty. For n > 0, input A is high for n/4096 of the PWM period

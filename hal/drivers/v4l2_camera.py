@@ -478,7 +478,8 @@ class ExposureTiming:
         """Return the host time (ns) of the start of a frame's exposure, or None for an absurd time stamp.
 
         A time stamp must not be in the future, nor earlier than that of the previous frame. Raises
-        CorruptData after several consecutive absurd time stamps, and for time stamps of another clock.
+        CorruptData after several consecutive impossible time stamps, and for time stamps of a different
+        clock.
         """
         if filled.flags & STAMP_MASK != STAMP_MONOTONIC:
             raise CorruptData(self._name, "the time stamps of its frames are not from the monotonic clock")

@@ -9,9 +9,9 @@ pseudo-inverse. The method assumes that the image has no distortion and that the
 flat detector, which is valid near the optical axis only. Meller et al. do not state from which side the image
 is scanned; this implementation scans from the darkest border. Meller et al. do not state how to compute nadir
 from the circle in the image of one camera. This implementation assumes that the point of the circle closest
-to the optical axis lies on the limb. Nadir lies in the direction from this point to the centre of the circle,
-at the angular radius of the Earth from the point. The lens distortion is removed before the circle fit. The
-circle fit does not distinguish between limb and terminator.
+to the optical axis lies on the limb. Nadir is on the line from this point to the centre of the circle, at the
+Earth's angular radius from the point. The lens distortion is removed before the circle fit. The circle fit
+does not distinguish between limb and terminator.
 
 Graphic Method (Meller et al., section 3.2.2 and Fig. 10): The limb is a circle in the horizon plane, whose
 distance below the satellite follows from the altitude. The plane through the centre column of a camera image

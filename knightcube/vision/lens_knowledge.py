@@ -503,7 +503,7 @@ class LensKnowledge:
         velocity: FloatArray | None = None,
         elapsed: float = 0.0,
     ) -> LensKnowledge:
-        """Return the knowledge after a frame. A frame without enough stars changes nothing.
+        """Return the knowledge after a frame. A frame without enough stars has no effect.
 
         If the frame contradicts the learned lens, the result is the configured lens, and the number of
         `contradictions` is one higher. The frame should then be solved again with the configured lens.

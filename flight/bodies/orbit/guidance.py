@@ -550,7 +550,7 @@ class PointingPlanner:
         if job is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
-        # Disturbance torques along the field may move the body off its goal for a while, without a slew.
+        # Disturbance torques along the field may temporarily move the body off its target, without a slew.
         if self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None:
             job = replace(job, slew=None)
         job = self._objects.directed(job)

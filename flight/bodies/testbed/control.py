@@ -151,7 +151,7 @@ class ThreadReader:
 
 @dataclass(frozen=True, slots=True)
 class ThreadLaw:
-    """A target that reaches `q2` at `rate` rad/s and keeps this rate; a zero rate holds the attitude."""
+    """A target at which the body reaches `q2` with `rate` (rad/s) and then keeps this rate."""
 
     q2: float
     rate: float = 0.0
@@ -353,12 +353,12 @@ class Planning:
         return _ARRIVED_NS < self._goal_ns - now_ns < self._settings.least_horizon * 1e9
 
     def _has_arrived(self, now_ns: int) -> bool:
-        """Return whether the goal time has come, so that plans hold the target from now on."""
+        """Return whether the goal time has passed, after which plans hold the target."""
         goal_ns = self._goal_ns if self._settings.strategy is Strategy.GOAL else None
         return goal_ns is not None and goal_ns - now_ns <= _ARRIVED_NS
 
     def _is_displaced(self, angle: float, now_ns: int) -> bool:
-        """Return whether the body is too far off its path to follow it; true at most once a second."""
+        """Return whether the body is too far from its path to follow the path; true at most once a second."""
         sample = self._guidance.sample(now_ns)
         if self._settings.strategy is not Strategy.GOAL or sample is None:
             return False

@@ -51,7 +51,10 @@ class Stage(IntEnum):
     COMPLETED = 4
     FAILED = 5
     REPEATED = 6
-    """A frame with an already used counter was refused, which says nothing about the command that used it."""
+    """A frame with an already used counter was refused.
+
+    This is no statement about the command that used it.
+    """
 
     @property
     def final(self) -> bool:
@@ -123,7 +126,7 @@ class Verification:
         self._open: tuple[Sent, Mode, int] | None = None
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
-        """Return the reports for an answer of the control process. Empty bytes stand for a missing answer."""
+        """Return the reports for an answer of the control process. Empty bytes represent a missing answer."""
         found = [answer[begin:end] for layout, begin, end in walk(answer) if layout.packet is COMMAND]
         if not found:
             return [report(sent, Stage.FAILED, "the flight did not answer")]
@@ -213,7 +216,7 @@ class ControlLine(Generic[T]):
         return ""
 
     def answers(self, now_ns: int) -> list[tuple[T, bytes]]:
-        """Return the received answers with their commands. Empty bytes stand for an answer that timed out."""
+        """Return the received answers with their commands. Empty bytes represent an answer that timed out."""
         found, still = [], []
         for waiting in self._waiting:
             try:

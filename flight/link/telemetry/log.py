@@ -546,7 +546,7 @@ class Log(Protocol):
 class Recorder:
     """Recorder that packs values into packets, converts clock time to mission time and writes to the logs.
 
-    A record that cannot be packed is lost and counted. The calling task gets no error.
+    A record that cannot be packed is lost and counted. The calling task receives no error.
 
     Attributes:
         epoch_ns: clock time (ns) of mission time zero.

@@ -223,8 +223,8 @@ class PriorCheck:
     """Detects that consistent measurements contradict learned states.
 
     Learned states are contradicted if the normalised squares of the innovations in `CONTRADICTED` seconds
-    have a mean above 5 instead of 3. Each square counts at most as one that is exceeded once in a thousand,
-    so that a few outliers contradict nothing.
+    have a mean above 5 instead of 3. Each square is limited to a value that is exceeded once in a thousand,
+    so that a few outliers cause no contradiction.
     """
 
     def __init__(self) -> None:

@@ -452,7 +452,7 @@ def _hypotheses(
     free = np.ones(len(observation.edges), dtype=bool)
     sound: list[Hypothesis] = []
     contradicted: list[InitialGuess] = []
-    # Cones with too few edges to make an accepted horizon ambiguous are skipped.
+    # Cones with so few edges that they cannot make an accepted horizon ambiguous are skipped.
     enough = float(settings.least_edges)
     for _ in range(settings.candidates):
         if np.count_nonzero(free) < enough:

@@ -195,7 +195,7 @@ def test_a_brown_out_is_said_even_if_an_earlier_run_had_set_the_chip_up() -> Non
 def test_another_part_at_the_address_is_named(rig: Rig) -> None:
     monitor = Ina219(rig.bus, PCA, rig.clock)
     rig.clock.advance(200 * MS)
-    assert "another part" in monitor.error()
+    assert "another chip" in monitor.error()
 
 
 def test_a_monitor_that_stops_converting_is_an_error() -> None:

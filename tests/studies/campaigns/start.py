@@ -183,7 +183,7 @@ class Board:
         return {
             "flies": flies,
             "restarts": restarts,
-            "waited": "cannot begin yet" in said,
+            "waited": "cannot start yet" in said,
             "status": None if flies else status,
             "said": said[-600:],
             "took_s": time.monotonic() - begun_s,

@@ -104,7 +104,7 @@ class PathGuidance:
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
-        """Set the target attitude and its rate in rad/s; the present path is followed until a new plan comes.
+        """Set the target attitude and its rate, rad/s; the present path is followed until a plan is accepted.
 
         Raises UsageError if a value is not finite or |target_q2| exceeds `AcceptanceRules.q2_limit`.
         """

@@ -100,7 +100,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
         service.notifies("STATUS=waiting to begin")
         service.notifies("EXTEND_TIMEOUT_USEC=")
     while "link open on UDP" not in (line := service.says("")):
-        assert "cannot begin yet" in line
+        assert "cannot start yet" in line
     assert "started at attempt" in line
     service.notifies("READY=1")
     for _ in range(2):
@@ -140,18 +140,18 @@ def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callabl
     service = start(config)
     service.says("no such file")
     whole.rename(config)
-    while "no such folder" not in (line := service.says("cannot begin yet")):
+    while "no such folder" not in (line := service.says("cannot start yet")):
         assert "no such file" in line
     keys.mkdir()
-    while "no key can be read" not in (line := service.says("cannot begin yet")):
+    while "no key can be read" not in (line := service.says("cannot start yet")):
         assert "no such folder" in line
     with Vault(away).owned():
         keys.rmdir()
         away.rename(keys)
-        while "another link process uses these counters" not in (line := service.says("cannot begin yet")):
+        while "another link process uses these counters" not in (line := service.says("cannot start yet")):
             assert "no such folder" in line or "no key can be read" in line
     while "link open on UDP" not in (line := service.says("")):
-        assert "cannot begin yet" in line
+        assert "cannot start yet" in line
     service.process.terminate()
     assert service.process.wait(_LONGEST_S) == 0
 

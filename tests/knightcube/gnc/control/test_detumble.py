@@ -185,7 +185,7 @@ def test_a_share_that_does_not_brake_is_refused(share: float) -> None:
 
 
 def test_a_window_without_time_to_measure_is_refused() -> None:
-    with pytest.raises(UsageError, match="need time"):
+    with pytest.raises(UsageError, match="must be above zero"):
         WindowSchedule(0, 0, 1)
 
 

@@ -17,7 +17,7 @@ def test_goals_keep_their_numbers_in_the_command_packet() -> None:
     labels = ["nadir", "velocity", "sun", "inertial", "ground", "object"]
     assert [Goal(number).label for number in range(6)] == labels
     assert [Goal.named(label).value for label in labels] == list(range(6))
-    with pytest.raises(UsageError, match="'moon' is not a goal"):
+    with pytest.raises(UsageError, match="'moon' is not a pointing goal"):
         Goal.named("moon")
 
 
@@ -57,7 +57,7 @@ def test_a_roll_is_shown_in_degrees() -> None:
         (Goal.SUN, (), math.inf, "must be finite"),
         (Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0011), None, "has length 1.0011"),
         (Goal.INERTIAL, (0.0, 0.0, 0.0, 0.9989), None, "has length 0.9989"),
-        (Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0), 0.0, "roll in its quaternion"),
+        (Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0), 0.0, "includes its roll"),
         (Goal.OBJECT, (), 0.1, "free roll"),
         (Goal.GROUND, (1.58, 0.0), None, "latitude 90.5273 deg is beyond a pole"),
         (Goal.OBJECT, (0.0, -1.58), None, "declination -90.5273 deg is beyond a pole"),
