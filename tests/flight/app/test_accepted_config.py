@@ -137,7 +137,7 @@ def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
             accepted_config(accepted, environment)
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert main(["run", str(accepted), "--out", str(tmp_path / "run")]) == 2
-    assert "sha256" in capsys.readouterr().err
+    assert "SHA-256" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

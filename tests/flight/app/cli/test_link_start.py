@@ -97,7 +97,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
         other.bind(("127.0.0.1", port))
         service = start(config)
         service.says(f"cannot start yet: link.udp: 127.0.0.1:{port} cannot be listened to")
-        service.notifies("STATUS=waiting to begin")
+        service.notifies("STATUS=waiting to start")
         service.notifies("EXTEND_TIMEOUT_USEC=")
     while "link open on UDP" not in (line := service.says("")):
         assert "cannot start yet" in line
