@@ -153,7 +153,7 @@ def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
         return None, ""
     reasons = [] if current is not None else ["the symbolic link `current` names no complete release"]
     if len(found) > 1 and trials.failed(found[0]) and not trials.failed(found[1]):
-        reasons.append(f"release {found[0].name} ended {UNCLEAN} times before it was accepted")
+        reasons.append(f"release {found[0].name} ended {UNCLEAN} times before a flight lasted a minute")
         found.reverse()
     chosen = found[0]
     for release in found:

@@ -468,7 +468,7 @@ def probe_ublox(rig: Rig, gps: Gps) -> str:
         if port.receive():
             return "sends"
         rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
-    silence = f"the port the port opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
+    silence = f"the port opens, but no byte arrived in {_LISTENED_NS * 1e-9:g} s"
     raise NotResponding(gps.device, f"{silence}: check power, the cable and the baud rate")
 
 

@@ -268,7 +268,7 @@ class Steering:
             facts.HOLDING,
             adrift,
             now_ns,
-            "no newer path: holding the attitude at the end of the last path path",
+            "no newer path: holding the attitude at the end of the last path",
         )
         return self._steered(state, now_ns, reference, dipole, saturated)
 

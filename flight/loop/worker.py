@@ -170,7 +170,7 @@ def _class(name: str) -> type:
     module, _, qualified = name.partition(":")
     found = getattr(sys.modules.get(module), qualified, None)
     if not isinstance(found, type):
-        raise FlightError(f"{name!r} is not a class that the control process has defined defined")
+        raise FlightError(f"{name!r} is not a class that the control process has defined")
     return found
 
 

@@ -108,7 +108,7 @@ def test_an_odd_checksum_is_damage(accepted: Path, service: dict[str, str], odd:
     else:
         beside.write_text({"empty": "", "short": line[:40], "text": "x" * 64}[odd], encoding="ascii")
     assert accepted_config(accepted, service).path.parent.name == FOLDER
-    with pytest.raises(UnreadConfigError, match="no accepted configuration"):
+    with pytest.raises(UnreadConfigError, match="no configuration that has flown"):
         accepted_config(accepted, {})
 
 
@@ -133,7 +133,9 @@ def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
 ) -> None:
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7"), encoding="utf-8")
     for environment in ({}, {"STATE_DIRECTORY": str(tmp_path / "empty")}):
-        with pytest.raises(ConfigError, match=r"no accepted configuration is stored; .*install\.sh --accept"):
+        with pytest.raises(
+            ConfigError, match=r"no configuration that has flown is stored; .*install\.sh --accept"
+        ):
             accepted_config(accepted, environment)
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert main(["run", str(accepted), "--out", str(tmp_path / "run")]) == 2
@@ -159,7 +161,7 @@ def test_configuration_and_sum_that_are_gone_or_damaged_are_replaced_by_the_newe
         else:
             chosen.path.unlink()
             (chosen.path.parent / chosen.path.name.replace("5-", "9-")).write_bytes(b"name: other")
-    with pytest.raises(UnreadConfigError, match="no accepted configuration"):
+    with pytest.raises(UnreadConfigError, match="no configuration that has flown"):
         accepted_config(accepted, service)
 
 
@@ -233,4 +235,4 @@ def test_a_flight_of_a_kept_configuration_says_so_and_records_it_as_an_event(
     fly(request)
     events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
     assert "no such file" in events["config-damaged"]
-    assert "the last accepted configuration is used" in capsys.readouterr().err
+    assert "the last configuration that has flown is used" in capsys.readouterr().err
