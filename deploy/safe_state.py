@@ -182,7 +182,7 @@ def main() -> int:
     now = time.monotonic()
     tries = Tries(os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], now)
     state = SafeState(tries, now)
-    say(f"the start of the flight failed; attempt {tries.number} in {state.due - now:.0f} s")
+    say(f"the flight ended too often; attempt {tries.number} in {state.due - now:.0f} s")
     serve(state, os.environ.get("KNIGHTCUBE_COMMANDS", ""))
     tries.keep(time.monotonic())
     say(f"the flight is started again, attempt {tries.number}")

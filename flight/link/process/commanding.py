@@ -53,7 +53,7 @@ class Stage(IntEnum):
     REPEATED = 6
     """A frame with an already used counter was refused.
 
-    This is no statement about the command that used it.
+    The refusal does not show whether the command that used the counter was executed.
     """
 
     @property

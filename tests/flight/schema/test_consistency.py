@@ -55,7 +55,7 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
         ("udp: '10.0.0.1:5000', peers: [10.0.0.500]", "`link.peers` .*not permitted"),
         ("udp: '10.0.0.1:5000', peers: [ground]", "`link.peers"),
         ("udp: '10.0.0.1:5000', peers: []", "`link.peers"),
-        ("spacecraft: 5", "`link` has no line"),
+        ("spacecraft: 5", "`link` has no communication line"),
         ("tcp: '127.0.0.1:5', telemetry_to: '127.0.0.1:6'", "`link.telemetry_to` goes with `link.udp`"),
         (
             "udp: '127.0.0.1:5', telemetry_to: 'ground.example:6'",

@@ -330,7 +330,7 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
         ("slew", {"q2": "much"}, "'much' is not a number"),
         ("ping", {}, "number is missing"),
         ("slew", {"q2": 0.1, "fast": 1}, "no such value: fast"),
-        ("slew", "0.1", "a command is"),
+        ("slew", "0.1", "a command has"),
         ("point", {"goal": 0}, "point: no such command"),
         ("mode", {"mode": int(Mode.SUN)}, "mode sun: this body has no such mode"),
         ("clear", {"event": "coil-brokn"}, "'coil-brokn' is not the name of an event"),
@@ -360,7 +360,7 @@ def test_a_satellite_points_by_named_numbers_and_refuses_what_only_a_testbed_obe
     )
     refused: list[tuple[str, dict[str, Any], str]] = [
         ("mode", {"mode": int(Mode.HOLD)}, "no such mode"),
-        ("schedule", {"at": "2099-01-01T00:00:00", "words": "slew 0.2"}, "does not obey slew"),
+        ("schedule", {"at": "2099-01-01T00:00:00", "words": "slew 0.2"}, "does not accept slew"),
         ("schedule", {"at": "2099-01-01T00:00:00", "words": "point groud"}, "groud"),
         ("schedule", {"at": "2001-01-01T00:00:00", "words": "point sun"}, "has passed"),
         ("schedule", {"at": "soon", "words": "point sun"}, "not a UTC"),
