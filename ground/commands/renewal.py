@@ -8,7 +8,8 @@ import os
 import re
 import sys
 import tarfile
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +20,7 @@ from tuf.api.exceptions import RepositoryError
 from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, TargetFile, Targets, Timestamp
 
 from flight.app.run import utc_ns
+from flight.link.commands import CommandPacker, Ping
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import KINDS, Activate, Confirm, Directive, Withdraw
@@ -28,6 +30,7 @@ from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
 from ground.commands.options import positive
 from ground.link.commanding import add_link_options, explained, no_answer, sha256_of, terminal_of
+from ground.link.terminal import Terminal
 from knightcube.errors import FlightError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
@@ -46,6 +49,8 @@ PARTS = (
 )
 """Source files and folders that a release contains."""
 _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
+_SILENCE_S = 5.0
+"""Time (s) without telemetry after which the ground sends a ping."""
 _TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0
 """Default times (s) to wait for the privileged part, which runs every 10 s, and for a release to be built."""
 
@@ -210,8 +215,7 @@ def _command(options: argparse.Namespace) -> int:
     builds = options.what == "activate" and options.kind == "release"
     timeout = options.timeout or (_BUILD_TIMEOUT_S if builds else _TIMEOUT_S)
     with closing(terminal_of(options)) as terminal:
-        counter = terminal.send(directives.pack(directive, utc_ns()), options.spi)
-        for report in terminal.follow(counter, options.spi, timeout):
+        for report in _followed(terminal, directives.pack(directive, utc_ns()), options.spi, timeout):
             reports.append(report)
             sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
             sys.stdout.flush()
@@ -226,6 +230,24 @@ def _command(options: argparse.Namespace) -> int:
             "`withdraw`, whose answer says whether a trial is running"
         )
     return int(reports[-1].stage in {Stage.REFUSED, Stage.FAILED})
+
+
+def _followed(terminal: Terminal, packet: bytes, spi: int, seconds: float) -> Iterator[Report]:
+    """Send a directive, and yield the reports on it until the final report, for at most `seconds` s.
+
+    A ping follows each silence, because a link that has restarted for a trial knows no UDP address of the
+    ground, and every link forgets such an address after a minute.
+    """
+    counter, packer = terminal.send(packet, spi), CommandPacker()
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0.0:
+        heard = terminal.gate.admitted
+        for report in terminal.follow(counter, spi, min(left, _SILENCE_S)):
+            yield report
+            if report.stage.final or report.stage is Stage.REPEATED:
+                return
+        if terminal.gate.admitted == heard:
+            terminal.send(packer.pack(Ping(), utc_ns()), spi)
 
 
 def artefact(kind: str, path: Path) -> bytes:

@@ -16,7 +16,7 @@ from tests.deploy.scenario import SERVICE, systemctl, wait
 from tests.deploy.scripts import ROOT
 
 LINK_SERVICE = "knightcube-link.service"
-CONFIG, PREFIX = Path("/etc/knightcube/flight.yaml"), Path("/opt/knightcube")
+CONFIG, STATUS = Path("/etc/knightcube/flight.yaml"), Path("/var/lib/knightcube-renewal/status")
 TRIAL = ("--timeout", "600", "--despite-faults")
 """Options of a trial: the devices of a busy machine answer late, which a flight reports as a fault."""
 FUTURE = "from __future__ import annotations\n"
@@ -105,6 +105,7 @@ def play(folder: Path, facts: Path) -> dict[str, Any]:
     wait(facts.exists, 20.0)
     systemctl("start", SERVICE, LINK_SERVICE, "knightcube-renewal.timer")
     wait(_are_up, 60.0)
+    wait(STATUS.exists, 60.0)  # the link refuses renewals until the privileged part has run once
     ground = Ground(folder)
     seen: dict[str, Any] = {
         "first": flown_release(),

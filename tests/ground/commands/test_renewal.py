@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import tarfile
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
+from flight.link.commands import Ping, unpack
 from flight.link.process.commanding import Report, Stage
 from tests.deploy.scripts import changed_testbed, script
 from tests.ground.commands.in_process import command
@@ -170,7 +172,10 @@ def test_activate_succeeds_only_if_the_trial_has_begun(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, stages: list[str], status: int, error: str
 ) -> None:
     terminal = Mock()
-    terminal.follow.return_value = [Report(1, 7, Stage[stage], "activate", "text") for stage in stages]
+    reports = [Report(1, 7, Stage[stage], "activate", "text") for stage in stages]
+    terminal.follow.side_effect = [reports, *[[]] * 1000]
+    times = itertools.count(0.0, 5.0)
+    monkeypatch.setattr("ground.commands.renewal.time.monotonic", lambda: next(times))
     monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: terminal)
     (tmp_path / "bundle").write_bytes(b"bundle")
     done = command(
@@ -180,3 +185,17 @@ def test_activate_succeeds_only_if_the_trial_has_begun(
     assert done.stdout.splitlines() == [f"{stage.lower()}: text" for stage in stages]
     assert error in done.stderr
     assert bool(error) == bool(done.stderr)
+
+
+def test_a_ping_follows_each_silence_so_that_a_restarted_link_knows_the_ground(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal = Mock()
+    terminal.gate.admitted = 0
+    terminal.follow.side_effect = [[], [], [Report(1, 7, Stage.COMPLETED, "confirm", "text")]]
+    monkeypatch.setattr("ground.commands.renewal.terminal_of", lambda _: terminal)
+    done = command("renewal", "confirm", "--link", "127.0.0.1:1", "--keys", "k", "release", folder=tmp_path)
+    assert (done.returncode, done.stdout) == (0, "completed: text\n")
+    first, *pings = [sent.args[0] for sent in terminal.send.call_args_list]
+    assert [unpack(packet) for packet in pings] == [Ping()] * 2
+    assert first != pings[0]
