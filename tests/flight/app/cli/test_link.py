@@ -17,6 +17,7 @@ import tty
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -242,7 +243,7 @@ def test_a_release_tests_its_link_without_a_network(monkeypatch: pytest.MonkeyPa
     """The sandbox of knightcube-renewal.service allows sockets of the family AF_UNIX only."""
     opened = socket.socket.__init__
 
-    def refusing(self: socket.socket, family: int = -1, *words: int, **named: int | None) -> None:
+    def refusing(self: socket.socket, family: int = -1, *words: Any, **named: Any) -> None:
         if family != socket.AF_UNIX:
             raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
         opened(self, family, *words, **named)
