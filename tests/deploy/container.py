@@ -226,6 +226,7 @@ Requires=sysinit.target
 After=sysinit.target
 [Service]
 Type=oneshot
+Environment=PYTHONPATH={ROOT}
 WorkingDirectory={ROOT}
 ExecStart={sys.prefix}/bin/python -m {scenario} /share {_FACTS}
 ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl --no-block --force poweroff'
