@@ -87,7 +87,7 @@ def test_a_bit_of_the_monitors_set_up_is_measured_and_mended(bit: int) -> None:
     rig.wire.monitor.upset(CONFIG, bit)
     assert rig.wire.monitor.register(CONFIG) != sound
     rig.clock.sleep_until_ns(3250 * MS)
-    assert "lost its register settings" in monitor.error()
+    assert "had lost its set-up" in monitor.error()
     rig.clock.sleep_until_ns(5000 * MS)
     assert not monitor.error()
     assert rig.wire.monitor.register(CONFIG) == sound
