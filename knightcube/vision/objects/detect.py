@@ -334,7 +334,9 @@ _PARTS = 12
 # Largest excess of chi-square over its expected value beside an object, relative to the decrease of
 # chi-square by the object: for any object, and for an object whose streak resembles a star's.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
-# The same limit for an object whose ends are not yet located.
+# Share of the required decrease of chi-square above which light may be a part of an object's streak.
+_PART = 0.6
+# The limit of any object, for an object whose ends are not yet located.
 _HOPELESS = 4.0
 # Distance from a star's path at which its light falls below the noise beyond that of its Gaussian profile,
 # in standard deviations of the PSF.
@@ -512,8 +514,15 @@ class Judge:
         enough = self.objects.crossing_improvement
         try:
             few = self._light(ends, stars, _FEW_PATHS)
-            if self._gained(few, few.explain(ends)) < enough:
-                return None
+            gained = self._gained(few, few.explain(ends))
+            if gained < enough:
+                longer = few.located(ends, among_stars=True) if gained >= _PART * enough else None
+                if longer is None:
+                    return None
+                ends = longer.ends
+                few = self._light(ends, stars, _FEW_PATHS)
+                if self._gained(few, few.explain(ends)) < enough:
+                    return None
             return self._candidate(ends, (), self._light(ends, stars), stars, enough)
         except FlightError:
             return None

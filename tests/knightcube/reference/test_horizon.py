@@ -75,7 +75,10 @@ def test_more_than_three_points_of_a_circle_give_it_too() -> None:
 
 @pytest.mark.parametrize(
     ("points", "complaint"),
-    [(np.zeros((2, 2)), "needs at least three"), (np.array([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]]), "one line")],
+    [
+        (np.zeros((2, 2)), "needs at least three"),
+        (np.array([[0.0, 0.0], [1.0, 2.0], [2.0, 4.0]]), "one line"),
+    ],
 )
 def test_points_on_no_circle_are_refused(points: FloatArray, complaint: str) -> None:
     with pytest.raises(NoCircleError, match=complaint):

@@ -255,9 +255,11 @@ def test_time_reversal_reverses_all_motions() -> None:
     path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)
     pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
     forward, backward = _only(_detect(pixels, _ROTATION)), _only(_detect(pixels, -_ROTATION))
-    np.testing.assert_allclose(backward.direction, -forward.direction, atol=1e-9)
-    np.testing.assert_allclose(backward.endpoints, forward.endpoints[::-1])
-    assert backward.relative_rate == pytest.approx(forward.relative_rate)
+    # The fit of the ends stops at a part of their uncertainty.
+    tenth = 0.1 * float(forward.sigma.min())
+    np.testing.assert_allclose(backward.endpoints, forward.endpoints[::-1], atol=tenth)
+    np.testing.assert_allclose(backward.direction, -forward.direction, atol=1e-4)
+    assert backward.relative_rate == pytest.approx(forward.relative_rate, rel=1e-3)
 
 
 def test_frames_without_an_object_have_none() -> None:
