@@ -613,9 +613,7 @@ class Renewal:
         trial = self._state.trial
         if trial is None:
             what = "release" if kind == "release" else "configuration"
-            if not self._go_back(
-                what, name, "withdraw", f"the previous {what} returned at the ground's request"
-            ):
+            if not self._go_back(what, name, "withdraw", f"the ground withdrew the present {what}"):
                 raise Refused(f"there is no previous {what}")
             return
         if trial.kind != kind:
@@ -735,8 +733,8 @@ class Renewal:
 
     def _other_release(self, trial: Trial) -> str:
         """Return the release that flight or link run instead of the one on trial, or an empty text."""
-        flown = {self._board.flown_release(unit) for unit in (FLIGHT, LINK)} - {"", trial.new}
-        return min(flown, default="") if trial.what == "release" else ""
+        units = (FLIGHT, LINK) if trial.what == "release" else ()
+        return min({*map(self._board.flown_release, units)} - {"", trial.new}, default="")
 
     def _go_back(self, what: str, request: str, word: str, text: str) -> bool:
         """Return to the previous release or configuration. Returns False without a previous version."""

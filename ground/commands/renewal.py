@@ -8,8 +8,7 @@ import os
 import re
 import sys
 import tarfile
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +19,6 @@ from tuf.api.exceptions import RepositoryError
 from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, TargetFile, Targets, Timestamp
 
 from flight.app.run import utc_ns
-from flight.link.commands import CommandPacker, Ping
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import KINDS, Activate, Confirm, Directive, Withdraw
@@ -29,8 +27,7 @@ from flight.loop.state import LinuxFiles, replace_file
 from flight.schema.document import read_document, read_text
 from flight.schema.reader import parse
 from ground.commands.options import positive
-from ground.link.commanding import add_link_options, explained, no_answer, sha256_of, terminal_of
-from ground.link.terminal import Terminal
+from ground.link.commanding import add_link_options, command, explained, failed, sha256_of, terminal_of
 from knightcube.errors import FlightError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
@@ -49,8 +46,6 @@ PARTS = (
 )
 """Source files and folders that a release contains."""
 _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
-_SILENCE_S = 5.0
-"""Time (s) without telemetry after which the ground sends a ping."""
 _TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0
 """Default times (s) to wait for the privileged part, which runs every 10 s, and for a release to be built."""
 
@@ -211,43 +206,27 @@ def _command(options: argparse.Namespace) -> int:
     else:
         directive = Confirm(kind) if options.what == "confirm" else Withdraw(kind)
 
-    reports: list[Report] = []
+    def show(report: Report) -> None:
+        sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
+        sys.stdout.flush()
+
+    def has_begun(reports: list[Report]) -> bool:
+        """Return whether the link and then the privileged part have reported a start: the trial runs."""
+        return options.what == "activate" and [one.stage for one in reports].count(Stage.STARTED) == 2
+
     builds = options.what == "activate" and options.kind == "release"
     timeout = options.timeout or (_BUILD_TIMEOUT_S if builds else _TIMEOUT_S)
+    packet = directives.pack(directive, utc_ns())
     with closing(terminal_of(options)) as terminal:
-        for report in _followed(terminal, directives.pack(directive, utc_ns()), options.spi, timeout):
-            reports.append(report)
-            sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
-            sys.stdout.flush()
-            # The link reports the first start; the second start, of the privileged part, begins the trial.
-            if options.what == "activate" and [one.stage for one in reports].count(Stage.STARTED) == 2:
-                return 0
-    if not reports:
-        raise no_answer(timeout)
+        reports = command(terminal, packet, options.spi, timeout, show, has_begun)
+    if failed(reports) or has_begun(reports):
+        return int(bool(failed(reports)))
     if not reports[-1].stage.final:
         raise FlightError(
             f"no result of the renewal within {timeout:g} s: look at the telemetry, and send `confirm` or "
             "`withdraw`, whose answer says whether a trial is running"
         )
-    return int(reports[-1].stage in {Stage.REFUSED, Stage.FAILED})
-
-
-def _followed(terminal: Terminal, packet: bytes, spi: int, seconds: float) -> Iterator[Report]:
-    """Send a directive, and yield the reports on it until the final report, for at most `seconds` s.
-
-    A ping follows each silence, because a link that has restarted for a trial knows no UDP address of the
-    ground, and every link forgets such an address after a minute.
-    """
-    counter, packer = terminal.send(packet, spi), CommandPacker()
-    until = time.monotonic() + seconds
-    while (left := until - time.monotonic()) > 0.0:
-        heard = terminal.gate.admitted
-        for report in terminal.follow(counter, spi, min(left, _SILENCE_S)):
-            yield report
-            if report.stage.final or report.stage is Stage.REPEATED:
-                return
-        if terminal.gate.admitted == heard:
-            terminal.send(packer.pack(Ping(), utc_ns()), spi)
+    return 0
 
 
 def artefact(kind: str, path: Path) -> bytes:

@@ -50,6 +50,8 @@ from knightcube.errors import FlightError, UsageError
 Show = Callable[[Report], object]
 _BLOCK = 64
 """Number of frame counters reserved at once, because each reservation takes two disk writes."""
+_SILENCE_S = 5.0
+"""Time (s) without telemetry after which the ground sends a ping while it awaits the reports on a command."""
 _REPEAT_NS = 5_000_000_000
 """Time (ns) after which an unanswered command is sent again."""
 _BURST_S = 0.05
@@ -182,12 +184,34 @@ def no_answer(seconds: float) -> FlightError:
     )
 
 
-def command(terminal: Terminal, packet: bytes, spi: int, seconds: float, show: Show) -> list[Report]:
-    """Send a command, pass its reports to `show` and return them. Raises FlightError without a report."""
-    found = []
-    for report in terminal.follow(terminal.send(packet, spi), spi, seconds):
-        show(report)
-        found.append(report)
+def command(
+    terminal: Terminal,
+    packet: bytes,
+    spi: int,
+    seconds: float,
+    show: Show,
+    ended: Callable[[list[Report]], bool] = lambda _: False,
+) -> list[Report]:
+    """Send a command, pass its reports to `show` and return them. Raises FlightError without a report.
+
+    The call ends with the final report, if `ended` is true for the list of received reports, or after
+    `seconds` s. A ping is sent after each silence, because a link that restarts forgets the UDP address of
+    the ground, and every link forgets an address that has sent no frame for a minute.
+    """
+    counter, packer, found = terminal.send(packet, spi), CommandPacker(), list[Report]()
+    left = seconds
+    while left > 0.0:
+        wait, heard = min(left, _SILENCE_S), terminal.gate.admitted
+        left -= wait
+        for report in terminal.follow(counter, spi, wait):
+            if report.stage is Stage.REPEATED and found:
+                continue  # somebody repeated the frame of a command that was accepted
+            show(report)
+            found.append(report)
+            if ended(found) or report.stage.final or report.stage is Stage.REPEATED:
+                return found
+        if terminal.gate.admitted == heard and left > 0.0:
+            terminal.send(packer.pack(Ping(), utc_ns()), spi)
     if not found:
         raise no_answer(seconds)
     return found

@@ -19,8 +19,8 @@ from typing import Any
 from knightcube.vision.startracker.index.sky_index import PATH
 from tests.hal.guardian.live_flight import ROOT, write_config
 
-LIMIT_S = 900.0
-"""Longest time (s) of a scenario in the container. It takes two to five minutes on an idle machine."""
+LIMIT_S = 1500.0
+"""Longest time (s) of a scenario in the container, on a busy machine."""
 SERVICES, RENEWALS = "tests.deploy.scenario", "tests.deploy.renewal_scenario"
 """Modules of the scenarios: faults of the services, and renewals by the ground over the link."""
 _SHARE = "/share"
@@ -46,7 +46,7 @@ _TOOLS = ("systemd-nspawn", "unshare", "systemctl", "mount", "useradd")
 def why_not() -> str:
     """Return the reason why this machine cannot boot such a container, or ""."""
     if os.environ.get("CI"):
-        return "takes two minutes: not in continuous integration"
+        return "takes minutes: not in continuous integration"
     if os.geteuid() != 0:
         return "needs root, to mount and to boot systemd in a container"
     missing = [tool for tool in _TOOLS if shutil.which(tool) is None]

@@ -57,7 +57,7 @@ class Ground:
             "activate": self.call("renewal activate", kind, bundle, *TRIAL),
         }
         if steps["activate"][0] == 0:
-            # A command is lost while the link restarts with what is on trial: a person sends it again.
+            # A command is lost while the link restarts for the trial; an operator sends the command again.
             for _ in range(6):
                 steps["confirm"] = self.call("renewal confirm", kind, "--timeout", "30")
                 if steps["confirm"][0] == 0:

@@ -10,7 +10,7 @@ import pytest
 from tests.deploy import container
 
 REASON = container.why_not()
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(3600)]
 
 
 @pytest.fixture(scope="module")

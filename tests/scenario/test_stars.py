@@ -95,7 +95,7 @@ def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstratio
 
 
 def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
-    """Without the IMU there is no estimate that could predict or use an attitude."""
+    """Without the IMU, no estimate predicts or uses an attitude."""
     run = fly(demo_config(8.0), tmp_path, lambda rigged: unit_silent(rigged, 0.0, 4.0))
     assert_solved(run)
     assert run["stars"]["tracked"].tolist() == [_LOST, _TRACKED]

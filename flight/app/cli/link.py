@@ -8,7 +8,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -62,6 +61,7 @@ from flight.schema.sections import Link
 from hal.buses.clock import SystemClock
 from hal.buses.linux_process import ServiceManager
 from hal.buses.serial_port import PySerialPort
+from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import FlightError, UsageError
 
 _NICE = 10
@@ -229,7 +229,7 @@ def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: Exit
     return lines
 
 
-class _TestLine:
+class _LoopbackLine:
     """Line to a ground in the same process; the sandbox in which a release is built has no network."""
 
     name = "self-test"
@@ -270,14 +270,15 @@ def self_test() -> None:
         length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(packet) + CRC_BYTES
         header = TelecommandHeader(settings.spacecraft, 0, 0).pack(length)
         frame, _ = Sealer(Vault(keys[1]), COMMAND_SPIS[0], TELECOMMAND_MASK).seal(header, packet)
-        line = _TestLine(close_frame(frame))
+        line = _LoopbackLine(close_frame(frame))
         control: ControlLine[Sent] = ControlLine(folder / "commands", folder)
-        station = Station(settings, Vault(keys[0]), [line], control, LogFollower(folder), SystemClock())
+        clock = SystemClock()
+        station = Station(settings, Vault(keys[0]), [line], control, LogFollower(folder), clock)
         for _ in range(1000):
             station.turn()
             if station.obeyed and line.answers:
                 return
-            time.sleep(0.02)
+            clock.sleep_until_ns(clock.now_ns() + SECOND_NS // 50)
     raise FlightError("self-test: the link executed no command")
 
 

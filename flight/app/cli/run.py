@@ -63,7 +63,7 @@ def summary_facts(result: RunResult, elapsed: float) -> dict[str, Any]:
         "log_error": result.log_error or None,
         "faults": result.faults,
         "devices_late": result.devices_late and result.devices_late[0],
-        "devices_latest_s": result.devices_late and result.devices_late[1],
+        "devices_late_max_s": result.devices_late and result.devices_late[1],
     }
 
 

@@ -158,8 +158,7 @@ def sweep(
     """Return the feedback gains K (n, controls, 6), the affine parts k, and the cost-to-go at the start.
 
     The affine part k of the controls has the shape (n, controls, columns). The affine part of the error model
-    is `affine` (n, 6, columns), and `end` is the cost-to-go after the last step. The computation takes 30 us
-    per step.
+    is `affine` (n, 6, columns), and `end` is the cost-to-go after the last step.
     """
     from scipy.linalg.lapack import dgesv  # noqa: PLC0415 - only the worker that plans needs scipy
 
@@ -177,7 +176,9 @@ def sweep(
         later[:, 6:] += slope
         sides = push.T @ later
         sides[:, 6:] += cost.control_slope[k]
-        *_, feedback[k], singular = dgesv(spread, sides)  # a third of the time that numpy takes
+        *_, feedback[k], singular = dgesv(
+            spread, sides
+        )  # numpy.linalg.solve checks its small arguments longer
         if singular:
             raise np.linalg.LinAlgError("the costs of the controls are singular")
         found = drive.T @ later - sides[:, :6].T @ feedback[k] + weights[k]

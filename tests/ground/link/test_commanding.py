@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import pytest
 
+from flight.link.commands import Ping, unpack
 from flight.link.files.store import Store
 from flight.link.files.units import DOWN, UP, UnitPacker, is_unit
 from flight.link.frames import LONGEST_FRAME
@@ -45,6 +46,7 @@ class FakeTerminal:
         self.answers = list(answers)
         self.sent: list[bytes] = []
         self.names: list[Any] = []
+        self.gate = SimpleNamespace(admitted=0)
 
     def sealer(self, spi: int, block: int) -> Any:
         return SimpleNamespace(name=spi, block=block, _name=spi)
@@ -91,6 +93,21 @@ def test_each_report_is_shown_and_none_is_an_error() -> None:
     assert commanding.command(terminal(None, answers), b"x", 1, 2.0, shown.append) == answers == shown
     with pytest.raises(FlightError, match=r"within 2\.5 s"):
         commanding.command(terminal(), b"x", 1, 2.5, shown.append)
+
+
+def test_a_ping_follows_each_silence_so_that_a_restarted_link_knows_the_ground() -> None:
+    double = terminal(None, [report(Stage.ACCEPTED)], [], [report(Stage.REPEATED)], [report(Stage.FAILED)])
+    found = commanding.command(double, b"x", 1, 20.0, lambda _: None)
+    assert [one.stage for one in found] == [Stage.ACCEPTED, Stage.FAILED]
+    assert [unpack(packet) for packet in double.sent[1:]] == [Ping()] * 3
+
+
+def test_a_command_is_followed_until_its_caller_has_seen_enough() -> None:
+    answers = [report(Stage.ACCEPTED), report(Stage.STARTED), report(Stage.STARTED)]
+    found = commanding.command(
+        terminal(None, answers), b"x", 1, 20.0, lambda _: None, lambda found: len(found) == 2
+    )
+    assert found == answers[:2]
 
 
 @pytest.fixture

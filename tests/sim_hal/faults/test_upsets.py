@@ -162,7 +162,7 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
 
 @pytest.mark.parametrize("name", UPSETS)
 def test_what_is_not_said_is_drawn(name: str) -> None:
-    """Of many random upsets, some change the registers in different ways."""
+    """Random upsets change registers in different ways."""
     lock = build_lockstep(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
     hardware = lock.hardware
     assert hardware.monitor is not None

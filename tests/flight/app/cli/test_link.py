@@ -40,6 +40,7 @@ from ground.link.terminal import (
     report_of,
 )
 from ground.xtce import TELECOMMANDS
+from hal.buses.clock import SystemClock
 from knightcube.errors import FlightError, UsageError
 from tests.flight.link.vaults import frame_with
 from tests.support.flights import CONFIG
@@ -254,6 +255,6 @@ def test_a_release_tests_its_link_without_a_network(monkeypatch: pytest.MonkeyPa
 
 def test_a_release_whose_link_obeys_nothing_fails_its_test(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flight.app.cli.link.close_frame", lambda frame: frame + b"\0\0")
-    monkeypatch.setattr(time, "sleep", lambda _: None)
+    monkeypatch.setattr(SystemClock, "sleep_until_ns", lambda *_: None)
     with pytest.raises(FlightError, match="executed no command"):
         self_test()

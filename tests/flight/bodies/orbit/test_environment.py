@@ -95,7 +95,7 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
     assert known.state(0) is None
     used = [known.fix(reading(elements, second * SECOND_NS)) for second in (8, 9, 10)]
     assert used == [False, False, True]
-    assert (known.refused, known.refusal) == (0, ""), "the first fixes contradict nothing"
+    assert (known.refused, known.refusal) == (0, ""), "the first fixes were refused"
     found = known.at(12 * SECOND_NS)
     assert found is not None
     expected = elements.at(UNIX_EPOCH + (UTC_NS + 12 * SECOND_NS) / (DAY * SECOND_NS))
