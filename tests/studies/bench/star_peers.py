@@ -2,9 +2,9 @@
 
 The program runs without this repository in the Python of the peers, because cedar-solve needs numpy below 2.
 A job is a star list (`pixels`, `size`) or a frame (`image`, a numpy file), with the field of view and its
-uncertainty in degrees. For a frame, the time includes the star extraction of the peer. The program prints one
-JSON object with the CPU time (ms) and the boresight (3,) of each job, or null for a refusal, and the growth of
-resident memory by catalogue and index after the import of the peer.
+uncertainty in degrees. For a frame, the time includes the star extraction of the peer. The program prints
+one JSON object with the CPU time (ms) and the boresight (3,) of each job, or null for a refusal, and the
+growth of resident memory by catalogue and index after the import of the peer.
 """
 
 import importlib
