@@ -1,12 +1,12 @@
-"""Sizes of the product's files, classes and functions, and files that a piece of work enters.
+"""Sizes of the product's files, classes and functions, and the number of files that each activity enters.
 
-`python -m tests.studies.house [--touched]`. Layers and cycles are import-linter's (pyproject.toml).
+Command: `python -m tests.studies.house [--touched]`. Import-linter checks layers and cycles (pyproject.toml).
 
-With `--touched` it flies and solves an image, and counts the files of the product that one control cycle, the
-opening of a flight and a star fix enter. A file counts if one of its functions is called; the execution of a
-module or of a class body does not count. The flight is the step demonstration in lock-step. Its emulated
-devices stand for the far end of the wires: `sim_hal`, and whatever `sim_hal` calls, does not count. A job
-that the lock-step runner runs in the calling thread belongs to a worker and does not count either.
+With `--touched` the program flies and solves an image. It counts the product files that one control cycle,
+the opening of a flight and a star fix enter. A file counts if one of its functions is called; the execution
+of a module or of a class body does not count. The flight is the step demonstration in lock-step. Files of
+`sim_hal` and files that `sim_hal` calls do not count, because they emulate the hardware. A job that the
+lock-step runner runs in the calling thread belongs to a worker and does not count either.
 """
 
 from __future__ import annotations
@@ -40,18 +40,21 @@ from tests.support.scenes import exposed
 ROOT = Path(__file__).resolve().parents[2]
 PRODUCT = ("knightcube", "flight", "ground", "hal", "sim_hal")
 MOST_LINES = {"file": 900, "class": 350, "function": 50}
-"""Lines of a piece; a class may be longer if its docstring says why ("... lines: ...")."""
+"""Largest number of lines; a class may be longer if its docstring gives a reason ("... lines: ...")."""
 MOST_LONG_FUNCTIONS = 20
 _REASON = re.compile(r"\blines\b", re.IGNORECASE)
 LIMITS = {"control cycle": 30, "opening of a flight": 45, "star fix": 20}
-"""Largest number of files of each piece of work."""
+"""Largest number of files that each activity may enter."""
 _FIRST, _LAST = 400, 440
-"""Control cycles that are measured: one second of steady flight, after the first plan."""
+"""First and last control cycle of the measurement: one second of steady flight, after the first plan."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A file, class or function with its length in lines; `excused` if its docstring gives a reason."""
+    """A file, class or function with its length in lines.
+
+    `excused` is true if its docstring gives a reason.
+    """
 
     kind: str
     name: str
@@ -60,7 +63,7 @@ class Piece:
 
     @property
     def long(self) -> bool:
-        """Whether it is longer than its kind may be."""
+        """Whether the length exceeds the limit of its kind."""
         return self.lines > MOST_LINES[self.kind] and not self.excused
 
     def __str__(self) -> str:
@@ -115,7 +118,7 @@ class Touched:
 
     @contextmanager
     def measured(self) -> Iterator[None]:
-        """Collect the files that the block enters."""
+        """Record the files that the block enters."""
         self._outside = 0
         sys.setprofile(self._profile)
         try:
@@ -125,7 +128,7 @@ class Touched:
 
 
 def of_flight() -> dict[str, set[str]]:
-    """Return the files of opening a flight, from its request to its first cycle, and of a control cycle.
+    """Return the files entered by opening a flight, from request to first cycle, and by a control cycle.
 
     The control cycle is the one that enters the most files in a second of flight.
     """
@@ -156,7 +159,7 @@ def of_flight() -> dict[str, set[str]]:
 
 
 def of_star_fix() -> dict[str, set[str]]:
-    """Return the files between an image of stars at rest and its attitude."""
+    """Return the files entered from an image of stars at rest to its attitude."""
     camera = StarCameraModel(field_of_view=np.radians(12.0))
     scene = exposed(camera, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), 0.2, np.random.default_rng(1))
     touched, tracker = Touched(), StarTracker(fov_deg=12.0)
@@ -167,12 +170,12 @@ def of_star_fix() -> dict[str, set[str]]:
 
 
 def measure() -> dict[str, set[str]]:
-    """Return the files that each piece of work in `LIMITS` enters."""
+    """Return the files that each activity of `LIMITS` enters."""
     return of_flight() | of_star_fix()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print sizes and files; return 1 when a limit is not kept."""
+    """Print sizes and files. Returns 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.house", description=__doc__)
     parser.add_argument("--touched", action="store_true", help="also count the files that are entered")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -194,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def kept(long: Sequence[Piece]) -> bool:
-    """Return whether only functions are too long, and not too many."""
+    """Return whether only functions are too long, and no more of them than permitted."""
     return all(piece.kind == "function" for piece in long) and len(long) <= MOST_LONG_FUNCTIONS
 
 

@@ -1,11 +1,11 @@
-"""Measures how many random faults of one line the fast tests find: `python -m tests.studies mutants`.
+"""Share of random one-line faults that the fast tests find: `python -m tests.studies mutants`.
 
 Each mutant changes one place on one line of product code and is tested in a temporary copy of the repository:
 the tracked files with their uncommitted changes. The fast tests of the mirrored file run first, then those of
 the mirrored folder, up to the first failure. A failure counts if the same test passes on the unchanged code.
 
-Not changed are docstrings, strings, annotations, decorators, imports, `raise` statements and the `strict` of
-`zip`. Known equivalent mutants stand in `equivalent_mutants.yaml`, each with a reason.
+Docstrings, strings, annotations, decorators, imports, `raise` statements and the `strict` of `zip` are not
+changed. Known equivalent mutants are listed in `equivalent_mutants.yaml`, each with a reason.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.yaml")
 PACKAGES = ("knightcube", "flight", "hal", "sim_hal", "ground")
-LIMIT_S = 600.0  # of one mutant's tests: a longer run counts as a hang
-MEMORY = 6 << 30  # bytes of data that the tests of a mutant may allocate
+LIMIT_S = 600.0  # limit for the tests of one mutant: a longer run counts as a hang
+MEMORY = 6 << 30  # most bytes of data that the tests of a mutant may allocate
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.GtE, ast.LtE),
     ast.LtE: (ast.Gt, ast.Lt),
@@ -65,7 +65,7 @@ _ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
 
 
 class MutantsError(Exception):
-    """A wrong option, or a repository that cannot be copied."""
+    """Error for a wrong option, or for a repository that cannot be copied."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Mutant:
     after: str
 
     def __str__(self) -> str:
-        """Return the place and the change on one line."""
+        """Return file, line and change as text on one line."""
         return f"{self.path}:{self.line}: {self.kind}: {self.before}  ->  {self.after}"
 
 
@@ -96,7 +96,7 @@ class Verdict:
 
 
 def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
-    """Draw mutants, test them and print the result; return 0, or 2 for wrong use, or 130 after Ctrl-C."""
+    """Draw mutants, test them and print the result. Returns 0, 2 for wrong use, or 130 after Ctrl-C."""
     options = _parser().parse_args(arguments)
     known = {
         (entry["line"], entry["mutant"]): entry["reason"]
@@ -177,7 +177,7 @@ class _Finder(ast.NodeVisitor):
         self.found: list[Mutant] = []
 
     def _add(self, node: ast.expr | ast.stmt, kind: str, changed: ast.AST | str) -> None:
-        """Add the mutant that replaces `node`, if it stands on one line."""
+        """Add the mutant that replaces `node`, if the node is on a single line."""
         if node.end_lineno != node.lineno or node.end_col_offset is None:
             return
         text = changed if isinstance(changed, str) else f"({ast.unparse(changed)})"
@@ -307,8 +307,8 @@ class _Finder(ast.NodeVisitor):
 def mirrored_tests(root: Path, path: str) -> list[str]:
     """Return the test files that may find a fault of a module.
 
-    The mirrored file comes first, then the other files of the mirrored folder, those that import the module
-    before the others. The nearest parent stands for a folder without a mirror.
+    The mirrored file comes first, then the other files of the mirrored folder, beginning with those that
+    import the module. A folder without a mirror is represented by its nearest parent that has one.
     """
     module = Path(path)
     mirror = root / "tests" / module.parent
@@ -339,13 +339,13 @@ class _Copy:
     _writes: int = 0
 
     def stop(self) -> None:
-        """End the tests that run, and begin no others."""
+        """Stop the running tests, and start no others."""
         self.stopped = True
         if self._process is not None:
             _kill_group(self._process)
 
     def judge(self, mutant: Mutant) -> Verdict:
-        """Test a mutant; failures that the unchanged code shows too are left out of the count."""
+        """Test a mutant. Failures that also occur on the unchanged code do not count."""
         tests = mirrored_tests(self.folder, mutant.path)
         original = (self.folder / mutant.path).read_text(encoding="utf-8")
         lines = original.splitlines(keepends=True)
@@ -367,13 +367,16 @@ class _Copy:
             self.deselected.append(failure)
 
     def _write(self, path: str, text: str) -> None:
-        """Write a module with a new time: kept bytecode is recognised by the second and the size."""
+        """Write a module with a new modification time.
+
+        Python recognises stale bytecode by the second of that time and by the size of the module.
+        """
         (self.folder / path).write_text(text, encoding="utf-8")
         self._writes += 1
         os.utime(self.folder / path, times=(1e9 + self._writes, 1e9 + self._writes))
 
     def _first_failure(self, tests: Sequence[str]) -> str | None:
-        """Return the test function, the file, or the way in which the tests fail; None if they pass."""
+        """Return the test function or file that fails, or the kind of failure; None if the tests pass."""
         options = ["-x", "-q", "-m", "not slow", "--no-header", "-rfE", "--tb=no", "-p", "no:xdist"]
         for name in self.deselected:
             options += ["--deselect", name]
@@ -398,7 +401,7 @@ class _Copy:
                 return f"hang: not done after {LIMIT_S:g} s"
             finally:
                 _kill_group(process)
-        if process.returncode in (0, 5):  # pytest: all passed; no test was selected
+        if process.returncode in (0, 5):  # pytest's exit codes: 0 all passed, 5 no test was selected
             return None
         for line in output.splitlines():
             if line.startswith(("FAILED ", "ERROR ")):
@@ -416,10 +419,10 @@ def _kill_group(process: subprocess.Popen[str]) -> None:
 def judge(
     root: Path, mutants: Sequence[Mutant], known: dict[tuple[str, str], str], workers: int = 1
 ) -> Iterator[Verdict]:
-    """Yield the verdict of each mutant as it comes.
+    """Yield the verdict of each mutant when it is ready.
 
-    `known` gives the reasons of equivalent mutants by line before and after; they are not run. Raises
-    MutantsError if git cannot copy the repository.
+    `known` maps the line before and after the change to the reason why the mutant is equivalent. These
+    mutants are not run. Raises MutantsError if git cannot copy the repository.
     """
     for mutant in mutants:
         if (mutant.before, mutant.after) in known:
@@ -452,7 +455,7 @@ def judge(
                 for future in done:
                     yield future.result()
         finally:
-            # The tests run in sessions of their own, which Ctrl-C does not reach.
+            # The tests run in sessions of their own, so Ctrl-C does not reach them.
             for copied in copies:
                 copied.stop()
             pool.shutdown(cancel_futures=True)

@@ -1,6 +1,6 @@
 """`python -m tests.studies.object_picture RUN`: draws a pass that a satellite followed, from its packets.
 
-The frame is rendered again with the attitude that the flight estimated and the object where its track has it.
+The frame is rendered with the attitude that the flight estimated and the object position of its track.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_object.yaml"
 
 
 def draw(run: Run, path: Path) -> None:
-    """Draw frame, way in the field, and angles over the pass."""
+    """Draw the frame, the path of the object in the field, and the angles over the pass."""
     config = as_orbit(configuration.load(CONFIG))
     assert config.camera is not None
     mounting = np.array(config.camera.mounting)
@@ -91,12 +91,12 @@ def _frame(axes: Axes, run: Run, cameras: FloatArray) -> None:
 
 
 def _at(times: FloatArray, known: FloatArray, quaternions: FloatArray) -> FloatArray:
-    """Return the attitudes (n, 4) nearest to times."""
+    """Return the attitudes (n, 4) that are nearest in time to `times` (n,)."""
     return np.asarray(quaternions[np.clip(np.searchsorted(known, times), 0, len(known) - 1)])
 
 
 def main() -> int:
-    """Draw."""
+    """Draw the picture; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="folder of a flight of config/orbit_object.yaml")
     parser.add_argument("--out", type=Path, default=Path("docs/pictures/object.png"))

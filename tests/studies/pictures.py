@@ -46,16 +46,16 @@ CONFIG = ROOT / "config" / "step_demo.yaml"
 ORBIT = ROOT / "config" / "orbit.yaml"
 POWER = ROOT / "docs" / "examples" / "power.yaml"
 RATE = 0.03
-"""rad/s: the peak of a 0.1 step."""
+"""Rate (rad/s) of the frame: the peak rate of a 0.1 rad step."""
 ORION_DEG = 84.0, -2.0, 15.0
-"""Right ascension, declination and roll of the solved picture."""
+"""Right ascension, declination and roll (deg) of the solved picture."""
 HORIZON_SEEDS = 2, 4, 6
 _OF_TESTBED, _IN_ORBIT = ("overview", "paths"), ("spin", "knowledge", "pointing")
 _OF_BATTERY = ("battery",)
 
 
 def main() -> int:
-    """Write the pictures and name them."""
+    """Write the pictures and print their names."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.pictures", description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures", metavar="DIR")
     folder: Path = parser.parse_args().out
@@ -79,7 +79,7 @@ def main() -> int:
 
 
 def _draw_frame(path: Path) -> None:
-    """Draw a frame of a slew at its fastest, with the endpoints that the rate is from."""
+    """Draw a frame at the peak rate of a slew, with the streak end points that determine the rate."""
     camera = configuration.load(CONFIG).camera
     assert camera is not None
     times = np.linspace(0.0, camera.exposure, 101)
@@ -127,7 +127,7 @@ def _draw_solved(path: Path) -> None:
 
 
 def _draw_horizons(path: Path) -> None:
-    """Draw the Earth with its terminator in view, three times: edges that were found, the limb they fit."""
+    """Draw three views of the Earth with its terminator, each with the detected edges and the fitted limb."""
     model = limb_frames.camera_model()
     pictures = []
     for seed in HORIZON_SEEDS:

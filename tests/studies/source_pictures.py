@@ -1,9 +1,21 @@
-"""`python -m tests.studies.source_pictures`: figures of Sease 2013, of this camera and these estimators.
+"""`python -m tests.studies.source_pictures`: figures of Sease 2013 with this camera and these estimators.
 
-2.1 the star table over the whole sky; 3.1 to 3.4 a streak and its four cornerness maps; 3.5 the centre of
-rotation and the vectors of a streak; 3.7 to 3.10 the errors of attitude and rate by the four detectors, from
-the campaign `streaks-thesis`, which is resumed in the folder; 4.2 to 4.4 the indicators of an object among
-stars, with their outlier; 5.4 to 5.6 the planned slew; 5.7 and 5.8 the simulated steps. Fig. 3.6 is a sketch.
+Fig. 2.1: the star table over the whole sky.
+
+Fig. 3.1 to 3.4: a streak and its four cornerness maps.
+
+Fig. 3.5: the centre of rotation, and the vectors of a streak.
+
+Fig. 3.7 to 3.10: the errors of attitude and rate with the four detectors, from the campaign `streaks-thesis`,
+which is resumed in the folder.
+
+Fig. 4.2 to 4.4: the indicators of an object among stars.
+
+Fig. 5.4 to 5.6: the planned slew.
+
+Fig. 5.7 and 5.8: the simulated steps.
+
+Fig. 3.6 is a sketch and is not drawn.
 """
 
 from __future__ import annotations
@@ -45,9 +57,9 @@ from tests.support.scenes import FIELD, YEAR, slew
 
 STREAK_SEED, CENTRE_SEED, OBJECT_SEED = 1, 1, 1
 TURN = 1.0
-"""Of the frame of the centre of rotation, in parts of the field: long arcs."""
+"""Rotation during the exposure that shows the centre of rotation, as a fraction of the field of view."""
 OBJECT_MAGNITUDE = 1.0
-"""As in the thesis, "for visualization purposes"."""
+"""Magnitude of the object, as in the thesis ("for visualization purposes")."""
 STREAKS_SEED = 12
 SIMULATION = Path(__file__).resolve().parents[2] / "config" / "step_simulation.yaml"
 PRINTED_SIGMAS = 3.6, 3.5, 3.6
@@ -77,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def draw_star_table() -> Figure:
-    """Draw the star table over the whole sky, brighter stars larger: Fig. 2.1."""
+    """Draw the star table over the whole sky, with larger dots for brighter stars: Fig. 2.1."""
     stars = catalogue.load()
     x, y, z = stars.directions_at(YEAR).T
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
@@ -94,7 +106,7 @@ def draw_star_table() -> Figure:
 
 
 def draw_cornerness() -> Figure:
-    """Draw a streak and its cornerness by the four detectors, the maxima circled: Fig. 3.1 to 3.4."""
+    """Draw a streak and its cornerness by the four detectors, with the maxima circled: Fig. 3.1 to 3.4."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene = slew(np.random.default_rng(STREAK_SEED), np.pi / 3.0, 0.04, 0.2, model=camera)
     window = _window_of_a_streak(scene.pixels, camera)
@@ -114,7 +126,7 @@ def draw_cornerness() -> Figure:
 
 
 def _window_of_a_streak(pixels: Image, camera: StarCameraModel) -> FloatArray:
-    """Return the surroundings of the strongest streak that is far from the border, background removed."""
+    """Return a window around the strongest streak far from the border, with the background removed."""
     streaks = measure_streaks(segment_frame(pixels, StreakSettings()), StreakSettings())
     middles = streaks.endpoints.mean(axis=1)
     room = np.abs(middles - 0.5 * camera.columns).max(axis=1) < 0.5 * camera.columns - 60.0
@@ -141,7 +153,7 @@ def draw_centre() -> Figure:
     true = camera.pinhole.project(np.sign(scene.rate[2]) * scene.rate)
     away = float(np.linalg.norm(centre - true))
     left.set_title(f"centre of rotation, {away:.2f} px from the true one", fontsize=10)
-    # The one that the centre sees under the largest angle: its vectors are then of like lengths.
+    # The streak that spans the largest angle at the centre has vectors of similar lengths.
     one = ends[int((lengths(ends) / np.linalg.norm(ends.mean(axis=1) - centre, axis=1)).argmax())]
     middle = one.mean(axis=0)
     _show(right, scene.pixels)
@@ -191,14 +203,14 @@ def draw_accuracies(folder: Path, runs: int) -> Figure:
 
 
 def accuracies(folder: Path, runs: int) -> list[dict[str, Any]]:
-    """Return the cells of the campaign `streaks-thesis`, flown or resumed in a folder."""
+    """Return the cells of the campaign `streaks-thesis`, which is run or resumed in a folder."""
     facts = fly_campaign(STREAKS_THESIS, runs, STREAKS_SEED, folder, progress=True).facts
     found: list[dict[str, Any]] = facts["cells"]
     return found
 
 
 def draw_path() -> Figure:
-    """Draw the slew that the thesis plans in 10 s and this coil makes in 13.8 s: Fig. 5.4 to 5.6."""
+    """Draw the slew that the thesis plans in 10 s, and that this coil performs in 13.8 s: Fig. 5.4 to 5.6."""
     plant = plant_of(as_testbed(configuration.load(SIMULATION)))
     return path_figure(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0, nodes=NODES), plant)
 
@@ -215,7 +227,7 @@ def draw_steps() -> Figure:
 
 
 def flown_simulation(duration: float = 700.0) -> Run:
-    """Return the thesis's simulation as this software flies it."""
+    """Return the run of the thesis's simulation, flown by this software."""
     config = configuration.replace(as_testbed(configuration.load(SIMULATION)), duration=duration)
     steps = tuple(step for step in config.steps if step.at < duration)
     text = SIMULATION.read_text(encoding="utf-8")
@@ -253,10 +265,10 @@ def draw_indicators() -> Figure:
 
 
 def indicators(ends: FloatArray, rate: FloatArray, pinhole: Pinhole) -> list[tuple[str, FloatArray]]:
-    """Return the thesis's three indicators (n,) of streaks (n, 2, 2), as it plots them: 4.2 to 4.4.
+    """Return the thesis's three indicators (n,) of streaks (n, 2, 2), as plotted in its Fig. 4.2 to 4.4.
 
-    `rate` is the stars', rad/s over `EXPOSURE`. Streaks are ordered in time as a star would go; slopes are
-    those of the chords, without the projection's bend removed.
+    `rate` is the rate of the stars (rad/s) over `EXPOSURE`. The end points of each streak are ordered in the
+    direction of a star's motion. Slopes are those of the chords, with the curvature of the projection.
     """
     vectors = pinhole.unit_vectors(ends)
     expected = star_ends(vectors, rate * EXPOSURE)

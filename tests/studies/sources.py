@@ -1,7 +1,7 @@
 """`python -m tests.studies sources [TABLE]`: tables of the three sources beside the same quantities here.
 
-Without a table the command lists every table and every figure with data of the sources, with the command that
-makes it here. The tables that the command measures itself are printed as Markdown for the results pages.
+Without a table the command lists every table and figure of the sources that has data, with the command that
+reproduces it here. The tables that this command measures are printed as Markdown for the results pages.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from tests.support.scenes import BRIGHTEST, FIELD
 from tests.support.star_lists import ListKind, draw
 
 Rows = list[list[str]]
-"""Cells of a table, the head first."""
+"""Cells of a table; the first row is the head."""
 _NO_FOLDER = Path()
 _ARCSECONDS = float(np.degrees(3600.0))
 
@@ -119,7 +119,7 @@ def table_4_4(runs: int, seed: int) -> Rows:
 
 
 def end_biases(runs: int, seed: int) -> Rows:
-    """Return the inward displacement of streak ends of the thesis's spots, which `streaks-thesis` removes."""
+    """Return the inward bias of the ends of the thesis's streaks, which `streaks-thesis` removes."""
     rows = [["detector", "bias in use, px", "measured, px"]]
     for name in DETECTOR_NAMES:
         rows.append([f"`{name}`", f"{THESIS_BIAS[name]:.2f}", f"{measured_bias(name, runs, seed):.3f}"])
@@ -127,7 +127,7 @@ def end_biases(runs: int, seed: int) -> Rows:
 
 
 def image_matching_errors(runs: int, seed: int) -> Rows:
-    """Return the attitude errors of AIM over those of the q-method, by prior error and number of steps."""
+    """Return the ratios of AIM's attitude errors to the q-method's, by prior error and number of steps."""
     steps = (1, 2, 3, 4)
     head = [
         "field, deg",
@@ -158,7 +158,7 @@ def image_matching_errors(runs: int, seed: int) -> Rows:
 
 
 FIELD_DEG = 15.0
-"""Field of the lists of `cosine_limits`, as in the campaign `lost-in-space`."""
+"""Field of view (deg) of the lists of `cosine_limits`, as in the campaign `lost-in-space`."""
 _WITH_ANGLES: dict[str, Propose] = {
     "angle": propose_angles,
     "pyramid": propose_pyramids,
@@ -167,7 +167,7 @@ _WITH_ANGLES: dict[str, Propose] = {
 
 
 def cosine_limits(runs: int, seed: int) -> Rows:
-    """Return identifications with limits from eq. 31 and from first-order angles, on the same lists."""
+    """Return the identifications on the same lists with limits from eq. 31 and from first-order angles."""
     rows = [["method", "lists", "right; wrong, angle", "right; wrong, eq. 31", "ms, angle", "ms, eq. 31"]]
     half = float(np.tan(np.radians(0.5 * FIELD_DEG)))
     sky = KnownSky(default_index(), (half, half))
@@ -191,7 +191,7 @@ def cosine_limits(runs: int, seed: int) -> Rows:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table that this study measures: how, and the number of runs by default."""
+    """A table that this study measures, with its function and the default number of runs."""
 
     measure: Callable[[int, int], Rows]
     runs: int

@@ -1,12 +1,12 @@
-"""`python -m tests.studies.tune_controllers`: tune every gain of the baselines by one criterion.
+"""`python -m tests.studies.tune_controllers`: tunes every gain of the baseline controllers by one criterion.
 
-The criterion: the least R I^2 over the demonstration's steps, with every step settled (5 % band) within 9 s
-and overshoots of 1 % at most, on a thread of 1e-5 N m/rad that no controller knows. PID has four free gains
-(angle, integral, rate, weight of the target), adaptive control three (bandwidth, adaptation, reference
-bandwidth). The search (Nelder and Mead from several starts) flies body and controller alone, without noise,
-with the loop's delay of one cycle; `tests.studies.campaigns controllers` flies what it finds on the whole
-loop. The margins below the limits leave room for noise; `--settling` and `--overshoot` set other limits, and
-`--stiffness` another thread.
+The search minimises R I^2 over the demonstration's steps. Every step must settle (5 % band) within 9 s and
+overshoot by at most 1 %, on a thread of 1e-5 N m/rad that no controller models. The PID controller has four
+free gains (angle, integral, rate, target weight). The adaptive controller has three (bandwidth, adaptation,
+reference bandwidth). The search uses the method of Nelder and Mead from several starts. It simulates body and
+controller only, without noise, with the loop's delay of one cycle. `tests.studies.campaigns controllers`
+flies the resulting gains in the whole loop. The limits leave a margin for noise; `--settling`, `--overshoot`
+and `--stiffness` change them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tests.support.thread_loop import BELIEVED, PERIOD
 TRUE = replace(BELIEVED, stiffness=1e-5, damping=2e-6)
 RELEASE = (angle_of(0.2), -0.1)
 TARGETS = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
-"""Of `config/step_demo.yaml`."""
+"""Targets (rad) of `config/step_demo.yaml`."""
 STEP = 20.0
 SETTLED_S, OVERSHOOT = 8.7, 0.008
 _BAND = 0.05
@@ -38,7 +38,7 @@ _PENALTY = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Mean R I^2 in W over the steps, the slowest settling in s and the largest overshoot, a share."""
+    """Mean R I^2 (W) over the steps, longest settling time (s), and largest overshoot as a fraction."""
 
     power: float
     settling: float
@@ -47,20 +47,20 @@ class Flown:
 
 @dataclass(frozen=True, slots=True)
 class Criterion:
-    """The true body, and the limits of settling (s) and overshoot (a share) for which a baseline is tuned."""
+    """True body, and the limits of settling time (s) and overshoot (fraction) that a baseline must keep."""
 
     true: SingleAxisPlant = TRUE
     settling: float = SETTLED_S
     overshoot: float = OVERSHOOT
 
     def loss(self, flown: Flown) -> float:
-        """Return the power in mW, with a penalty for what the criterion forbids."""
+        """Return the power (mW) plus a penalty for exceeded limits."""
         slow, over = max(0.0, flown.settling - self.settling), max(0.0, flown.overshoot - self.overshoot)
         return 1e3 * flown.power + _PENALTY * (slow + 100.0 * over)
 
 
 def fly(controller: AngleController, true: SingleAxisPlant = TRUE) -> Flown:
-    """Fly the steps of a true body with perfect measurements."""
+    """Simulate the steps of a true body with perfect measurements."""
     (angle, rate), current, energy = RELEASE, 0.0, 0.0
     slowest = furthest = 0.0
     for q2 in TARGETS:
@@ -82,14 +82,14 @@ def fly(controller: AngleController, true: SingleAxisPlant = TRUE) -> Flown:
 
 
 def pid(x: Sequence[float]) -> AngleController:
-    """Return the PID controller of four variables."""
+    """Return the PID controller with the four variables `x`."""
     proportional, integral, derivative = np.exp(x[:3]).tolist()
     weight = 1.0 / (1.0 + math.exp(-x[3]))
     return PidController(BELIEVED, PERIOD, PidSettings(proportional, integral, derivative), weight)
 
 
 def adaptive(x: Sequence[float]) -> AngleController:
-    """Return the adaptive controller of three variables."""
+    """Return the adaptive controller with the three variables `x`."""
     return AdaptiveController(BELIEVED, PERIOD, AdaptiveSettings(*np.exp(x).tolist()))
 
 
@@ -120,7 +120,7 @@ def tune(
 
 
 def named(name: str, x: Sequence[float]) -> dict[str, float]:
-    """Return the gains by the names of the configuration."""
+    """Return the gains as a mapping from their names in the configuration."""
     if name == "pid":
         gains = np.exp(x[:3]).tolist()
         weight = 1.0 / (1.0 + math.exp(-x[3]))

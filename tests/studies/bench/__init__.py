@@ -1,1 +1,1 @@
-"""Tests of the KnightCube flight software."""
+"""Benchmarks: `python -m tests.studies.bench`."""

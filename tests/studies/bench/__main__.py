@@ -1,7 +1,7 @@
-"""`python -m tests.studies.bench NAME [arguments]`: run a bench by name; without a name, list them.
+"""`python -m tests.studies.bench NAME [arguments]`: runs a benchmark; without a name, lists all of them.
 
 A benchmark is a module of this package with a function `main`. The list is read from the docstrings. Only the
-requested benchmark is imported, so that the extras of other benchmarks may be missing.
+requested benchmark is imported, so the extras of other benchmarks may be missing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _FOLDER = Path(__file__).parent
 
 
 def benches() -> dict[str, str]:
-    """Return every bench's name and the first line of its docstring, without importing any."""
+    """Return the name of each benchmark and the first line of its docstring, without importing any."""
     found = {}
     for module in pkgutil.iter_modules([str(_FOLDER)]):
         if module.name.startswith("_") or module.ispkg:
@@ -34,7 +34,7 @@ def benches() -> dict[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a bench; return its exit status, 0 after the list, 2 for wrong use."""
+    """Run a benchmark. Returns its exit status, 0 after the list, or 2 for wrong use."""
     known = benches()
     width = max(map(len, known), default=0)
     parser = argparse.ArgumentParser(
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    """Run `main` of a benchmark with its arguments as a list, or without if it reads the command line."""
+    """Run `main` of a benchmark, with its arguments as a list if it takes them."""
     bench = importlib.import_module(f"tests.studies.bench.{name}").main
     with _command_line(f"python -m tests.studies.bench {name}", arguments):
         status = bench(arguments) if inspect.signature(bench).parameters else bench()
@@ -62,7 +62,7 @@ def _run(name: str, arguments: list[str]) -> int:
 
 @contextmanager
 def _command_line(program: str, arguments: list[str]) -> Iterator[None]:
-    """Set the command line of the process, for functions `main` that read it and for their help."""
+    """Set the process's command line, for functions `main` that read it and for their help texts."""
     before = sys.argv
     sys.argv = [program, *arguments]
     try:

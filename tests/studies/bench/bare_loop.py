@@ -1,10 +1,11 @@
-"""A bare sleep loop in a separate process, instead of the flight process: it measures machine stalls.
+"""A bare sleep loop in a separate process beside the flight process: it measures stalls of the machine.
 
-Like a minimal C program, it calls clock_nanosleep with TIMER_ABSTIME for the next slot. It records the time
-of each wake-up, and the processor time that the machine's host had given to others until then. Its slots are
-multiples of the period in CLOCK_MONOTONIC, like those of a real-time flight. Run as `python -m
-tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`, under SCHED_FIFO with a priority above zero. At
-SIGTERM it writes its records to the file: rows of two int64, monotonic ns and ns stolen since boot.
+The loop calls clock_nanosleep with TIMER_ABSTIME for the next slot, as a minimal C program does. It records
+the time of each wake-up, and the processor time that the host has given to other virtual machines until then.
+Its slots are multiples of the period in CLOCK_MONOTONIC, like those of a real-time flight. Command: `python
+-m tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`. A priority above zero selects SCHED_FIFO. At
+SIGTERM the program writes its records to the file: rows of two int64, the monotonic time (ns) and the stolen
+time since boot (ns).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class _Timespec(ctypes.Structure):
 
 
 def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
-    """Wake at every slot until `stopped` is not empty, and record the times and the stolen time.
+    """Wake at every slot until `stopped` is not empty, and record the wake-up times and the stolen time.
 
     Missed slots are skipped.
     """

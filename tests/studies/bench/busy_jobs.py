@@ -1,9 +1,9 @@
 """Workers that are never idle: each repeats its last job until the next job arrives.
 
-For `python -m tests.studies.bench executive --busy`: a satellite plans every 10 s at most, and emulating a
-camera frame takes longer than processing it. The flight's own jobs are repeated, and the results are
-discarded. A new job waits for the end of the running repetition. Imports are made late, because these
-functions run in the workers.
+`python -m tests.studies.bench executive --busy` uses them, because a satellite plans at most every 10 s, and
+because emulating a camera frame takes longer than processing it. The flight's own jobs are repeated, and the
+results of the repetitions are discarded. A new job waits for the end of the running repetition. Imports are
+made late, because the functions run in the workers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _M_ARENA_MAX = -8  # malloc.h
 
 
 class Again:
-    """Runs the jobs of one module, and repeats the last job while no new job waits."""
+    """Runner of one module's jobs that repeats the last job while no new job waits."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -39,7 +39,7 @@ class Again:
         self._goes.clear()
         with self._turn:
             result = run(argument)
-            # The arrays of the job may be overwritten once its result is sent.
+            # The caller may overwrite the job's arrays once the result is sent.
             begun, self._last = self._last is not None, copy.deepcopy(argument)
         self._goes.set()
         if not begun:
@@ -58,7 +58,7 @@ class Again:
 
 
 def _one_heap() -> None:
-    """Let all threads of this process use one heap, like the only thread of a worker."""
+    """Let all threads of this process use one heap, like a worker, which has one thread."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
@@ -93,7 +93,7 @@ BUSY: dict[str, Callable[[Any], Any]] = {
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,
 }
-"""Repeated functions by the module of the job."""
+"""Repeated functions by the module of their job."""
 
 
 def keep_busy() -> None:

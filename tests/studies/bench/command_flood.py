@@ -1,8 +1,9 @@
 """The command socket under a flood: `python -m tests.studies.bench command_flood [--seconds S]`.
 
-The step demonstration runs in real time with a UDP command port: without a flood, with 20,000 datagrams a
-second that are not commands, and with 20,000 a second that begin like commands. A peer sends twenty pings,
-each once. The lateness of the control cycles and the number of answered pings are printed.
+The step demonstration runs in real time with a UDP command port, in three cases: without a flood, with 20,000
+datagrams a second that are not commands, and with 20,000 a second that begin like commands. A peer sends
+twenty pings, each once. The benchmark prints the lateness of the control cycles and the number of answered
+pings.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ FLOODS = ("none", "no commands", "begin as commands")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run all cases and print.
+    """Run all cases and print the figures.
 
-    Return 1 if a ping was lost, except under datagrams that begin like commands.
+    Returns 1 if a ping was lost without a flood or under datagrams that are not commands.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, seconds: float, kind: str) -> dict[str, Any]:
-    """Run one case, and return the lateness, the number of flood datagrams, and the answered pings."""
+    """Run one case. Returns the lateness, the number of flood datagrams, and the number of answered pings."""
     port, run, config = free_port(), place / "run", place / "flight.yaml"
     commands = json.dumps({"udp": f"127.0.0.1:{port}"})
     config.write_text(f"{CONFIG.read_text(encoding='utf-8')}\ncommands: {commands}\n", encoding="utf-8")
@@ -79,7 +80,7 @@ def measure(place: Path, seconds: float, kind: str) -> dict[str, Any]:
 
 
 def _datagrams(kind: str) -> list[bytes]:
-    """Return flood datagrams: random bytes, or commands with a valid start and random rest."""
+    """Return flood datagrams: random bytes, or the start of a valid command followed by random bytes."""
     draw = np.random.default_rng(2)
     sizes = draw.integers(16, 200, _KINDS).tolist()
     found = [draw.bytes(size) for size in sizes]

@@ -1,9 +1,9 @@
 """Workers that cannot start, in real time: `python -m tests.studies.bench dead_worker [--minutes M]`.
 
-The full load of `bench executive` runs with a missing module for the workers, so that each worker process
-ends at once. The attempts, their reports and the lost cycles are printed: all lost cycles, those that a bare
-loop beside the flight did not lose, and those within a second of an attempt. Only the last ones can be caused
-by workers. Run it alone on two cores.
+The full load of `bench executive` runs, but a module of the workers is missing, so each worker process ends
+at once. The benchmark prints the start attempts, their reports and three counts of lost cycles: all, those
+that a bare loop beside the flight did not lose, and those within a second of an attempt. Only the cycles of
+the last count can be lost because of the workers. Run it alone on two cores.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ _BESIDE_S = 1.0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run, print the figures, and return 1 if a cycle was lost or an attempt was not limited and reported."""
+    """Run the flight and print the figures.
+
+    Returns 1 if a cycle was lost or an attempt was not limited and reported.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0, metavar="M", help="default %(default)s")
     minutes = parser.parse_args(arguments).minutes
@@ -62,7 +65,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _workers(texts: Sequence[bytes]) -> list[str]:
-    """Return the workers that are named first in the texts of events."""
+    """Return the worker that each event text names first."""
     return [text.decode().partition(":")[0] for text in texts]
 
 

@@ -1,14 +1,15 @@
-"""The 40 Hz loop with everything running: `python -m tests.studies.bench executive [--minutes M] [--orbit]`.
+"""The 40 Hz loop under full load: `python -m tests.studies.bench executive [--minutes M] [--orbit] [--busy]`.
 
-The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
-its devices: planner and vision work without pause, and the guardian watches. With `--orbit` the KnightCube
-of `config/orbit.yaml` flies in its place, at nadir from the begin; its planner has the shortest period that
-the configuration allows, 10 s, and the wide cameras work as they fly; with `--busy` each worker does its
-last job again until the next one comes, so that none is ever idle. Beside it a bare absolute-sleep loop at
-the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the kernel the time
-that a virtual machine's host takes; a working loop meets such stalls more often than a sleeping loop. If
-SCHED_FIFO is permitted, the flight runs twice, with and without it. Run it alone on two cores. The slope of
-memory needs flights of 16 minutes or longer.
+The step demonstration flies in real time on emulated devices in separate processes. Planner and vision work
+without pause, and the guardian watches. With `--orbit` the satellite of `config/orbit.yaml` flies instead. It
+points to nadir from the start, its planner has the shortest period that the configuration allows (10 s), and
+its horizon cameras run at their flight rate. With `--busy` each worker repeats its last job until the next
+one comes, so no worker is ever idle.
+
+A bare sleep loop at the same rate (`tests.studies.bench.bare_loop`) runs beside the flight and measures
+stalls of the machine. The kernel measures the time that a virtual machine's host takes. A working loop meets
+such stalls more often than a sleeping loop. If SCHED_FIFO is permitted, the flight runs twice, with and
+without it. Run the benchmark alone on two cores. The slope of memory needs flights of 16 minutes or longer.
 """
 
 from __future__ import annotations
@@ -59,7 +60,8 @@ SHARED_LOOKS = 9
 SHORTEST_REPLAN = 10.0
 """Interval (s) of pointing plans: the shortest that the schema permits."""
 AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
-"""The release: along the flight, the star camera at the sky, so that all work from the first minute on."""
+"""Release state: along the flight direction with the star camera at the sky, so that all tasks work at once.
+"""
 
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
 _KEPT_BUSY = "from tests.studies.bench.busy_jobs import keep_busy; keep_busy()"
@@ -83,12 +85,12 @@ _ROLES = {
     "tests.studies.bench.busy_jobs:see ": "vision",
     "tests.studies.bench.busy_jobs:see_wide": "wide",
 }
-"""Names of processes by a text in their command line."""
+"""Function of a process, by a text in its command line."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Duration, intervals of frames and plans, and warm-up time, s, and the configuration."""
+    """Duration, intervals of frames and plans, and warm-up time (s), with the configuration."""
 
     duration: float
     camera_period: float = 0.4
@@ -100,7 +102,7 @@ class Load:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run, print required and measured figures, and return 1 if a requirement is not met."""
+    """Run, and print required and measured figures. Returns 1 if a requirement is not met."""
     load, options = _load(arguments)
     flights: dict[str, Figures] = {}
     grids: dict[str, Grid] = {}
@@ -120,7 +122,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
-    """Return the configuration and all options."""
+    """Return the load and all options."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -158,7 +160,7 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
 
 
 def _schedulings(wanted: str) -> list[str]:
-    """Return the ways to run, including SCHED_FIFO if it is permitted."""
+    """Return the schedulings to run: the ordinary one, and SCHED_FIFO if it is permitted."""
     if wanted == "ordinary" or fifo_allowed():
         return ["fifo", "ordinary"] if wanted == "both" else [wanted]
     sys.stderr.write("SCHED_FIFO is refused here: flown without it\n")
@@ -166,7 +168,7 @@ def _schedulings(wanted: str) -> list[str]:
 
 
 def _write(folder: Path, load: Load, flights: dict[str, Figures], grids: dict[str, Grid]) -> None:
-    """Write the figures, and the picture where matplotlib is installed."""
+    """Write the figures, and the picture if matplotlib is installed."""
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"load": asdict(load), "asked": ASKED, "flights": flights}, indent=2)
     (folder / "executive.json").write_text(text + "\n", encoding="utf-8")
@@ -183,10 +185,10 @@ def fifo_allowed() -> bool:
 
 
 def full_load(load: Load) -> str:
-    """Return the configuration with planner and vision at work without pause.
+    """Return the configuration in which planner and vision work without pause.
 
-    In the step demonstration the receding strategy plans at every replanning, where the goal strategy rests
-    once a step is over.
+    In the step demonstration the receding strategy plans at every replanning. The goal strategy stops
+    planning once a step is over.
     """
     period = load.camera_period
     if load.orbit:
@@ -223,7 +225,7 @@ def _compiled() -> Iterator[None]:
 
 
 def fly(folder: Path, load: Load, fifo: bool) -> Flown:
-    """Run once in `folder` beside the bare loop, and return the measured figures."""
+    """Run once in `folder` beside the bare loop; return the measured figures."""
     config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
     facts = devices / "facts.json"
     config.write_text(full_load(load), encoding="utf-8")
@@ -234,7 +236,7 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
                 "tests.studies.bench.bare_loop", str(PERIOD_NS), str(PRIORITY if fifo else 0), str(wakes)
             )
         )
-        # Devices that exist before the flight process, as on a board.
+        # The devices exist before the flight process starts, as on a board.
         outputs = "--folder", str(devices), "--facts", str(facts)
         stack.enter_context(answering("sim_hal", "serve", str(config), *outputs))
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -253,7 +255,7 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
 
 
 def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watched:
-    """Watch the flight to its end, reading the service manager's end of the socket."""
+    """Watch the flight until it ends, with the service manager's end of the notification socket."""
     shared: list[float] = []
     due = time.monotonic() + 0.5 * (load.duration + load.warm_up)
     with closing(ProcessWatch(lambda: members(flight), load.look_period)) as watch:
@@ -262,11 +264,11 @@ def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watc
                 notifications.recv(4096)
             if len(shared) < SHARED_LOOKS and time.monotonic() > due:
                 due += load.look_period
-                with suppress(OSError, LookupError, ValueError):  # a process has just ended: try again
+                with suppress(OSError, LookupError, ValueError):  # a process may have just ended: try again
                     present = members(flight)
                     held = sum(process_watch.look(present).memory.values())
                     shared.append(process_watch.unshared(present) - held)
-    # A job that begins or ends between the two samples would count as shared.
+    # A single sample would count a job that begins or ends during it as shared memory.
     return Watched(watch.looks, max(0.0, median(shared)) if shared else 0.0)
 
 
@@ -282,7 +284,7 @@ def members(flight: LiveFlight) -> dict[str, int]:
 def _started(
     folder: Path, config: Path, notifications: socket.socket, load: Load, facts: Path, fifo: bool
 ) -> LiveFlight:
-    """Start the flight beside its devices, without the right to SCHED_FIFO if this is requested."""
+    """Start the flight on its devices, without the right to SCHED_FIFO if `fifo` is false."""
     started: list[LiveFlight] = []
 
     def start() -> None:

@@ -1,8 +1,8 @@
 """File transfer with killed processes: `python -m tests.studies.bench file_kills [--kills N] [--seed S]`.
 
-Link process and the ground's `flight files` are processes of their own, on loopback. In each of N transfers,
-alternately down and up, each process gets one SIGKILL at a random time and is restarted. The bench counts the
-transfers whose file arrived whole (SHA-256) and that are closed at both ends.
+The link process and the ground's `flight files` run as separate processes on loopback. In each of N
+transfers, alternately down and up, each process gets one SIGKILL at a random time and is restarted. The
+benchmark counts the transfers whose file arrived complete (SHA-256) and which are closed at both ends.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PATIENCE_S = 120.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run and print all transfers; return 0 if all files arrived whole and all transfers were closed."""
+    """Run and print all transfers. Returns 0 if all files arrived complete and all transfers were closed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20, metavar="N", help="of each side (default 20)")
     parser.add_argument("--megabytes", type=float, default=1.0, metavar="M", help="of the file (default 1)")
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Bench:
-    """A satellite's link and a ground, with a file at each."""
+    """The link of a satellite and a ground station, with a file at each end."""
 
     def __init__(self, place: Path, data: bytes, draw: np.random.Generator) -> None:
         self._place, self._data, self._draw = place, data, draw
@@ -70,7 +70,7 @@ class _Bench:
         self._run.mkdir(parents=True)
 
     def transfer(self, number: int) -> dict[str, int]:
-        """Transfer a file under another name, with a kill of each side."""
+        """Transfer a file under a new name, with one kill of each end."""
         name = f"{number}.bin"
         files, ground = self._place / "keys" / "files", self._place / "ground"
         if number % 2:

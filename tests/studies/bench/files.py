@@ -1,8 +1,9 @@
 """File transfer with losses: `python -m tests.studies.bench files [--megabytes M] [--seed S]`.
 
 Link and ground run in one process on a manual clock with protected frames. Frames are lost at random with the
-same probability in both directions. For each loss and direction, the bench states whether the file arrived
-whole and both ends closed, the duration on the clock, and the processor time.
+same probability in both directions. For each probability and direction, the benchmark reports whether the
+file arrived complete, whether both ends closed the transfer, its duration on the manual clock, and the
+processor time.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _LONGEST_NS = 7200 * 10**9
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run and print all transfers; return 0 if all files arrived whole."""
+    """Run and print all transfers. Returns 0 if all files arrived complete."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of the file (default 10)")
     parser.add_argument("--seed", type=int, default=1, metavar="S")

@@ -1,7 +1,8 @@
-"""How long the coils carry current after a fault: `python -m tests.studies.bench guardian [ROUNDS]`.
+"""Time for which the coils carry current after a fault: `python -m tests.studies.bench guardian [ROUNDS]`.
 
-Flights in real time on emulated devices in a process of their own are stopped, hung and killed; the measured
-time is from the act to zero current in the devices' log (every 25 ms). The guardian owes 0.5 s.
+Real-time flights on emulated devices in a separate process are stopped, hung and killed. The benchmark
+measures the time from the fault to zero current in the log of the devices, which has a sample every 25 ms.
+The guardian must zero the current within 0.5 s.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from tests.hal.guardian.campaign import UNGUARDED, Hurt, hurt_in_every_way
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the table, and fail if a coil was driven for more than 0.5 s."""
+    """Print the table. Returns 1 if a coil was driven for more than 0.5 s."""
     rounds = int(arguments[0]) if arguments else 3
     found: defaultdict[str, list[Hurt]] = defaultdict(list)
     for _ in range(rounds):

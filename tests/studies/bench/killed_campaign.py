@@ -1,9 +1,9 @@
 """Killed and resumed campaign of a user: `python -m tests.studies.bench killed_campaign [--dask]`.
 
-The command `knightcube campaign` is run three times with the same draws: undisturbed; killed at random
-moments (one SIGINT, otherwise SIGKILL) and started again each time; and, with `--dask`, on a cluster of two
-workers of which one is killed. The bench compares the printed figures and the result of each flight, and
-counts flights that were flown twice, processes that outlive a campaign, and temporary files that remain.
+The command `knightcube campaign` runs with the same draws undisturbed, and then killed at random times (one
+SIGINT, otherwise SIGKILL) and restarted each time. With `--dask` it also runs on a cluster of two workers,
+one of which is killed. The benchmark compares the printed figures and the result of each flight. It counts
+the flights that were flown twice, the processes that outlive a campaign, and the remaining temporary files.
 """
 
 from __future__ import annotations
@@ -56,21 +56,14 @@ class Comparison:
     remains: int
 
     def sound(self, runs: int) -> bool:
-        """Return whether the campaign of `runs` flights is complete, equal, and left nothing behind."""
+        """Return whether the campaign is complete, has equal results, and left no processes or files."""
         wrong = self.repeated + self.unequal + self.orphans + self.remains
         return self.flights == runs and self.same_figures and not wrong
 
 
 @dataclass(frozen=True, slots=True)
 class UserCampaign:
-    """Command of a user in a folder of its own.
-
-    Attributes:
-        folder: folder in which the command runs, with the results in `campaign` and temporary files in `tmp`.
-        runs: number of flights.
-        duration: duration of each flight, s.
-        dask: address of a Dask scheduler, or an empty text.
-    """
+    """A campaign command in a folder of its own."""
 
     folder: Path
     runs: int
@@ -111,7 +104,7 @@ class UserCampaign:
         return path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
 
     def interrupt(self, number: signal.Signals, results: int, delay: float) -> tuple[bool, int]:
-        """Start the command, and send a signal `delay` seconds after it has a number of results.
+        """Start the command, and send a signal `delay` seconds after it has written a number of results.
 
         Returns whether the signal came before the end of the command, and the number of processes that
         outlived the command by more than a minute.
@@ -129,7 +122,7 @@ class UserCampaign:
     def compare(
         self, found: Any, expected: Any, reference: UserCampaign, interruptions: int, orphans: int
     ) -> Comparison:
-        """Return the comparison with the undisturbed campaign `reference`, given both printed summaries."""
+        """Return the comparison of the printed summary `found` with that of the undisturbed campaign."""
         keys = Counter(json.loads(line)["key"] for line in self.lines())
         own, other = (
             {entry["key"]: entry["result"] for entry in map(json.loads, one.lines())}
@@ -150,7 +143,7 @@ class UserCampaign:
 def killed(
     folder: Path, runs: int, duration: float, kills: int, seed: int, dask: bool = False
 ) -> dict[str, Comparison]:
-    """Return the comparison of the killed campaign, and of the one on a cluster if `dask` is true."""
+    """Return the comparison of the killed campaign, and that on a cluster if `dask` is true."""
     chance = np.random.default_rng(seed)
     whole = UserCampaign(folder / "whole", runs, duration)
     expected = whole.finish()
@@ -222,7 +215,7 @@ def _runs(process: int) -> bool:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the comparisons; return 1 if a campaign is incomplete, differs, or left something behind."""
+    """Print the comparisons. Returns 1 if a campaign is incomplete, differs, or left processes or files."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=500, metavar="N", help="default %(default)s")
     parser.add_argument("--duration", type=float, default=0.3, metavar="S", help="default %(default)s")

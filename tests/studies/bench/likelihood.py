@@ -1,12 +1,12 @@
-"""The likelihood fit against the Cramer-Rao bound, and its time: `python -m tests.studies.bench.likelihood`.
+"""Likelihood fit relative to the Cramer-Rao bound, and its time: `python -m tests.studies.bench.likelihood`.
 
-Random fields of the real sky on the simulator's default camera (1024 x 1024, 20 deg). A ratio is the rms
-error over the bound of the 20 brightest stars, each taken alone in the sky: of the whole rate vector, of the
-rate's magnitude, of mid-exposure positions (the eight brightest). NEES: 1 for an honest covariance. Seeds of
-its own.
+The frames show random fields of the real sky through the simulator's default camera (1024 x 1024, 20 deg). A
+ratio is the rms error divided by the bound of the 20 brightest stars, each taken alone in the sky. The table
+has the ratios of the whole rate vector, of the rate's magnitude, and of the mid-exposure positions of the
+eight brightest stars. The NEES is 1 if the covariance is correct. The seeds are used by no other study.
 
-With `--known-sky` the stars are then identified, nothing being known of the attitude, and the streaks are
-fitted again with all stars of the catalogue, as in flight: figures and times are of that.
+With `--known-sky` the stars are identified after the first fit, without prior attitude. The streaks are then
+fitted again with all stars of the catalogue, as in flight; figures and times are those of the second fit.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BRIGHT = 8
 def estimated(scene: Scene, known_sky: bool) -> MotionResult:
     """Return the motion of a frame with the sign of the true rate.
 
-    For a known sky, that of the second fit.
+    With `known_sky` the result is that of the second fit.
     """
     found = estimate_motion(scene.pixels, CAMERA.pinhole, scene.exposure, _SETTINGS, scene.rate, 0.0)
     if not known_sky or found.rate is None:
@@ -79,7 +79,8 @@ def rate_row(
 def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[float]:
     """Return the squared position errors of the brightest stars relative to the bound; 1 is expected.
 
-    A streak with both ends outside has no determined position along its direction and is omitted.
+    Streaks with both ends outside the image are omitted, because their position along the streak is
+    undetermined.
     """
     out = []
     bright = scene.stars[:_BRIGHT]

@@ -1,9 +1,9 @@
-"""The loop's lateness while its link is flooded: `python -m tests.studies.bench link_flood [--seconds S]`.
+"""Lateness of the loop while its link is flooded: `python -m tests.studies.bench link_flood [--seconds S]`.
 
-The step demonstration flies in real time on its emulated devices beside its link process: alone, then with
-10,000 forged frames a second at the link while it plays the archive back and sends a file of 50 MB down, at
-a megabyte a second together. The bench states the lateness of the control cycles, the counts of link and
-ground, and the received part of the file.
+The step demonstration flies in real time on its emulated devices beside its link process. It flies first
+without a flood. In the second flight the link receives 10,000 forged frames a second while it plays back the
+archive and sends a file of 50 MB, together at a megabyte a second. The benchmark prints the lateness of the
+control cycles, the counts of link and ground, and the received part of the file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _UP_RATE = 20_000.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly both, print."""
+    """Fly both flights and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default 60)"
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
-    """Run once, and return quantiles of the lateness, ms, the number of cycles, and the link's counts."""
+    """Run one flight. Returns quantiles of the lateness (ms), the number of cycles, and the link's counts."""
     with ExitStack() as stack:
         port = free_port()
         config = write_linked_config(place, udp=f"127.0.0.1:{port}", rate=1e6)
@@ -80,7 +80,7 @@ def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
 
 
 def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool) -> dict[str, int]:
-    """Receive telemetry and request playbacks until the flight ends, and return counts."""
+    """Receive telemetry and request playbacks until the flight ends; return the counts."""
     keys = place / "keys" / "ground"
     terminal = open_terminal(f"127.0.0.1:{port}", keys)
     store, now_ns = Store(place / "ground-files"), time.monotonic_ns()

@@ -1,13 +1,13 @@
-"""The link killed between accepting, storing and handing over: python -m tests.studies.bench link_kills.
+"""Links killed between accepting, storing and forwarding commands: python -m tests.studies.bench link_kills.
 
-Each time a link process takes the commands of a ground while an attacker sends every old frame again, and is
-killed (SIGKILL) before or after one of its calls that write to the disk or to the socket of the flight;
-some of the writes are cut in the middle first. The ground's sender is killed in the same way. The bench
-counts commands that the flight received twice, and counters that two frames share.
+Each time a link process receives the commands of a ground station while an attacker replays every old frame.
+The link process is killed (SIGKILL) before or after one of its calls that write to the disk or to the socket
+of the flight. Some of the writes are cut in the middle first. The ground's sender is killed in the same way.
+The benchmark counts commands that the flight received twice, and counters that two frames share.
 
-With `--scheduled` the commands stand in the link's schedule and fall due while the link process is killed.
-A second process, which is not killed, takes over. Counted are commands that the flight received twice,
-commands that it never received, of which each kill may cost one, and schedules without a good copy.
+With `--scheduled` the commands are in the link's schedule and fall due while the link process is killed. A
+second process, which is not killed, continues. The benchmark counts commands that the flight received twice,
+commands that it never received (each kill may cost one), and schedules without an intact copy.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from tests.manual_clock import ManualClock
 _AT_ONCE = 3
 _SENDER_POINTS = 5 * _AT_ONCE + 1
 _LINK_POINTS = 5 * _AT_ONCE + 8
-"""Calls that write: per command two copies with two calls each and a send; the same of telemetry."""
+"""Number of calls that write: five for each command, and the calls for telemetry."""
 
 _OLD = 40
 _RATE = 1e6
@@ -71,7 +71,7 @@ class Findings:
 
     @property
     def obeyed_twice(self) -> int:
-        """How often the flight received a command that it had received before."""
+        """Number of commands that the flight received although it had received them before."""
         return self.obeyed.total() - len(self.obeyed)
 
     @property
@@ -94,7 +94,10 @@ class Findings:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Kill, count, print; return 0 if nothing came twice and a kill cost one command at most."""
+    """Kill the processes and print the counts.
+
+    Returns 0 if no command came twice and each kill cost one command at most.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=1000, metavar="N", help="of the link (default 1000)")
     parser.add_argument("--seed", type=int, default=1, metavar="S")
@@ -135,7 +138,7 @@ def measure(place: Path, kills: int, seed: int) -> Findings:
 
 
 def measure_scheduled(place: Path, kills: int, seed: int) -> Findings:
-    """Schedule three commands and kill the link that executes them, `kills` times."""
+    """Schedule three commands and kill the link that executes them, `kills` times. Returns the counts."""
     make_keys(place / "keys")
     run = place / "run-000001"
     run.mkdir()
@@ -160,7 +163,7 @@ def measure_scheduled(place: Path, kills: int, seed: int) -> Findings:
 
 
 class Way:
-    """The calls of a process that is killed at one of them."""
+    """Calls of a process that is killed at one of them."""
 
     def __init__(self, point: int, torn: bool, writer: socket.socket) -> None:
         self._left = point
@@ -169,7 +172,7 @@ class Way:
         self._pwrite, self._fsync, self._sendto = os.pwrite, os.fsync, socket.socket.sendto
 
     def arm(self) -> None:
-        """Have the calls of this process go this way."""
+        """Replace the writing calls of this process by those of this object."""
         os.pwrite, os.fsync = self.pwrite, self.fsync  # type: ignore[assignment]  # of this process alone
         way = self
 
@@ -183,36 +186,36 @@ class Way:
         socket.socket.sendto = sendto  # type: ignore[method-assign, assignment]  # of this process alone
 
     def ends(self) -> bool:
-        """Return whether this call is the last."""
+        """Return whether this call is the last one."""
         self._left -= 1
         return self._left < 0
 
     def die(self) -> None:
-        """End as kill -9 ends a process."""
+        """End the process as kill -9 does."""
         os.kill(os.getpid(), signal.SIGKILL)
 
     def pwrite(self, file: int, data: bytes, offset: int) -> int:
-        """Write, or write half or all of the data and die."""
+        """Write the data; or write half or all of them and end the process."""
         if self.ends():
             self._pwrite(file, data[: len(data) // 2] if self._torn else data, offset)
             self.die()
         return self._pwrite(file, data, offset)
 
     def fsync(self, file: int) -> None:
-        """Sync, or die before."""
+        """Sync the file, or end the process first."""
         if self.ends():
             self.die()
         self._fsync(file)
 
     def put(self, frame: bytes) -> None:
-        """Send a frame over the air, or die before."""
+        """Send a frame over the air, or end the process first."""
         if self.ends():
             self.die()
         self._writer.send(frame)
 
 
 class _SkyWire(Wire):
-    """The link's line, whose frames leave the process one by one."""
+    """Line of the link that sends each frame to the parent process."""
 
     def __init__(self, way: Way, frames: list[bytes]) -> None:
         super().__init__()
@@ -225,7 +228,7 @@ class _SkyWire(Wire):
 
 
 class _GroundOut(GroundWire):
-    """The ground's line, whose frames also leave the process one by one."""
+    """Line of the ground that sends each frame to the parent process."""
 
     def __init__(self, way: Way) -> None:
         super().__init__(Wire())
@@ -236,9 +239,9 @@ class _GroundOut(GroundWire):
 
 
 def killed(work: Callable[[Way], None], point: int, torn: bool) -> list[bytes]:
-    """Do work in a process that is killed at its call number `point`; return the frames that left it before.
+    """Run `work` in a process that is killed at its call `point`; return the frames that it sent before.
 
-    Calls are those that write to the disk or send; `torn` cuts a write in the middle.
+    Calls that write to the disk or send are counted. With `torn` the last write is cut in the middle.
     """
     reader, writer = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     child = os.fork()
@@ -267,7 +270,7 @@ def _send(place: Path, number: int, way: Way) -> None:
 
 
 def _serve(place: Path, frames: list[bytes] | None, turns: int, way: Way) -> None:
-    """Serve as the link for some turns, with these frames coming in; None if the link has no line."""
+    """Serve as the link for a number of turns, with the received `frames`; None if the link has no line."""
     control: ControlLine[Sent] = ControlLine(place / "commands", place)
     clock = ManualClock()
     settings = StationSettings(SETTINGS.spacecraft, SETTINGS.frame_bytes, _RATE)

@@ -1,14 +1,14 @@
 """Error of the attitude at mid-exposure of a streaked frame, relative to its lower bound.
 
-`python -m tests.studies bench mid_exposure`.
+Command: `python -m tests.studies bench mid_exposure`.
 
-`flight` is the star tracker's answer to the first fit, given roughly where the camera looks, and `known sky`
-its answer after the second fit, with the light of unseen stars taken out
-(`knightcube.vision.startracker.catalogue_refit`); the rates of both fits are compared with their bound too.
+Row `flight` is the star tracker's answer to the first fit with a rough prior of the pointing. Row `known sky`
+is its answer after the second fit, in which the light of unseen stars is subtracted
+(`knightcube.vision.startracker.catalogue_refit`). The rates of both fits are compared with their bound too.
 
-The bound: all pixels of the brightest stars, whose directions are known and whose light and background are
-not, the turn, the width of the point spread and the attitude common to all (Fisher information as in
-`tests.support.streak_bound`).
+The bound is the Fisher information of all pixels of the brightest stars, as in `tests.support.streak_bound`.
+The directions of the stars are known; their brightness and background are free. Rotation, width of the point
+spread function and attitude are common to all stars.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from tests.support.scenes import FIELD, Scene, noise_floor, slew
 from tests.support.streak_bound import star_information
 
 _STARS = 30
-# Turn (3), point spread, then attitude (3) or a star's x and y.
+# Common parameters: rotation (3) and point spread, followed by attitude (3) or a star's x and y.
 _SHARED = 4
 EXPOSURE = 0.2
 SOLUTIONS = ("flight", "known sky")
 # Error (rad) of the tracker's prior about each axis, and its claimed standard deviation.
 _PRIOR_ERROR, _PRIOR_SIGMA = np.array([2e-4, -1e-4, 1e-4]), 3e-4
-# Median of the distance of a point whose two coordinates have the rms distance 1.
+# Median distance of a point whose two coordinates have an rms of 1 each, divided by the rms distance.
 _RAYLEIGH_MEDIAN = float(np.sqrt(np.log(2.0)))
 
 
@@ -62,14 +62,14 @@ def scenes(
     seed: tuple[int, ...],
     faintest: float,
 ) -> list[Scene]:
-    """Return frames with a rotation of `percent` of the field, and theta spread evenly over `thetas` deg.
+    """Return frames with a rotation of `percent` of the field, and theta spread evenly over `thetas` (deg).
 
     The sky holds stars down to magnitude `faintest`.
     """
     found = []
     for frame in range(frames):
         generator = np.random.default_rng((*seed, round(10.0 * percent), frame))
-        # One theta from each of `frames` equal parts of the range.
+        # One theta is drawn from each of `frames` equal parts of the range.
         theta = thetas[0] + (thetas[1] - thetas[0]) * (frame + generator.uniform()) / frames
         angle, fraction = float(np.deg2rad(theta)), percent / 100.0
         found.append(slew(generator, angle, fraction, exposure, faintest, camera))
@@ -77,7 +77,7 @@ def scenes(
 
 
 def _by_attitude(vectors: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return d(pixel)/d(small turn of the camera), (n, 2, 3), of directions (n, 3): v moves by v x psi."""
+    """Return d(pixel)/d(small rotation of the camera) (n, 2, 3) of directions (n, 3); v moves by v x psi."""
     x, y, z = vectors.T
     projected = np.zeros((len(vectors), 2, 3))
     projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / z
@@ -86,9 +86,9 @@ def _by_attitude(vectors: FloatArray, pinhole: Pinhole) -> FloatArray:
 
 
 def across_bound(scene: Scene, camera: StarCameraModel) -> float:
-    """Return the lower bound of the rms error, rad, of the boresight direction.
+    """Return the lower bound of the rms error (rad) of the boresight direction.
 
-    Raises numpy.linalg.LinAlgError when the stars fix none.
+    Raises numpy.linalg.LinAlgError if the stars do not determine it.
     """
     pinhole = camera.pinhole
     seen = np.flatnonzero(
@@ -123,7 +123,7 @@ def across_bound(scene: Scene, camera: StarCameraModel) -> float:
 def tracked(
     found: MotionResult, scene: Scene, camera: StarCameraModel, truth: FloatArray
 ) -> tuple[FrameSolution, FrameSolution]:
-    """Return the solutions of the star tracker for the fit, and for a second fit with all stars known."""
+    """Return the star tracker's solutions for the fit, and for a second fit with all stars known."""
     settings = SolveSettings(
         likelihood=LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, line_time=0.0)
     )
@@ -135,7 +135,7 @@ def tracked(
 def attitude_rows(
     percent: float, frames: int, seed: int, faintest: float, exposure: float
 ) -> list[dict[str, Any]]:
-    """Return for each solution the errors across the boresight at mid-exposure, in px and over the bound."""
+    """Return the errors across the boresight at mid-exposure of each solution, in px and over the bound."""
     camera = StarCameraModel(field_of_view=FIELD)
     figures: list[list[tuple[float, float, float]]] = []
     bounds: list[float] = []
@@ -176,7 +176,10 @@ def attitude_rows(
 
 
 def _figures(angles: FloatArray, least: FloatArray, pixel: float) -> dict[str, Any]:
-    """Return how many attitudes (n,) rad there are, NaN for none, and their errors, px and over the bound."""
+    """Return the number of attitudes, and their errors in px and relative to the bound `least`.
+
+    The errors `angles` (n,), rad, are NaN for frames without an attitude.
+    """
     there = np.isfinite(angles)
     if not there.any():
         return {"attitudes": 0}
@@ -193,7 +196,7 @@ def _figures(angles: FloatArray, least: FloatArray, pixel: float) -> dict[str, A
 
 
 def _root_mean_square(values: FloatArray) -> float | None:
-    """Return the statistic of the existing values, or None without values."""
+    """Return the root mean square of the values that are not NaN, or None without such values."""
     there = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(there)))) if len(there) else None
 

@@ -1,8 +1,9 @@
 """Objects among long streaks, and the time of the search: `python -m tests.studies.bench.object_turns`.
 
-The camera of the simulator turns by 10 to 30 % of its field within 0.5 s about a random axis. Each frame has
-one object of the given magnitude, or none, that moves by 9 to 87 px among the stars, as in the campaign
-`rso-orbits`. The rotation is that of the likelihood estimate. Only the search is timed, in processor time.
+The camera of the simulator rotates by 10 to 30 % of its field within 0.5 s about a random axis. A frame has
+no object, or one of the given magnitude that moves by 9 to 87 px relative to the stars, as in the campaign
+`rso-orbits`. The search uses the rotation of the likelihood estimate. Only the search is timed, in processor
+time.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ _SEED = 27_182
 
 @dataclass(frozen=True, slots=True)
 class Looked:
-    """The search of one frame.
+    """Result of the search of one frame.
 
     Attributes:
         error: error (px) of the true object's ends, or None if the object is not found.
-        claims: squared errors of the two ends (2,) in claimed standard deviations, or none.
-        others: number of other finds.
+        claims: squared errors (2,) of the two ends in claimed standard deviations, or None.
+        others: number of false detections.
         spent: processor time, ms.
     """
 
@@ -53,7 +54,7 @@ class Looked:
 
 
 def drawn(camera: StarCameraModel, generator: np.random.Generator, fraction: float) -> Sky:
-    """Return a random pointing of a camera that turns by `fraction` of its field, and an object in view."""
+    """Return a random pointing of a camera that rotates by `fraction` of its field, and an object in view."""
     pinhole = camera.pinhole
     while True:
         axis = normalise(generator.normal(size=3))
@@ -77,7 +78,7 @@ def drawn(camera: StarCameraModel, generator: np.random.Generator, fraction: flo
 def frame(
     camera: StarCameraModel, seed: tuple[int, ...], percent: float, magnitude: float | None
 ) -> tuple[Image, FloatArray, FloatArray]:
-    """Return a frame, the camera's rate (3,), rad/s, and the ends (2, 2), px, of the object's streak."""
+    """Return a frame, the camera's rate (3,), rad/s, and the object's streak ends (2, 2), px."""
     generator = np.random.default_rng(seed)
     sky = drawn(camera, generator, percent / 100.0)
     return sky.frame(camera, magnitude, generator), sky.rate, sky.path[[0, -1]]
@@ -86,7 +87,7 @@ def frame(
 def looked(
     camera: StarCameraModel, pixels: Image, rate: FloatArray, ends: FloatArray | None
 ) -> Looked | None:
-    """Return the result of the search of a frame, or None if the frame gives no rate."""
+    """Return the result of the search of a frame, or None if the frame has no rate estimate."""
     saturation = float(camera.highest_count)
     likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain, line_time=0.0)
     motion = estimate_motion(pixels, camera.pinhole, EXPOSURE, likelihood, rate, 0.0)
@@ -122,7 +123,7 @@ def main() -> None:
     camera, out = StarCameraModel(field_of_view=FIELD), sys.stdout
     out.write(f"{options.frames} frames a row, seed {options.seed}\n")
     out.write("  %    V   rates  found  others  error px  (error/claim)^2  CPU ms: median  95 %     max\n")
-    # The first search of a process loads its compiled forms.
+    # The first search of a process also loads compiled code.
     pixels, rate, _ = frame(camera, (options.seed,), options.percent[0], None)
     looked(camera, pixels, rate, None)
     for percent in options.percent:

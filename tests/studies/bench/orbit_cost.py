@@ -1,7 +1,7 @@
 """Processor time of a flight in lock-step: `python -m tests.studies.bench orbit_cost [--config FILE]`.
 
-Flies the first seconds of config/orbit.yaml, from the tip-off to pointing, or of another configuration by
-`flight run`, and reads from its log the processor time of a control cycle and of the workers' jobs. The time
+The command flies the first seconds of config/orbit.yaml, from the tip-off to pointing, or of another
+configuration. It reads the processor time of a control cycle and of the workers' jobs from the log. The time
 of a cycle includes the emulated devices on the coils' bus, but not the jobs. On a slow machine, times are
 scaled to those of a standard machine.
 """
@@ -31,7 +31,7 @@ import runpy, time
 time.perf_counter_ns = time.thread_time_ns
 runpy.run_module("flight", run_name="__main__", alter_sys=True)
 """
-"""Program that runs the flight application, whose log then contains processor times, not elapsed times."""
+"""Program that runs the flight application with processor times instead of elapsed times in its log."""
 MODES = (Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT, Mode.TESTBED_DEMO)
 
 
@@ -84,7 +84,7 @@ def figures(run: Run, slowness: float) -> str:
 
 
 def command_s(*arguments: str) -> tuple[float, float]:
-    """Return the processor time of a command of the flight application, s, and the slowness of this machine.
+    """Return the processor time (s) of a command of the flight application, and the slowness of this machine.
 
     The time includes child processes and is scaled to a standard machine.
     """

@@ -1,11 +1,12 @@
 """Plan slews in orbit, random or recorded: `python -m tests.studies.bench orbit_slews [--recorded]`.
 
-Slews of 30 to 180 deg from rest to rest, of a 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2, 80 to 400 s) and a 3U
-(0.0066 and 0.0333 kg m^2, 0.2 A m^2, 300 to 1,200 s), in the orbits of the space station and of a
-Sun-synchronous satellite, in the field of WMM2025. `--recorded` plans the slews of `optimum_orbit.json`,
+The slews are of 30 to 180 deg from rest to rest, in the orbits of the space station and of a Sun-synchronous
+satellite, in the field of WMM2025. A 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2) slews in 80 to 400 s, and a 3U
+(0.0066 and 0.0333 kg m^2, 0.2 A m^2) in 300 to 1,200 s. `--recorded` plans the slews of `optimum_orbit.json`,
 compares them with their optima, and integrates the dipoles independently. `--job` runs the planner's job of
-the flight instead: prediction, slew within cones, planned with air and sunlight and then planned again with
-the areas that the body exposes on it, and table. Times are of this process's processor.
+the flight instead:
+prediction, a slew that avoids exclusion cones, planned with the air drag and sunlight torques of the areas
+that the body exposes along it, and the table. Times are processor times of this process.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ def _jobs(runs: int, seed: int) -> int:
 
 
 def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
-    """Return the job of a task whose torques are `draw` (9,) times those that a filter expects."""
+    """Return the job of a task with torques of `draw` (9,) times the filter's prior standard deviations."""
     craft = {"1U": "knightcube", "3U": "cubesat_3u"}[name[:2]]
     place = task.along(np.array([0.0, 1.0])).position
     end = task.end(task.horizon)

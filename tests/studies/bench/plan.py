@@ -1,10 +1,10 @@
 """Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N]`.
 
-Random slews over the testbed's range, with thread, disturbance and moving ends
-(tests.support.step_problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one,
-and too short ones, which are stretched.
-Solve times are of this process's processor time; cost is compared with the collocation oracle at the same
-horizon; limits are checked at 4001 points of the path.
+The slews are random over the testbed's range, with thread stiffness, disturbance and moving end points
+(tests.support.step_problems). The horizons of the first set are 1.1 to 2.5 times the shortest feasible one.
+Those of the second set are too short, and the planner stretches them. Solve times are processor times of this
+process. The cost is compared with that of the collocation oracle at the same horizon. Limits are checked at
+4001 points of the path.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOO_SHORT = (0.6, 0.99)
 
 
 def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
-    """Return the figures of slews, each with its shortest feasible horizon in s."""
+    """Return the figures of slews, each given with its shortest feasible horizon (s)."""
     spans, costs, passed, beyond, failed, unsolved = [], [], [], [], 0, 0
     stretched = 0
     for problem, shortest in problems:
@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.runs < 1:
         parser.error("--runs must be at least 1")
-    THESIS.planned()  # fills the caches, as the worker's first plan does
+    THESIS.planned()  # fills the caches, as the first plan of a worker does
     STEPS[0].planned()
     feasible = feasible_problems(options.runs, options.seed, FEASIBLE)
     short = feasible_problems(max(1, options.runs // 5), options.seed + 1, TOO_SHORT)

@@ -1,11 +1,12 @@
 """Real releases renewed over the link: `python -m tests.studies.bench releases`.
 
-The releases are built from the sources of this repository with pip, virtual environments and the packages
-of this Python environment. Only systemd and the radio are replaced by test doubles. The first release is
-installed into a folder by `deploy/install.sh`. The second release has a higher version. Its bundle is signed,
-sent up by CFDP, activated, built by the privileged program (which is killed once during the build), tested,
-flown and confirmed. The ground withdraws it, and the first release flies again. A third release passes its
-self-test, but its flight with the board's configuration ends at once, so that the previous release returns.
+The releases are built from the sources of this repository with pip, virtual environments and the packages of
+this Python environment. Only systemd and the radio are replaced by test doubles. `deploy/install.sh` installs
+the first release into a folder. The second release has a higher version. The ground signs its bundle, sends
+it by CFDP and activates it. The privileged program builds the release and is killed once during the build.
+The release is tested, flown and confirmed. Then the ground withdraws it, and the first release flies again. A
+third release passes its self-test, but its flight with the board's configuration ends at once, so the
+previous release flies again.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class RealBoard(FakeBoard):
         build = [*program, "build", "--python", python, "--reuse", "packages"]
         done = subprocess.run(build, capture_output=True, text=True, check=True)
         subprocess.run([*program, "switch", done.stdout.split()[-1]], check=True)
-        return super().install(label)  # finds the release of these sources, and installs everything else
+        return super().install(label)  # finds the release of these sources, and installs all other files
 
     @staticmethod
     def _copy_packages(release: Path) -> None:
@@ -86,7 +87,7 @@ class RealBoard(FakeBoard):
         (release / "manifest").write_text(releases.manifest_text(release), encoding="utf-8")
 
     def fly(self, *program: str) -> tuple[str, str]:
-        """Start the flight by the launcher, and return the started version ("" for none) and the messages."""
+        """Start the flight by the launcher; return the started version (empty if none) and the messages."""
         state = self.root / "state"
         state.mkdir(exist_ok=True)
         text = (self.root / "etc/knightcube/flight.yaml").read_text(encoding="utf-8")
@@ -175,7 +176,7 @@ class Rehearsal:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Renew the releases, and return 0 if the expected release is in use after each step."""
+    """Renew the releases. Returns 0 if the expected release is in use after each step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.parse_args(arguments)
     minor, _, patch = __version__.rpartition(".")

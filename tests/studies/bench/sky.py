@@ -1,13 +1,14 @@
-"""The star tracker from pixels: real photographs, points and streaks: `python -m tests.studies.bench sky`.
+"""The star tracker on real photographs, points and streaks: `python -m tests.studies.bench sky`.
 
-Photographs: those of a folder with a `truth.json` (right ascension and declination of the image's centre and
-the horizontal field, degrees), with the field known to 5 % and, where it is of 10 to 30 deg, unknown.
-Simulated frames: the simulator's camera of 12 deg and 0.1 s, with the field known to 0.1 deg, the axis of
-the turn 30 to 90 deg off the boresight, and across it. The bounds are Cramer-Rao's: `over bound`, the rms
-error across the boresight over that of the stars' places, and `bound`, that of the rate's magnitude.
-Identified stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths of
-streaks. Times are of one core's CPU; peers extract the stars themselves, with their default filters and
-without filters.
+The photographs are those of a folder with a `truth.json`, which gives right ascension and declination of the
+image's centre and the horizontal field of view in degrees. Each photograph is solved with the field known to
+5 %, and also with an unknown field if it is 10 to 30 deg wide. The simulated frames have the simulator's
+camera with a field of 12 deg known to 0.1 deg and an exposure of 0.1 s. The axis of rotation is 30 to 90 deg
+off the boresight, or perpendicular to it. `over bound` is the rms error across the boresight divided by the
+Cramer-Rao bound of the star positions; `bound` is the same ratio of the rate's magnitude. Identified stars
+lower the bound of the rate by at most 2 %, because the rate follows from the lengths of streaks. Times are
+processor times of one core. Peers extract the stars themselves, with their default filters and without
+filters.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def photographs(folder: Path) -> list[Photograph]:
 
 
 def _shown(folder: Path) -> Iterator[tuple[str, dict[str, float], bool]]:
-    """Yield the photographs, each as often as it is tried: name, truth, whether the field is known."""
+    """Yield name, truth and whether the field is known, once for each trial of a photograph."""
     for name, values in json.loads((folder / "truth.json").read_text()).items():
         yield name, values, True
         if _LOWEST_DEG <= values["fov"] <= _HIGHEST_DEG:
@@ -66,13 +67,13 @@ def _shown(folder: Path) -> Iterator[tuple[str, dict[str, float], bool]]:
 
 
 def scene_of(length: float, theta_deg: tuple[float, float], frame: int) -> SkyFrame:
-    """Return a frame with streaks of `length` px."""
+    """Return a frame with streaks that are `length` px long."""
     key = [_SEED, frame, round(length)] + ([1] if theta_deg == _ACROSS else [])
     return sky_frame(np.random.default_rng(key), length, _EXPOSURE, theta_deg=theta_deg)
 
 
 def row_of(length: float, theta_deg: tuple[float, float], frames: int) -> dict[str, Any]:
-    """Return the figures of `frames` random frames with streaks of `length` px."""
+    """Return the figures of `frames` random frames with streaks that are `length` px long."""
     each = [solved(scene_of(length, theta_deg, frame), length) for frame in range(frames)]
     columns = {name: np.array([getattr(one, name) for one in each]) for name in asdict(each[0])}
     told = ~np.isnan(columns["across"])
@@ -107,7 +108,7 @@ def _or_nan(figure: Any, values: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Case:
-    """A frame for the peers: its configuration, its truth (3,), and the job in their format."""
+    """A frame for the peers, with its configuration, true direction (3,) and job in their format."""
 
     configuration: str
     boresight: FloatArray
@@ -180,7 +181,7 @@ def _peer_row(chosen: Sequence[tuple[Answer, Case]]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure and print; exit status 0."""
+    """Measure and print; return exit status 0."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.bench sky", description=__doc__)
     parser.add_argument("--frames", type=int, default=20, help="of each length (default %(default)s)")
     parser.add_argument("--photographs", type=Path, default=PHOTOGRAPHS, metavar="FOLDER")

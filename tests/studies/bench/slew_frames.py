@@ -1,8 +1,8 @@
 """Rates from streaks during a slew: `python -m tests.studies.bench slew_frames [--as-they-come]`.
 
 The 3U of `config/orbit_3u.yaml` is released near rest, holds its attitude and slews by 100 deg in 300 s or
-more, a frame every 5 s, through the whole loop. Exposures avoid the steps of the coils, or begin at the
-scheduled times of the camera. Rates are compared with the truth's mean over their exposures.
+more. The whole loop runs, with a frame every 5 s. Exposures avoid the steps of the coils, or begin at the
+scheduled times of the camera. Each rate is compared with the mean true rate over the exposure.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.support.slew_frames import compared, flight
 
 
 class _Unscheduled(SatelliteControl):
-    """The satellite's control with exposures that are not scheduled by the coils' pauses."""
+    """Control of the satellite whose exposures are not scheduled by the coils' pauses."""
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
         """Return the requested time."""

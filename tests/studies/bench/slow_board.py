@@ -1,12 +1,13 @@
 """Flight on a board of the 800 MHz class: `python -m tests.studies.bench slow_board [--orbit] [--share S]`.
 
 The flight runs in real time on emulated devices, with vision and planner, in a fraction of one core and 512
-MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz: the yardstick (heap sort and
-Linpack's elimination) is measured here and compared with the published figures of that processor
-(`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The emulated
-devices are outside the limit. `--camera-period` and `--replan-period` can request more work than the board
-can do, so that work is shed. Needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`.
-`user_mode_linux.sh` runs the bench with cgroup v2 on a machine with cgroup v1.
+MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz. It follows from benchmarks
+(heap sort and Linpack's elimination) that are measured here and compared with the published figures of that
+processor (`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The
+limit does not apply to the emulated devices. `--camera-period` and `--replan-period` can request more work
+than the board can do, so that work is shed. The benchmark needs root, and a cgroup hierarchy with the
+controllers `cpu` and `memory`. `user_mode_linux.sh` runs the bench with cgroup v2 on a machine with cgroup
+v1.
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ from tests.support.process_watch import MIB, answering
 from tests.support.processor_share import CORTEX_A53, Limits, limited, measure
 
 MEMORY = 512 * 1024 * 1024
-"""Bytes of memory of the board."""
+"""Memory of the board (bytes)."""
 IMU_BAUD = 230_400
 SLOW_AFTER_S, FRAME_AGE_S, TIMEOUT_S = 5.0, 60.0, 60.0
-"""Times (s) that a slow board needs: of a frame, between frames, and of a job until it is given up."""
+"""Times (s) that a slow board needs: age of a frame, time between frames, and timeout of a job."""
 _WORKERS = ("planner", "vision", "wide")
 _PATIENCE_S = 240.0
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What is flown.
+    """Options of the flight.
 
     Duration (s), craft, periods (s) of frames and plans, share of a core or None, and readings per second.
     """
@@ -116,7 +117,7 @@ def configuration(wish: Wish) -> str:
 
 
 def fly(folder: Path, wish: Wish) -> Figures:
-    """Fly once in `folder`, and return the figures. Raises OSError where the limit is refused."""
+    """Fly once in `folder`, and return the figures. Raises OSError if the system refuses the limit."""
     config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
     facts = devices / "facts.json"
     config.write_text(configuration(wish), encoding="utf-8")
@@ -169,7 +170,7 @@ def _own_process() -> int:
 
 
 def _demote(flight: LiveFlight, limits: Limits, stop: threading.Event) -> None:
-    """Put each worker behind the control process as soon as it exists."""
+    """Lower the priority of each worker below that of the control process as soon as the worker exists."""
     done: set[int] = set()
     while not stop.wait(0.1):
         for role, process in executive.members(flight).items():

@@ -1,10 +1,10 @@
 """Solvers and centroids on the same frames: `python -m tests.studies.bench solve_methods`.
 
-Frames of real stars to V 8.5 at rest (1024 x 1024, 12 deg, 0.2 s), identified once a centroid, and each
-attitude solver of `flight solve --attitude` on the same places, with Delabie's image matching (AIM) beside
-them. The lens is known. Errors are across and
-about the boresight, arcsec rms of an axis; NEES of three axes over three, 1 when honest; ms of processor of
-identification, image fit and solver, and of finding and measuring the stars.
+The frames show real stars to V 8.5 at rest (1024 x 1024, 12 deg, 0.2 s). Each centroid identifies the stars
+once. Each attitude solver of `flight solve --attitude` and Delabie's image matching (AIM) then use the same
+positions. The lens is known. The table has the errors across and about the boresight (arcsec rms per axis),
+the NEES of three axes divided by three (1 if the covariance is correct), and the processor times (ms) of
+finding and measuring the stars, and of identification, image fit and solver.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _ARCSECONDS = float(np.degrees(3600.0))
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One solver with one centroid."""
+    """Figures of one solver with one centroid."""
 
     centroid: str
     attitude: str

@@ -1,10 +1,11 @@
-"""Other people's star identification on our lists: tests/studies/bench/star_peers.py PEER JOBS.json.
+"""Star identification programs of others on our lists: tests/studies/bench/star_peers.py PEER JOBS.json.
 
-The program runs without this repository in the Python of the peers, because cedar-solve needs numpy below 2.
-A job is a star list (`pixels`, `size`) or a frame (`image`, a numpy file), with the field of view and its
-uncertainty in degrees. For a frame, the time includes the star extraction of the peer. The program prints
-one JSON object with the CPU time (ms) and the boresight (3,) of each job, or null for a refusal, and the
-growth of resident memory by catalogue and index after the import of the peer.
+The program runs without this repository in the Python environment of the peers, because cedar-solve needs
+numpy below 2. A job is a star list (`pixels`, `size`) or a frame (`image`, a numpy file), with the field of
+view and its uncertainty in degrees. For a frame, the time includes the star extraction of the peer. The
+program prints one JSON object with the CPU time (ms) and the boresight (3,) of each job, or null for a
+refusal. It also prints by how much catalogue and index increase the resident memory after the import of the
+peer.
 """
 
 import importlib
@@ -20,13 +21,13 @@ Solver = Callable[[dict[str, Any]], "list[float] | None"]
 
 
 def direction(right_ascension: float, declination: float) -> list[float]:
-    """Return the unit vector of a place given in degrees."""
+    """Return the unit vector of a right ascension and declination in degrees."""
     ra, dec = math.radians(right_ascension), math.radians(declination)
     return [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
 
 
 def cedar(**extraction: Any) -> Solver:
-    """Return cedar-solve with its own database of 10 to 30 deg."""
+    """Return cedar-solve with its own database for fields of 10 to 30 deg."""
     import numpy as np  # noqa: PLC0415 - of the peer's Python, where it is asked for
 
     tetra3: Any = importlib.import_module("tetra3")
@@ -48,7 +49,7 @@ def cedar(**extraction: Any) -> Solver:
 
 
 def tetra3rs(**extraction: Any) -> Solver:
-    """Return tetra3rs with a database for 10 to 30 deg."""
+    """Return tetra3rs with a database for fields of 10 to 30 deg."""
     import numpy as np  # noqa: PLC0415
 
     peer: Any = importlib.import_module("tetra3rs")

@@ -1,13 +1,14 @@
 """Star identification beside cedar-solve and tetra3rs: `python -m tests.studies.bench starid`.
 
-The twelve configurations of issue 4 (1024 x 1024 pixels; 12 and 20 deg; 0.1 and 0.5 px of noise; 0, 2, 5
-false stars; the field known to 0.1 deg and really that far off), then the field unknown between 10 and 30
-deg, and lists that show no part of the sky. An answer is correct if its boresight is correct to 0.05 deg and
-80 % of the identified stars are correct. Times are of CPU, one core, one list a call; peers run in their own
-process.
+The lists have the twelve configurations of issue 4: 1024 x 1024 pixels, fields of 12 and 20 deg, 0.1 and 0.5
+px of noise, 0, 2 and 5 false stars, and an error of the known field of up to 0.1 deg. Further lists have an
+unknown field between 10 and 30 deg, or show no part of the sky. An answer is correct if its boresight is
+correct to 0.05 deg and 80 % of the identified stars are correct. Times are processor times of one core with
+one list per call. Peers run in separate processes.
 
-`bound`: the median over the lists of pointing error over the median that the centroid noise allows, from
-the Fisher information of all true stars of the list with attitude and scale unknown (1.1774 sigma: Rayleigh).
+`bound` is the median pointing error divided by the median error that the centroid noise allows. The latter
+follows from the Fisher information of all true stars of the list with attitude and scale unknown (1.1774
+sigma: Rayleigh).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _INSTALL = (
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What one solver said of one list: milliseconds, boresight (3,) or None, share of true names."""
+    """Answer of one solver to a list: time (ms), boresight (3,) or None, share of correct identifications."""
 
     ms: float
     boresight: FloatArray | None
@@ -74,9 +75,9 @@ def our_answers(lists: Sequence[StarList], sky: SkyIndex) -> list[Answer]:
 
 
 def peer_answers(peer: str, python: str, jobs: Sequence[dict[str, Any]]) -> tuple[list[Answer], float] | None:
-    """Return a peer's answers to jobs as `star_peers` takes them, and its resident megabytes.
+    """Return a peer's answers to jobs in the format of `star_peers`, and its resident memory (MB).
 
-    None where it is not installed.
+    Returns None if the peer is not installed.
     """
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         json.dump(jobs, file)
@@ -111,14 +112,14 @@ def _one_core() -> dict[str, str]:
 
 
 def pointing_error(answer: Answer, drawn: StarList) -> float:
-    """Return the angle in rad between the boresight found and the true one."""
+    """Return the angle (rad) between the boresight of the answer and the true one."""
     assert answer.boresight is not None
     true = attitude_matrix(drawn.attitude)[2]
     return float(np.arctan2(np.linalg.norm(np.cross(answer.boresight, true)), answer.boresight @ true))
 
 
 def pointing_bound(drawn: StarList, sky: SkyIndex) -> float:
-    """Return sigma in rad of the boresight, each axis, with all true stars and the scale unknown."""
+    """Return the bound of sigma (rad) of the boresight per axis, with all true stars and unknown scale."""
     true = np.flatnonzero(drawn.star >= 0)
     field = drawn.field()
     scale = PIXELS / (2.0 * drawn.camera.focal_length * field.half_width[0])
@@ -184,7 +185,7 @@ def memory_of_index() -> float:
 
 
 def cases(count: int, sky: SkyIndex, seed: int) -> dict[str, list[StarList]]:
-    """Return the lists by the name of their kind."""
+    """Return the lists by the name of their configuration."""
     found = {}
     for number, kind in enumerate(configurations()):
         name = f"{kind.field_deg:.0f} deg, {kind.noise_px} px, {kind.false_stars} false"
@@ -225,7 +226,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     megabytes = {"flight": memory_of_index()}
     ratios = {}
     for peer in ("cedar-solve", "tetra3rs") if options.peers else ():
-        # A list of no sky may take a peer the whole of its time limit.
+        # A peer may use its whole time limit for a list that shows no part of the sky.
         shown = {
             name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()
         }
@@ -257,7 +258,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> dict[str, float]:
-    """Return our time over the peer's on the lists with the field known: median and 95th percentile."""
+    """Return the ratio of our time to the peer's on lists with a known field: median and 95th percentile."""
     known = list(ours)[: len(configurations())]
     mine, other = ([answer.ms for name in known for answer in all_of[name]] for all_of in (ours, theirs))
     return {
@@ -267,7 +268,7 @@ def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> di
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables, and return 1 if a list was identified wrongly."""
+    """Print the tables. Returns 1 if a list was identified wrongly."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lists", type=int, default=200, help="of each configuration (default %(default)s)")
     parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")

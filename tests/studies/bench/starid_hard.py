@@ -1,11 +1,11 @@
 """Star identification in difficult lists: `python -m tests.studies.bench starid_hard`.
 
-Fields of view unknown, false stars that are all brighter than the true ones, mirrored images, hints of the
-field that are 10 % wrong, lenses with 2 to 8 % of distortion that nobody calibrated, and points that show no
-part of the sky, with the times of their refusals. Lists as in the bench `starid`; `wrong` is an answer that
-is not right. For a distorted lens, an answer is misleading if its error exceeds both five sigmas and 120
-arcseconds. The status is 1 when an answer is wrong or misleading. `--peer` runs tetra3rs or cedar-solve on
-the same lists.
+The lists have unknown fields of view, false stars that are all brighter than the true ones, mirrored images,
+field estimates that are 10 % wrong, or uncalibrated lenses with 2 to 8 % of distortion. Points that show no
+part of the sky measure the time of a refusal. The lists are drawn as in the benchmark `starid`. `wrong`
+counts incorrect answers. For a distorted lens, an answer is misleading if its error exceeds both five sigmas
+and 120 arcseconds. The exit status is 1 if an answer is wrong or misleading. `--peer` runs tetra3rs or
+cedar-solve on the same lists.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ class Hardship:
 
     Attributes:
         kind: name of the row.
-        fields: deg.
+        fields: range of fields of view, deg.
         distorted: whether the lens is distorted by _DISTORTION at the corner, with 0 to 5 false stars.
-        hint: relative error of the field of view given.
+        hint: relative error of the given field of view.
         strewn: whether the points are random.
     """
 
@@ -144,7 +144,7 @@ def measured(
         "p95_ms": float(np.percentile(ms, 95)),
         "max_ms": max(ms),
     }
-    # A list of no sky may take a peer the whole of its time limit.
+    # A peer may use its whole time limit for a list that shows no part of the sky.
     if peer is None or row.strewn:
         return figures
     jobs = [_job(row, one) for one in drawn]
@@ -174,7 +174,7 @@ def _right(answers: Sequence[Answer], drawn: Sequence[StarList]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table; 1 when an answer is wrong."""
+    """Print the table. Returns 1 if an answer is wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lists", type=int, default=100, help="of each row (default %(default)s)")
     parser.add_argument("--only", default="", metavar="WORD", help="rows whose names contain it")

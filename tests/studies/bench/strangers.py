@@ -1,14 +1,14 @@
 """Commands and lateness under attack by strangers: `python -m tests.studies.bench strangers [--rounds N]`.
 
 In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
-quiet, and attacked. The attackers share one core. They send 30,000 datagrams a second from an address that is
-not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that form no frame.
-With `--forged N` they also send N forged frames a second from a peer's address: replayed, damaged and without
-the key. The link has to examine these frames, so that commands by UDP may be lost among them.
-In both flights the operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a
-new one. The bench prints the executed commands, the rates of the attackers, and the lateness of the control
-cycles. The exit status is 1 if a command was not obeyed, or if the 99 % quantile of the lateness is more than
-twice that of the quiet flights (medians over the rounds).
+without and with an attack. The attackers share one core. They send 30,000 datagrams a second from an address
+that is not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that form
+no frame. With `--forged N` they also send N forged frames a second from a peer's address: replayed, damaged
+and without the key. The link must examine these frames, so commands by UDP may be lost. In both flights the
+operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a new one. The
+benchmark prints the executed commands, the rates of the attackers, and the lateness of the control cycles.
+The exit status is 1 if a command was not executed, or if the 99 % quantile of the lateness is more than twice
+that of the quiet flights (medians over the rounds).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> dict[str, Any]:
-    """Run once, and return the executed commands, the lateness, ms, and the rates of the attackers."""
+    """Run one flight. Returns the executed commands, the lateness (ms), and the rates of the attackers."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     with ExitStack() as stack:
         config, run = (
@@ -101,7 +101,7 @@ def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> d
 
 
 def _wait_for_port(tcp: int) -> None:
-    """Wait until a link listens. Raises TimeoutError."""
+    """Wait until a link listens on the port. Raises TimeoutError if none does."""
     until = time.monotonic() + 2.0 * _START_S
     while time.monotonic() < until:
         with contextlib.suppress(OSError):
@@ -112,12 +112,12 @@ def _wait_for_port(tcp: int) -> None:
 
 
 def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
-    """Send commands in turn by three lines; return number and reason of each that was not obeyed."""
+    """Send commands in turn by three lines; return number and reason of each that was not executed."""
     packer, failures = CommandPacker(), list[str]()
     ways = (f"127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}", f"tcp:127.0.0.1:{tcp}")
     with ExitStack() as stack:
         lasting = [stack.enter_context(contextlib.closing(open_terminal(way, keys))) for way in ways[:2]]
-        for terminal in lasting:  # like gateway and console
+        for terminal in lasting:  # the gateway and the console hold such connections
             terminal.send(packer.pack(Ping(), utc_ns()))
         for number in range(count):
             try:
@@ -138,7 +138,7 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
 
 @contextmanager
 def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[str, float]]]:
-    """Run all floods on one core; yield a function that returns their rates until now."""
+    """Run all floods on one core; yield a function that returns their mean rates so far."""
     context = multiprocessing.get_context("fork")
     begun = time.monotonic()
     counts = {name: context.Value("Q", 0) for name in ("datagrams", "connections", "forged")}
@@ -205,7 +205,7 @@ def _forged(port: int, a_second: int, count: Any) -> None:
 
 
 def _grid(period: float) -> Iterator[None]:
-    """Yield once a period; periods that were missed are made up for at once."""
+    """Yield once a period. Missed periods are yielded at once."""
     due = time.monotonic()
     while True:
         yield
