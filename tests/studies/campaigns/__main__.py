@@ -1,7 +1,7 @@
-"""`python -m tests.studies.campaigns`: run a campaign by name.
+"""`python -m tests.studies.campaigns`: runs a campaign by name.
 
-A campaign is a constant `Campaign("name", "purpose", ...)` of a module of this package. The list is read from
-the source texts, and only the campaign that runs is imported.
+A campaign is a constant `Campaign("name", "purpose", ...)` of a module of this package. The list of campaigns
+is read from the sources, and only the requested campaign is imported.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ def campaigns() -> dict[str, Listed]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a campaign, and return the exit status: 0 done, 1 cluster lost, 2 wrong use, 130 interrupted."""
+    """Run a campaign.
+
+    Returns 0 if it is done, 1 if the cluster is lost, 2 for wrong use, 130 if interrupted.
+    """
     known = campaigns()
     listed = "\n".join(f"  {name:18} {campaign.purpose}" for name, campaign in known.items())
     parser = argparse.ArgumentParser(

@@ -28,7 +28,7 @@ from tests.support.flights import CONFIG, fly
 ORBIT = CONFIG.parent / "orbit.yaml"
 SPEED, DURATION = math.radians(0.5), 120.0
 WANTED, SETTLED = 60.0, 10.0
-"""Limits (s): time to a fine attitude, and time after which a fine attitude is judged."""
+"""Limits (s): time to a fine attitude, and time after which the error of a fine attitude counts."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -45,7 +45,7 @@ def run(case: Case) -> Result:
 
 
 def _config(duration: float) -> OrbitConfig:
-    """Return the configuration without elements, which are of one orbit; braking ends at once."""
+    """Return the configuration without elements, because they fit one orbit only, and without detumbling."""
     config = as_orbit(configuration.load(ORBIT))
     rest = configuration.replace(config.detumble, low_rate=2.0 * SPEED, low_for=0.1)
     return configuration.replace(config, detumble=rest, elements=None, duration=duration)
@@ -87,7 +87,7 @@ def _facts(flown: Run) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return times to a fine attitude, and errors and claims afterwards, in sunlight and shadow."""
+    """Return times to a fine attitude, and later errors and claims, separately for sunlight and shadow."""
     facts: dict[str, Any] = {}
     for name, lit in (("sunlit", True), ("shadow", False)):
         mine = [r for r in results if r["sunlit"] is lit]

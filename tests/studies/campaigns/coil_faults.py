@@ -1,10 +1,10 @@
 """Campaign `coil-faults`: accuracy of the filter while a coil does not carry the commanded current.
 
 Each run flies 20 s of the demonstration's loop in lock-step, without a camera, through two slews, and breaks
-one coil or one leg of a bridge at a random time, for 3 s or to the end. The IMU has no fault. From
-log and truth: for how long after the fault's onset and end the estimated rate or angle is more than 5 of its
-own standard deviations off; how long after the onset measurements of the healthy IMU are still refused; how
-often control was lost.
+one coil or one leg of a bridge at a random time, for 3 s or to the end. The IMU has no fault. The campaign
+reports for how long after the fault's onset and end the error of the estimated rate or angle exceeds 5 of its
+claimed standard deviations, how long after the onset the filter still rejects measurements of the healthy
+IMU, and how often control was lost.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ DURATION = 20.0
 SPAN = 3.0
 SIGMAS = 5.0
 LONGEST_BEYOND = 0.25
-"""Longest time (s) for which the estimate may be beyond `SIGMAS` after an onset or an end."""
+"""Longest time (s) after an onset or an end for which the error may exceed `SIGMAS`."""
 LONGEST_REFUSAL = 0.5
-"""Time (s) after the onset from which no measurement of the healthy IMU may be refused."""
+"""Time (s) after the onset from which the filter may reject no measurement of the healthy IMU."""
 
 
 def faults() -> list[str]:
@@ -109,7 +109,7 @@ def judge(flown: Run, entry: FaultEntry) -> Result:
 
 
 def estimate_beyond(flown: Run) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], FloatArray]:
-    """Return for each control cycle with an estimate whether it is beyond, and the mission times, s."""
+    """Return whether the error exceeds the limit at each cycle with an estimate, and the times (s)."""
     control, truth = flown["control"], flown["truth"]
     known = np.isfinite(control["rate"])
     control = control[known]
@@ -148,7 +148,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _first(event: Any, names: Sequence[str], name: str, after: float) -> float | None:
-    """Return the time, s, from a given time to the first event of a name, or None."""
+    """Return the mission time (s) of the first event of a name after a given time, or None."""
     at = event["time_ns"][np.array([one == name for one in names], bool)] / SECOND_NS - after
     return min(at[at >= 0.0].tolist(), default=None)
 

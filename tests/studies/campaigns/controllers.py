@@ -1,24 +1,25 @@
 """Campaign `controllers`: the 700 s step demonstration under each controller, on the same seeds.
 
-The thesis states a power consumption of 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive
-control on its testbed (ch. 5, Hardware Results). Here all fly the same simulated hardware with the same
-noise: this loop, also with paths that save supply energy, the thesis's, the thesis's on raw readings (its
-filter made transparent), and PID and adaptive control, which are shown the targets themselves. All gains of
-PID and adaptive are tuned by one criterion, `python -m tests.studies.tune_controllers`: the least power with
-every step settled in 9 s and overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone
-and a PID with three equal poles are compared with them.
+The thesis states a power of 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive control on its
+testbed (ch. 5, Hardware Results). In this campaign all controllers fly the same simulated hardware with the
+same noise. They are this project's loop, this loop with paths of minimum supply energy, the loop of the
+thesis, the loop of the thesis on raw readings (without filter), PID and adaptive control. PID and adaptive
+control receive the targets instead of a path. `python -m tests.studies.tune_controllers` tunes all their
+gains by one criterion: minimum power with every step settled in 9 s and overshoots of at most 1 %. An
+adaptive controller that is tuned by its bandwidth alone and a PID with three equal poles are added for
+comparison.
 
-Two powers are given (`knightcube.gnc.guidance.one_axis.plant`): V |I|, which the chopped coils take from
-their supply of 3.4 V and which compares with the thesis's consumption, and R I^2 of the mean current, the
+Two powers are given (`knightcube.gnc.guidance.one_axis.plant`). V |I| is the power that the chopped coils
+draw from their supply of 3.4 V; it compares with the figures of the thesis. R I^2 of the mean current is the
 cost that the paths minimise.
 
-The thesis names no stiffness of its thread. On a thread of 4.2e-5 N m/rad its own loop draws the 0.10 W that
-it printed (R I^2), so the controllers of `STIFF` are also flown on this thread, with PID and adaptive control
+The thesis states no stiffness of its thread. On a thread of 4.2e-5 N m/rad its loop draws the 0.10 W that it
+states (as R I^2). The controllers of `STIFF` are also flown on this thread, with PID and adaptive control
 tuned for it.
 
-The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
-command and held, by direct collocation (tests.support.collocation_oracle). A controller that reaches its
-targets later may use less power.
+The lower bound of the power is the clairvoyant optimum, computed by direct collocation
+(tests.support.collocation_oracle): the whole plant is known, and each target is reached at rest 10 s after
+its command and held. A controller that reaches its targets later may use less power.
 """
 
 from __future__ import annotations
@@ -80,13 +81,13 @@ def supply_saving() -> TestbedConfig:
 
 
 def pid() -> TestbedConfig:
-    """Return the demonstration under PID control with tuned gains [tune_controllers, 2026-11-23]."""
+    """Return the demonstration under tuned PID control [tune_controllers, 2026-11-23]."""
     gains = PidGains(proportional=0.4851, integral=0.09534, derivative=1.0)
     return towards_steps(tracker="pid", gains=gains, target_weight=0.187)
 
 
 def limit_pid() -> TestbedConfig:
-    """Return the demonstration under PID control tuned without margins below the criterion's limits.
+    """Return the demonstration under PID control tuned without margins to the criterion's limits.
 
     The gains are those of `tune_controllers --settling 9 --overshoot 0.01` [2026-11-26].
     """
@@ -101,7 +102,7 @@ def stiff_pid() -> TestbedConfig:
 
 
 def stiff_adaptive() -> TestbedConfig:
-    """Return adaptive control with gains of the same command; it cannot settle within 9 s on this thread."""
+    """Return adaptive control with the gains of that command; it cannot settle within 9 s on this thread."""
     return towards_steps(tracker="adaptive", bandwidth=0.9991, adaptation=363.2, reference_bandwidth=0.526)
 
 
@@ -111,7 +112,7 @@ def placed_pid() -> TestbedConfig:
 
 
 def adaptive() -> TestbedConfig:
-    """Return the demonstration under adaptive control with tuned gains [tune_controllers, 2026-11-23]."""
+    """Return the demonstration under tuned adaptive control [tune_controllers, 2026-11-23]."""
     return towards_steps(tracker="adaptive", bandwidth=0.319, adaptation=33.2, reference_bandwidth=0.584)
 
 
@@ -184,12 +185,12 @@ def run(case: Case) -> Result:
 
 
 def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
-    """Return the largest figure, or infinity if a step did not reach it."""
+    """Return the largest figure, or infinity if a step has none."""
     return max(np.inf if row[key] is None else row[key] for row in rows)
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return each controller's mean power and worst figures over the seeds, beside the floor, by thread."""
+    """Return each controller's mean power and worst figures by thread, and the lower bound."""
     facts: dict[str, Any] = {}
     for thread, names in THREADS.items():
         if own := [result for result in results if result["thread"] == thread]:
@@ -200,7 +201,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _figures(results: Sequence[Result], name: str, floor: float) -> dict[str, Any]:
-    """Return a controller's figures on one thread; its power over this loop's is a factor."""
+    """Return a controller's figures on one thread, with its power relative to that of this project's loop."""
     own = [result for result in results if result["controller"] == name]
     if not own:
         return {"seeds": 0}

@@ -1,11 +1,12 @@
-"""Campaign `coverage`: stars, Sun and limb in view of the cameras of VT, UW and USU (Meller et al., 4).
+"""Campaign `coverage`: stars, Sun and limb in view of the cameras of VT, UW and USU.
 
-Each run is one revolution of the paper's orbit with a random date and node, for each camera suite and each
-kind of attitude: level; rolled and pitched by up to 15 deg (4.1); pitched back and forth by 90 deg (4.3);
-random. It gives the share of time with the horizon, lit or not, in 0, 1, 2, ... cameras, and that of the
-sunlit time with the Sun in a camera. For UW, level, the Sun's share is given over the Sun's height over the
-orbit's plane (beta) and three headings of the hexagon, for the square detector and for the cone in it: the
-paper names none of them.
+It repeats section 4 of Meller et al. Each run is one revolution of the paper's orbit with a random date and
+node, for each camera suite and each kind of attitude: level, rolled and pitched by up to 15 deg (4.1),
+pitched back and forth by 90 deg (4.3), and random. The campaign reports the share of time in which 0, 1, 2,
+... cameras have the horizon, lit or not, in view, and the share of the sunlit time in which a camera has the
+Sun in view. For UW in level attitude, the latter is given over the Sun's elevation above the orbital plane
+(beta), for three headings of the hexagon, and for the square detector and its inscribed cone, because the
+paper states none of these.
 """
 
 from __future__ import annotations
@@ -39,16 +40,18 @@ STEP = 20.0
 MOST_TILT = np.radians(15.0)
 ATTITUDES = ("level", "within 15 deg", "tipped 90 deg", "any")
 HEADINGS = {"two to the Sun's side": -90.0, "one forward": 0.0, "one to the Sun's side": 90.0}
-"""Azimuth (deg) of the first camera, from forward towards the Sun's side of the orbital plane."""
+"""Azimuth (deg) of the first camera, measured from the flight direction towards the Sun's side of the orbital
+plane.
+"""
 BEST = "two to the Sun's side"
 BETA_STEP = 5.0
 PAPER = 74.0
 LEAST_ARC = 5
-"""Number of limb points, of 720, that count as a horizon: 2.5 deg of the limb."""
+"""Smallest number of visible limb points, of 720, that count as a horizon: 2.5 deg of the limb."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` drawn revolutions, and the fixed table of headings."""
+    """Return `runs` random revolutions, and the fixed table of headings."""
     drawn = [Case(f"orbit/{run}", (seed, run), {"kind": "orbit"}) for run in range(runs)]
     betas = np.arange(0.0, 75.1, BETA_STEP)
     return drawn + [
@@ -57,7 +60,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Evaluate the views of one revolution."""
+    """Evaluate the fields of view over one revolution."""
     if case.parameters["kind"] == "heading":
         return {**case.parameters, "shares": sun_by_heading(suite("uw"), np.radians(case.parameters["beta"]))}
     rng = np.random.default_rng(case.seed)
@@ -82,7 +85,7 @@ def run(case: Case) -> Result:
 def _shares(
     sensors: SensorSuite, edge: FloatArray, day: BoolArray, sun: FloatArray, lit: BoolArray
 ) -> dict[str, Any]:
-    """Return the shares of time with the horizon in 0..n cameras, all of it and by day, and with the Sun."""
+    """Return the shares of time with the horizon, lit or any, in 0..n cameras, and with the Sun."""
     count, count_day = np.zeros(len(lit), int), np.zeros(len(lit), int)
     seen = np.zeros(len(lit), bool)
     for camera in sensors.cameras:
@@ -102,7 +105,7 @@ def _shares(
 
 
 def _attitudes(kind: str, n: int, rng: np.random.Generator) -> FloatArray:
-    """Return attitudes (n, 4) from the local vertical's axes into the body's."""
+    """Return attitudes (n, 4) from the local vertical frame to the body frame."""
     if kind == "level":
         return from_rotation_vector(np.zeros((n, 3)))
     if kind == "within 15 deg":
@@ -116,7 +119,7 @@ def _attitudes(kind: str, n: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _sun(way: Pass) -> FloatArray:
-    """Return the Sun's directions (n, 3); in a revolution it moves by 0.06 deg, and is held."""
+    """Return the Sun's directions (n, 3), held constant because the Sun moves by 0.06 deg in a revolution."""
     seen, _ = apparent_sun(way.julian_date, way.positions[0], way.velocities[0])
     return np.broadcast_to(seen, way.positions.shape)
 
@@ -124,7 +127,8 @@ def _sun(way: Pass) -> FloatArray:
 def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, float]]:
     """Return the share of the sunlit orbit with the Sun in a camera, by heading and by shape of the field.
 
-    `beta` rad is the Sun's height over the orbit's plane, to the right: a circular orbit over a sphere.
+    `beta` (rad) is the Sun's elevation above the plane of a circular orbit around a sphere, positive to the
+    right.
     """
     along = np.linspace(0.0, 2.0 * np.pi, 2881)[:-1]
     sun = np.stack(
@@ -135,7 +139,7 @@ def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, flo
     lit = sunlit_share(np.broadcast_to([0.0, 0.0, -radius], sun.shape), ASTRONOMICAL_UNIT * sun) > 0.5
     found: dict[str, dict[str, float]] = {}
     for heading, degrees in HEADINGS.items():
-        # The body is yawed so that its first camera, at azimuth 0, points in the heading.
+        # The body is yawed so that its first camera, at azimuth 0, points along the heading.
         turn = attitude_matrix(from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)])))
         body = sun[lit] @ turn.T
         found[heading] = {
@@ -146,7 +150,7 @@ def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, flo
 
 
 def all_three_up_to(name: str = "vt") -> float:
-    """Return the largest tilt, rad, in any direction, at which each camera has the horizon in view."""
+    """Return the largest tilt (rad), in any direction, at which every camera has the horizon in view."""
     edge = limb(revolution(FIRST_DATE, 0.0, 6000.0).positions[:1])[0]
     direction = np.radians(np.arange(0.0, 360.0, 5.0))
     axes = np.stack([np.cos(direction), np.sin(direction), np.zeros_like(direction)], axis=-1)
@@ -164,7 +168,7 @@ def all_three_up_to(name: str = "vt") -> float:
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return the mean shares, and the Sun's share in UW by heading and height of the Sun."""
+    """Return the mean shares, and the Sun's share in UW by heading and elevation of the Sun."""
     orbits = [result for result in results if result["kind"] == "orbit"]
     tables = [result for result in results if result["kind"] == "heading"]
     facts: dict[str, Any] = {"orbits": len(orbits), "suites": _mean_shares(orbits)}
@@ -198,7 +202,7 @@ def _mean_shares(orbits: Sequence[Result]) -> dict[str, Any]:
 
 
 def _over_year(orbits: Sequence[Result], tables: Sequence[Result]) -> dict[str, float]:
-    """Return UW's mean share of the Sun over the drawn orbits, its first camera kept on the Sun's side."""
+    """Return UW's mean share of the Sun over the drawn orbits, with its first camera on the Sun's side."""
     betas = [result["beta"] for result in tables]
     return {
         shape: float(

@@ -1,4 +1,4 @@
-"""Campaign `damaged-files`: a whole release starts after one flipped bit in one file of a board.
+"""Campaign `damaged-files`: an intact release starts after one flipped bit in one file of a board.
 
 The files are both copies of the launcher and of the safe state, the manifest and a module of the current
 release, the records that flight and link have stored, and all keys. Each flip is followed by a start of the
@@ -133,7 +133,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Count the flips after which a whole release flew."""
+    """Count the flips after which an intact release flew."""
     del folder
     flips = [flip for result in results for flip in result["flips"]]
     bad = [flip for flip in flips if flip["problems"] or not flip["reported"]]

@@ -1,13 +1,13 @@
 """Campaign `detumble`: detumbling from 10 to 0.5 deg/s by coils alone, with all simulated disturbances.
 
-Two craft, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law `magnetometer` has only a
-magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a coarse attitude. The law
-`inertia` has the same sensors, but the body's moments and principal axes differ from the described ones by up
-to the default accuracies. The coils are off for a twentieth of each four seconds, as the magnetometer needs,
-and before the rate is known. While the rate is uncertain, they are off for a tenth of each two seconds. Coils
-are commanded each quarter of a second, and as often as the body rotates by 0.3 rad. Each time is compared
-with a rigorous lower bound (`least_time`), which no control of these coils can beat. The bound assumes that
-the coils are never off and that a dipole of the largest strength has any direction.
+Two craft are detumbled, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law
+`magnetometer` has only a magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a
+coarse attitude. The law `inertia` has the same sensors, but the body's moments and principal axes differ from
+the described ones by up to the default accuracies. The coils are off for a twentieth of each four seconds, as
+the magnetometer needs, and before the rate is known. While the rate is uncertain, they are off for a tenth of
+each two seconds. Coils are commanded each quarter of a second, and as often as the body rotates by 0.3 rad.
+Each time is compared with a rigorous lower bound (`least_time`), which no control of these coils can beat.
+The bound assumes that the coils are never off and that a dipole of the largest strength has any direction.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from tests.studies.campaigns.free_flight import (
 
 DIRECTIONS = 2000
 CLOSER, TRIES = (0.06, 0.02, 0.007), 60
-"""Spreads (rad) of the directions tried around the worst one so far, and their number for each spread."""
+"""Spreads (rad) of the directions tried around the worst one found, and their number for each spread."""
 
 
 def least_time(
@@ -104,7 +104,7 @@ def least_time(
 
 
 def _crossed(removed: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return by column the row, in parts, where `removed` (n + 1, k), rising, reaches `wanted` (k,)."""
+    """Return the rows, with fractions, at which rising columns `removed` (n + 1, k) reach `wanted` (k,)."""
     row = np.sum(removed < wanted, axis=0)
     after = np.clip(row, 1, len(removed) - 1)
     column = np.arange(len(wanted))
@@ -119,19 +119,22 @@ SAMPLES_NS = range(SCHEDULE.settle_ns, SCHEDULE.settle_ns + SCHEDULE.measure_ns,
 LAWS = ("magnetometer", "attitude", "inertia")
 CELLS = tuple((orbit, law) for orbit in ("sso", "iss", "equator") for law in LAWS)
 LONGEST = 6000.0
-"""Time (s) after which a body that is not slow counts as lost."""
+"""Time (s) after which a body that still rotates counts as lost."""
 WALK, LIGHTEST = 4.0, 1.04
-"""Largest random walk of the residual dipole, in standard deviations of an axis, and strongest sunlight, as a
-multiple of that at one astronomical unit."""
+"""Largest random walk of the residual dipole, in standard deviations of an axis, and largest solar pressure,
+as a multiple of that at one astronomical unit.
+"""
 LEAST_CYCLES = 16
-"""Number of commands in a window; a flight has 152."""
+"""Smallest number of commands in a window; a flight has 152."""
 HORIZON = {"knightcube": 1500.0, "cubesat_3u": 3000.0}
 """Horizon (s) of a plan."""
 ATTITUDE_SIGMA = np.radians(1.0)
 """Error (rad per axis) of the coarse attitude from Sun and field."""
 FIELD_SIGMA = 2e-7
 TORQUE_WALK = {"knightcube": 3e-4, "cubesat_3u": 3e-5}
-"""rad/s per sqrt(s): a tenth of the coils' torque over a few seconds."""
+"""Random walk of the torque over the inertia (rad/s per sqrt(s)): a tenth of the coils' torque over a few
+seconds.
+"""
 TARGETS = {
     ("knightcube", "magnetometer"): 2000.0,
     ("knightcube", "attitude"): 450.0,
@@ -142,7 +145,7 @@ TARGETS = {
 }
 """Required times, s."""
 OVER = {"magnetometer": 1.6, "attitude": 1.3, "inertia": 1.4}
-"""Required medians of the time over its lower bound, in the orbits that are not equatorial."""
+"""Required medians of the time divided by its lower bound, in the orbits that are not equatorial."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -218,12 +221,12 @@ def run(case: Case) -> Result:
 
 
 def hash_of(case: Case) -> int:
-    """Return the seed of a case's world: the same for both laws."""
+    """Return the seed of a case's world, which is the same for all laws."""
     return case.seed[0] * 100_003 + case.seed[1]
 
 
 class _Bound:
-    """The lower bound of the time of a flight, from the field along its orbit and its true craft."""
+    """Lower bound of the time of a flight, from the field along its orbit and its true craft."""
 
     def __init__(self, flight: FreeFlight) -> None:
         self._flight = flight
@@ -236,7 +239,7 @@ class _Bound:
         self._times_ns = [flight.time_ns]
 
     def pass_window(self) -> None:
-        """Keep the field and the largest torque of other causes at the end of a window."""
+        """Record the field and the largest torque of other causes at the end of a window."""
         self._fields.append(self._flight.body.orbit_truth().field)
         self._others.append(self._other())
         self._times_ns.append(self._flight.time_ns)
@@ -255,7 +258,7 @@ class _Bound:
         return least_time(self._momentum, middles, step, reach, left, np.maximum(others[1:], others[:-1]))
 
     def _other(self) -> float:
-        """Return the largest torque of gravity, air and sunlight at any attitude, N m."""
+        """Return the largest torque (N m) of gravity gradient, drag and sunlight over all attitudes."""
         craft, here = self._flight.body.craft, self._flight.body.surroundings()
         moments = craft.inertia
         gravity = (
@@ -263,7 +266,7 @@ class _Bound:
         )
         areas = np.array([face.area for face in craft.faces])
         arms = np.array([face.arm for face in craft.faces])
-        # The forces of the flow on the faces of a box act like one force at the middle of the box.
+        # The forces of the flow on the faces of a box act like one force at the centre of the box.
         middle = float(np.linalg.norm(arms.mean(axis=0)))
         speed = float(np.linalg.norm(air_flow(here)))
         force = 0.5 * DRAG_COEFFICIENT * here.density * speed**2 * float(np.linalg.norm(areas[::2]))
@@ -272,7 +275,7 @@ class _Bound:
 
 
 class _Law:
-    """The flight's control law with its permitted knowledge; some magnetometer samples may be outliers."""
+    """Control law of the flight with the knowledge that it has; some magnetometer samples may be outliers."""
 
     def __init__(self, flight: FreeFlight, wanted: dict[str, Any]) -> None:
         self._flight = flight
@@ -317,7 +320,7 @@ class _Law:
         return self._law.dipole(self._flight.time_ns)
 
     def _expected(self, _: int) -> FieldPrediction:
-        """Return the field expected ahead along the orbit, in the axes of a coarse attitude or in ICRS."""
+        """Return the field predicted along the orbit, in the axes of a coarse attitude or in ICRS."""
         flight = self._flight
         truth, draw = flight.body.orbit_truth(), flight.generator.standard_normal
         place, velocity = truth.position + FIX_SIGMA * draw(3), truth.velocity + 0.05 * draw(3)

@@ -1,11 +1,11 @@
 """Attitude from gyros, Sun, nadir and magnetic field (Meller et al., section 2 and Fig. 3).
 
-Gyros propagate the attitude; directions correct attitude and bias. The filter is `AttitudeFilter` of
-`knightcube.gnc.estimation` for a free body in orbit. Flights do not use this filter; the campaigns
-`orbit-attitude` and `orbit-frames` measure it. It starts from the first directions that agree and fix an
-attitude accurately enough. Then each measurement of Sun, nadir and field is used at its own time. The
-magnetometer's bias is estimated together with the error of the field model, which changes as slowly: the
-estimate from sunlight is used in eclipse.
+Gyros propagate the attitude, and directions correct attitude and bias. The filter is `AttitudeFilter` of
+`knightcube.gnc.estimation` for a free body in orbit. It starts from the first directions that agree and
+determine the attitude accurately enough. Then it uses each measurement of Sun, nadir and field at the time of
+the measurement. It estimates the magnetometer's bias together with the error of the field model, which
+changes as slowly, and uses the estimate from sunlight in eclipse. Flights do not use this filter; the
+campaigns `orbit-attitude` and `orbit-frames` measure it.
 """
 
 from __future__ import annotations
@@ -79,13 +79,13 @@ class Status(Enum):
     """The sensors on which the attitude is based."""
 
     ACQUIRING = "acquiring"
-    """The available directions determine no attitude yet."""
+    """The available directions do not determine the attitude yet."""
     OBSERVED = "observed"
     """At least two directions are in use, with or without the field."""
     AIDED = "aided"
     """One direction is in use; the rotation about it drifts with the gyros until the direction changes."""
     COASTING = "coasting"
-    """Gyros alone."""
+    """Only the gyros are in use."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +158,7 @@ class AttitudeDetermination:
             self._wait(sensor, time_ns, VectorObservation(observed, reference, covariance))
 
     def field(self, time_ns: int, field: FloatArray, reference: FloatArray) -> None:
-        """Accept the magnetometer's field (3,) T, body axes, and the model's `reference` (3,) T."""
+        """Accept the magnetometer's field (3,), T, body axes, and the model's field `reference` (3,), T."""
         self.nis = math.nan
         settings = self._settings
         if not (np.all(np.isfinite(field)) and np.all(np.isfinite(reference))):
@@ -167,8 +167,8 @@ class AttitudeDetermination:
             covariance = settings.field_sigma**2 * np.eye(3)
             self._ingest(FIELD, FieldMeasurement(time_ns, field, reference, covariance))
         else:
-            # The bias enters the first attitude, and again the next sample as if independent: twice the
-            # bias's sigma keeps the attitude's weight right.
+            # The bias affects the first attitude, and the next sample as if it were independent: twice the
+            # bias's sigma keeps the weight of the attitude right.
             spread = settings.field_sigma**2 + (2.0 * settings.field_bias_start) ** 2
             try:
                 self._wait(FIELD, time_ns, field_observation(field, reference, spread * np.eye(3)))
@@ -176,7 +176,7 @@ class AttitudeDetermination:
                 self._refuse(FIELD)
 
     def report(self, time_ns: int) -> Report:
-        """Return the attitude at `time_ns` and its accuracy; discards an estimate that is too uncertain."""
+        """Return the attitude at `time_ns` and its accuracy; discard an estimate that is too uncertain."""
         fresh_ns = round(self._settings.fresh * 1e9)
         in_use = frozenset(name for name, then in self._taken_ns.items() if time_ns - then <= fresh_ns)
         estimate = self._filter.at(time_ns) if self._filter.started else None
@@ -218,7 +218,7 @@ class AttitudeDetermination:
         self.starts += 1
 
     def _moved(self, waiting: _Waiting, time_ns: int) -> VectorObservation:
-        """Return a direction at `time_ns`, its covariance enlarged by the possible turn of the body since."""
+        """Return a direction at `time_ns`; its covariance includes the possible rotation of the body since."""
         assert self._rate is not None
         rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
         turned = rate * (time_ns - waiting.time_ns) * 1e-9
@@ -253,9 +253,10 @@ class AttitudeDetermination:
 
 
 def begin(observations: Sequence[VectorObservation], improbable: float = 1e-4) -> AttitudeFix | None:
-    """Return the attitude from directions, or None if they determine none or contradict each other.
+    """Return the attitude from directions, or None if they do not determine it or contradict each other.
 
-    Their angles to each other must be those of their references: a chi-square of 2 n - 3 degrees of freedom.
+    The angles between the directions must be those between their references: a chi-square of 2 n - 3 degrees
+    of freedom.
     """
     try:
         fix = weighted_fit(observations)

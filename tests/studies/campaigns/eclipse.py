@@ -1,11 +1,11 @@
 """Campaign `eclipse`: accuracy of the filter's attitude during an eclipse without stars.
 
-The cells `filter` run the loop's filter (`FreeFilter`, with the noises of the configurations) on a craft that
-points to nadir. The bias of the simulated gyro walks as the filter assumes. Star fixes every 10 s calibrate
-the bias for at least LEARNED s. From the start of a shadow, the filter has only gyro and magnetometer. Orbits
-without a shadow of at least SHORTEST s are replaced by new draws. The cells `storm`, half as many as
-`filter`, add a field error of STORM. The cells `loop`, a tenth as many as `filter`, run the whole loop
-(`fly_loop`), and the bias of the emulated gyro is constant.
+The cells `filter` run the filter of the loop (`FreeFilter`, with the sensor noise of the configurations) on a
+craft that points to nadir. The bias of the simulated gyro walks as the filter assumes. Star fixes every 10 s
+calibrate the bias for at least LEARNED s before the shadow. From the start of a shadow, the filter has only
+gyro and magnetometer. Orbits without a shadow of at least SHORTEST s are replaced by new draws. The cells
+`storm`, half as many as `filter`, add a field error of STORM. The cells `loop`, a tenth as many as `filter`,
+run the whole loop (`fly_loop`), and the bias of the emulated gyro is constant.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ CRAFT = {"knightcube": "orbit.yaml", "cubesat_3u": "orbit_3u.yaml"}
 LIT, BLIND = 900.0, 300.0
 """Times (s) from the release, and from the last star fix, to the shadow."""
 SETTLED, LAST = 300.0, 120.0
-"""s: from the release until stars are judged; the ends of the sunlight and of the shadow that are judged."""
+"""Time (s) from the release after which star fixes count, and duration (s) of the counted ends of sunlight
+and shadow.
+"""
 NODES = (9.5, 14.5)
 """Range (h) from which the mean local time of the ascending node of each run is drawn."""
 
@@ -58,7 +60,7 @@ def fly_loop(given: dict[str, Any], seed: tuple[int, ...]) -> Result:
 
 
 def _config(path: Path, duration: float) -> OrbitConfig:
-    """Return the configuration that points to nadir; braking ends at once, elements are of one orbit."""
+    """Return the configuration of a nadir-pointing satellite, without elements and without detumbling."""
     config = as_orbit(configuration.load(path))
     rest = configuration.replace(config.detumble, low_rate=config.modes.tumble_rate, low_for=0.1)
     target = TargetStep(at=0.0, point="nadir", roll_deg=0.0)
@@ -66,7 +68,7 @@ def _config(path: Path, duration: float) -> OrbitConfig:
 
 
 def _world(path: Path, seed: tuple[int, ...], lit: float, silent: float) -> tuple[Simulation, float]:
-    """Return the world whose shadow begins after `lit` s, and the time, s, at which it ends."""
+    """Return the world whose shadow begins after `lit` s, and the time (s) at which the shadow ends."""
     section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
     assert section is not None
     assert section.free_body is not None
@@ -79,7 +81,7 @@ def _world(path: Path, seed: tuple[int, ...], lit: float, silent: float) -> tupl
     times = np.arange(lit, lit + 1.5 * revolution)
     dark = ahead.sunlit_at(times) < 0.5
     begin = int(np.flatnonzero(dark[1:] & ~dark[:-1])[0]) + 1
-    end = begin + int(np.argmin(dark[begin:]))  # of the times, the first of which is `lit`
+    end = begin + int(np.argmin(dark[begin:]))  # index of a time, the first of which is `lit`
     orbit = configuration.replace(first, true_anomaly_deg=360.0 * begin / revolution)
     body = configuration.replace(body, orbit=orbit)
     body = configuration.replace(body, release=_at_nadir(_state(body, section.utc)))
@@ -102,7 +104,7 @@ def _state(body: FreeBodySection, utc: str) -> OrbitState:
 
 
 def _at_nadir(state: OrbitState) -> TipOff:
-    """Return the release with body +z to nadir, +x along the flight, turning with the orbit."""
+    """Return the release with body +z to nadir, +x along the flight, and the rate of the orbit."""
     down, normal = -state.position, np.cross(state.position, state.velocity)
     z, y = down / np.linalg.norm(down), -normal / np.linalg.norm(normal)
     a, b, c, d = quaternion.from_matrix(np.stack([np.cross(y, z), y, z])).tolist()
@@ -111,9 +113,9 @@ def _at_nadir(state: OrbitState) -> TipOff:
 
 
 def _facts(flown: Run, settled: float, silent: float, lit: float, last: float) -> Result:
-    """Return rms errors, deg, NEES of an axis and largest errors, sigmas, by the parts of the flight.
+    """Return rms errors (deg), NEES of an axis and largest errors (sigmas) by phase of the flight.
 
-    They are those of the star camera's attitude; the attitude of the body has the error of the mounting, too.
+    The attitude is that of the star camera; that of the body also has the error of the mounting.
     """
     errors, packets, truth = camera_errors(flown), flown["navigation"], flown["orbit_truth"]
     end = float(seconds(truth)[-1])
@@ -144,8 +146,9 @@ def judged(error: FloatArray, sigma: FloatArray) -> Result | None:
 
 
 LEARNED, SHORTEST, LONGEST = 3_800.0, 1_900.0, 12_000.0
-"""s: with stars at least, so that a revolution has passed at the shadow's end; of a shadow at least, and of a
-flight."""
+"""Shortest time (s) with star fixes, so that a revolution has passed at the end of the shadow; shortest
+shadow; longest flight.
+"""
 NOTED = 14.0
 """Interval (s) of the recorded errors, which covers all times since the last star fix (every 10 s)."""
 STORM, STORM_TIME = 5e-8, 300.0
@@ -179,7 +182,7 @@ class DarkFlight(PointingFlight):
     dark, end = math.inf, 0.0
 
     def __init__(self, craft: str, seed: int, storm: float = 0.0) -> None:
-        """`storm` (T per axis) is the added field error."""
+        """Create the flight; `storm` (T per axis) is the standard deviation of the added field error."""
         self._storm, self._weather = storm, np.random.default_rng([seed, 0x570])
         super().__init__({"craft": craft, "share": SHARE, "target": "nadir"}, seed)
         config = as_orbit(configuration.load(CONFIG.parent / CRAFT[craft]))
@@ -209,7 +212,7 @@ class DarkFlight(PointingFlight):
         return self.end - self.dark >= shortest
 
     def error(self) -> tuple[FloatArray, FloatArray, float]:
-        """Return error and claim of the attitude (3,) rad, and the share of the dipole that is not known."""
+        """Return error and claim (3,), rad, of the attitude, and the unknown share of the residual dipole."""
         found, truth = self._filter, self.flight.body.orbit_truth()
         off = to_rotation_vector(multiply(self.flight.motion.quaternion, conjugate(found.quaternion)))
         missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
@@ -222,7 +225,7 @@ class DarkFlight(PointingFlight):
 
 
 def _fly_filter(given: dict[str, Any], seed: tuple[int, ...]) -> Result:
-    """Fly the filter alone; `learned`, `shortest`, `settled`, `last` and `seconds` shorten it."""
+    """Run the filter alone; `learned`, `shortest`, `settled`, `last` and `seconds` shorten the run."""
     number, storm = seed[0] * 100_003 + seed[1], STORM * (given["kind"] == "storm")
     flight = DarkFlight(given["craft"], number, storm)
     while not flight.find_shadow(given.get("learned", LEARNED), given.get("shortest", SHORTEST)):
@@ -257,7 +260,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return errors and claims by kind, craft and part of the flight."""
+    """Return errors and claims by kind, craft and phase of the flight."""
     facts: dict[str, Any] = {}
     cells = list(dict.fromkeys((r["kind"], r["craft"]) for r in results))
     for kind, craft in cells:

@@ -1,15 +1,15 @@
 """Campaign `failures`: results of the likelihood estimator for random frames of the real sky.
 
-Pointings are uniform over the sky, theta (axis to boresight) over 0..90 deg, turns over 0..50 % of the field
-(3.28), exposures 0.2 or 1 s; a sky with fewer than five usable stars is drawn again with the same motion.
-Usable is a star whose whole streak lies in the frame, 4 px off its border, and whose light exceeds eight
-standard deviations of the noise under its streak (`scenes.usable`).
+Pointings are uniform over the sky. Theta (axis to boresight) is 0 to 90 deg, the rotation 0 to 50 % of the
+field (3.28), and the exposure 0.2 or 1 s. A sky with fewer than five usable stars is drawn again with the
+same motion. A star is usable if its whole streak lies at least 4 px inside the frame, and its signal exceeds
+eight standard deviations of the noise under its streak (`scenes.usable`).
 
-A right answer is an answer that is not wrong. Wrong is one more than 6 of its own standard deviations off
-(the square root of its NEES; chance: 1 in 13 million) and more than 1 % of the rate off, as a vector. Each
-condition alone is counted too: the first means a covariance that is too small, the second may be a consistent
-answer from streaks of a few px. Any other outcome is a refusal, by its status; if the usable stars move less
-than the estimator's minimum length, the rate cannot be determined, and a refusal is right.
+An answer is wrong if its error exceeds 6 of its own standard deviations (the square root of its NEES;
+probability 1 in 13 million) and 1 % of the rate, as a vector. Each condition is also counted alone. The first
+alone means that the covariance is too small. The second alone may be a consistent answer from streaks of a
+few px. Refusals are counted by their status. If the usable stars move less than the estimator's minimum
+length, the rate cannot be determined, and a refusal is correct.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
-# Upper bounds of the classes of rotation (percent of the field) for which time and errors are stated.
+# Upper limits of the classes of rotation (percent of the field) for which times and errors are reported.
 TURNS = (5, 20, 35, 50)
 _FREEDOM = 3
 
@@ -81,13 +81,13 @@ def run(case: Case) -> Result:
 
 
 def _path_lengths(scene: Scene) -> FloatArray:
-    """Return the stars' paths (n,), px, from chords of their two halves."""
+    """Return the path lengths (n,), px, of the stars, as sums of the chords of both halves."""
     halves = (scene.middle - scene.start, scene.end - scene.middle)
     return np.asarray(sum(np.linalg.norm(half, axis=1) for half in halves))
 
 
 def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
-    """Return the verdict, the errors of an answer, and the known reasons where it is missing or wrong."""
+    """Return the verdict, the errors of an answer, and the reasons for a refusal or a wrong answer."""
     size = float(np.linalg.norm(scene.rate))
     if found.status is not StreakStatus.RATE or found.rate is None or found.covariance is None:
         verdict = AT_REST if still else found.status.value
@@ -114,7 +114,7 @@ def _why_refused(found: MotionResult) -> str:
 
 
 def _how_wrong(found: MotionResult, scene: Scene) -> str:
-    """Return how an answer differs from the truth."""
+    """Return in which way an answer differs from the truth."""
     if found.rate is None:
         return _why_refused(found)
     sizes = float(np.linalg.norm(found.rate)), float(np.linalg.norm(scene.rate))
@@ -126,7 +126,7 @@ def _how_wrong(found: MotionResult, scene: Scene) -> str:
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return the counts, the distribution of NEES, the times, every seed that failed, and the figure."""
+    """Return the counts, the distribution of NEES, the times, every seed that failed, and the plot."""
     facts = {
         "frames": len(results),
         "verdicts": dict(sorted(Counter(r["verdict"] for r in results).items())),
@@ -140,7 +140,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def _worth_a_line(result: Result) -> bool:
-    """Return whether a frame needs a look: wrong, overconfident, refused though stars move, or warned."""
+    """Return whether a frame is listed: wrong, overconfident, refused although stars move, or warned."""
     if result["verdict"] == AT_REST:
         return bool(result["warnings"])
     return bool(result["reason"] or result["warnings"])

@@ -1,10 +1,10 @@
-"""Campaign `false-horizons`: false horizons in images without limb, and difficult limbs that must be found.
+"""Campaign `false-horizons`: false detections in images without a limb, and detections of difficult limbs.
 
-Pictures without a limb (`limbless`) are searched by several cameras with three kinds of knowledge: nothing,
-the altitude, and a flight's (position, Sun, coarse Sun and field, all of a scene drawn at random). Any nadir
-is false. Difficult rendered limbs are also included: thin crescents, terminators, a third of the limb
-behind a structure, sea glint, the Sun in the frame, a linear narrow camera. There an answer is wrong beyond
-half a degree and five of its own sigmas.
+Pictures without a limb (`limbless`) are searched by several cameras with three kinds of prior knowledge:
+none, the altitude, or that of a flight (position, Sun, coarse Sun and field of a random scene). Any nadir is
+a false detection. The campaign also renders difficult limbs: thin crescents, terminators, a third of the limb
+behind a structure, sun glint on the sea, the Sun in the frame, and a narrow camera with linear response. An
+answer to these is wrong if its error exceeds both half a degree and five of its claimed standard deviations.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tests.support.limb_frames import camera_model, coarse_knowledge, finder_set
 
 KNOWN = ("nothing", "altitude", "flight")
 CAMERAS = ((512, 512, 67.0), (480, 640, 60.0), (768, 1024, 30.0), (768, 1024, 12.8), (512, 512, 100.0))
-"""Rows, columns, and field of view across, deg."""
+"""Rows, columns, and horizontal field of view (deg)."""
 HARD = ("sunlit", "crescent", "terminator", "hidden", "glint", "glare", "narrow")
 ALTITUDE = 515e3
 WRONG_DEG, MOST_SIGMAS = 0.5, 5.0
@@ -38,7 +38,7 @@ _CRESCENT = 0.05, 0.35
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` pictures of each kind without a limb, and a fifth as many of each hard limb."""
+    """Return `runs` pictures of each kind without a limb, and a fifth as many of each difficult limb."""
     empty = [
         Case(f"{kind}-{run}", (seed, number, run), {"limb": False, "kind": kind})
         for number, kind in enumerate(MAKERS)
@@ -52,7 +52,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Search one picture with each kind of knowledge."""
+    """Search one picture with each kind of prior knowledge."""
     generator = np.random.default_rng(case.seed)
     search = _limb if case.parameters["limb"] else _empty
     return {**case.parameters, "seed": list(case.seed), "answers": search(case.parameters["kind"], generator)}
@@ -66,7 +66,7 @@ def limbless_picture(kind: str, generator: np.random.Generator) -> tuple[Image, 
 
 
 def knowledge_of(scene: EarthScene, known: str, generator: np.random.Generator) -> HorizonKnowledge:
-    """Return the prior knowledge of a scene, one of `KNOWN`."""
+    """Return the prior knowledge of a scene of one kind of `KNOWN`."""
     if known == "flight":
         return coarse_knowledge(scene, generator)
     height = float(np.linalg.norm(scene.position)) - 6_371e3
@@ -87,7 +87,7 @@ def _empty(kind: str, generator: np.random.Generator) -> list[Result]:
 def limb_picture(
     kind: str, generator: np.random.Generator
 ) -> tuple[Image, EarthScene, EarthCameraModel, HorizonSettings]:
-    """Return a rendered limb of one of `HARD`, its scene, its camera and the finder's settings."""
+    """Return a rendered limb of a kind of `HARD`, its scene, its camera and the settings of the search."""
     if kind == "narrow":
         model, scene = _narrow(generator)
         return render(model, scene, generator), scene, model, HorizonSettings()
@@ -110,7 +110,7 @@ def limb_picture(
 
 
 def _narrow(generator: np.random.Generator) -> tuple[EarthCameraModel, EarthScene]:
-    """Return a narrow camera and a scene; the camera is replaced if it shows too little of the limb."""
+    """Return a narrow camera and a scene; the camera is drawn again if it shows too little of the limb."""
     while True:
         field = np.radians(generator.uniform(15.0, 40.0))
         model = EarthCameraModel.fuga15d(field, seed=1, response="linear", sensitivity=30_000.0)
@@ -136,7 +136,7 @@ def _hidden(
 def _glinting(
     frame: Image, scene: EarthScene, model: EarthCameraModel, generator: np.random.Generator
 ) -> Image:
-    """Return the frame with the Sun's glint on the sea near the limb: ten times the light in the middle."""
+    """Return the frame with sun glint on the sea near the limb, with ten times the signal in its centre."""
     points = limb_truth(scene, model, count=720).points
     middle = points[generator.integers(len(points))]
     rows, columns = np.mgrid[0 : model.rows, 0 : model.columns]
@@ -163,7 +163,7 @@ VERDICTS = ("right", "wrong", "ambiguous", "refused", "no-horizon")
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the frequency of found horizons for each kind of image and knowledge."""
+    """Return the frequency of detected horizons for each kind of image and knowledge."""
     rows = []
     for limb, kind in dict.fromkeys((r["limb"], r["kind"]) for r in results):
         of = [r for r in results if (r["limb"], r["kind"]) == (limb, kind)]

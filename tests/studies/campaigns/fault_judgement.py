@@ -1,4 +1,4 @@
-"""Judges a run of campaign `faults` by its log and its true states.
+"""Evaluation of a run of campaign `faults` by its log and its true states.
 
 Times follow from log and truth, not from events alone, because events are rate-limited.
 """
@@ -21,7 +21,7 @@ from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PE
 
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
-"""s after the end of a fault: later events have another cause."""
+"""Time (s) after the end of a fault within which its event must come: later events have another cause."""
 BLIND_GRACE = 0.1
 """Longest time (s) from the last measurement to zero coil current."""
 ZERO = 1e-3
@@ -32,9 +32,11 @@ DRIVEN = 6.0e-3
 """Smallest current (A) at which the monitor can judge a driven coil."""
 
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
-"""Absolute (A) and relative difference of two readings of the same current."""
+"""Absolute (A) and relative difference of two readings of the same current that can still be noise."""
 LOOKED_FROM, LOOKED = 2.0, 3.0
-"""s: from when in a flight the monitor's mean is whole, and how long an upset's trace is looked for."""
+"""Time (s) from which the monitor's mean is complete, and time (s) after an upset in which its effect is
+searched for.
+"""
 FEW = 3
 """Largest difference in the number of IMU samples that does not count as an effect."""
 BACK_WITHIN = 2.0
@@ -44,7 +46,7 @@ _KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
 
 
 def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
-    """Return the judgement of a fault from its flight's logs."""
+    """Return the evaluation of a fault from the logs of its flight."""
     at = entry.at or 0.0
     span = DURATION - at if entry.span is None else entry.span
     end = at if kind.momentary else min(at + span, DURATION)
@@ -100,16 +102,16 @@ def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
 
 
 def _is_driven(own: FloatArray, kind: str) -> bool:
-    """Return whether a broken coil or bridge was driven for long, from the commanded currents (n,) A.
+    """Return whether a broken coil or bridge was driven for long enough, from the commanded currents (n,), A.
 
-    A leg stuck low has an effect only if it should be high: input A drives forwards, B backwards.
+    A leg that is stuck low has an effect only if it should be high: input A drives forwards, B backwards.
     """
     driven = {"a-low": own > DRIVEN, "b-low": own < -DRIVEN}.get(kind, np.abs(own) > DRIVEN)
     return kind.endswith("high") or bool(driven.sum() * CYCLE > 2.5)
 
 
 def _is_worker_busy(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
-    """Return whether a worker had a job during its fault."""
+    """Return whether a worker ran a job during its fault."""
     jobs = flown["job_timing"]
     when = jobs["time_ns"] * 1e-9
     mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
@@ -121,7 +123,7 @@ def _is_worker_busy(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
-    """Return whether the commands differed from the stuck answer for a second."""
+    """Return whether the commands differed from the stuck answer for at least a second."""
     asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
     behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
@@ -134,7 +136,7 @@ def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def _is_upset(flown: Run, device: str, at: float) -> bool:
-    """Return whether a flipped bit had an effect: not in a register that is unused or soon rewritten."""
+    """Return whether a flipped bit had an effect; not in a register that is unused or soon rewritten."""
     match device:
         case "pwm":
             obeyed = _obeyed(flown, at)
@@ -151,7 +153,7 @@ def _is_upset(flown: Run, device: str, at: float) -> bool:
 
 
 def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
-    """Return whether the fault affected a due frame."""
+    """Return whether the fault affected a frame that was due."""
     due = np.arange(0.0, DURATION, FRAME_PERIOD) + FRAME_EXPOSURE + FRAME_READOUT
     spoiled = due[(due >= at) & (due < end)]
     if kind == "torn":
@@ -168,7 +170,7 @@ def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
 def _recovered(
     flown: Run, kind: FaultKind, at: float, end: float, reported: Sequence[tuple[float, str]]
 ) -> float | None:
-    """Return the time from the end of the fault until the device's data are valid again; None for never."""
+    """Return the time (s) from the end of the fault until the device's data are valid again, or None."""
     house = flown["housekeeping"]
     found: float | None = 0.0
     match kind.device.partition("-")[0]:
@@ -179,7 +181,7 @@ def _recovered(
         case "monitor":
             finite, time = np.isfinite(house["coil_current"]), house["time_ns"] * 1e-9
             lost = time[~finite & (time >= end) & (time < end + LOOKED)]
-            # A momentary fault has effects only afterwards.
+            # The effects of a momentary fault begin after it.
             found = _first(time[finite], end)
             if kind.momentary and len(lost):
                 later = _first(time[finite], float(lost[-1]))
@@ -207,7 +209,7 @@ def _first(times: FloatArray, end: float) -> float | None:
 
 
 def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float | None:
-    """Return the time, s, from `end` until samples arrive without a gap."""
+    """Return the time (s) from `end` until samples arrive without a gap."""
     later = times[times >= end - 1e-6]
     short = np.diff(later) < gap
     for first in range(len(short) - count):
@@ -217,7 +219,7 @@ def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float 
 
 
 def _obeyed(flown: Run, end: float) -> float | None:
-    """Return the time, s, from `end` until the coils carry the logged commands for half a second."""
+    """Return the time (s) from `end` until the coils carry the logged commands for half a second."""
     control, truth = flown["control"], flown["truth"]
     count = min(len(control), len(truth) - 1)
     # The true sample at the start of a cycle has the current of the previous command.
@@ -231,7 +233,7 @@ def _obeyed(flown: Run, end: float) -> float | None:
 
 
 def _is_unmeasured(flown: Run) -> BoolArray:
-    """Return for each cycle whether its newest measurement was older than the permitted age plus a cycle."""
+    """Return whether the age of each cycle's newest measurement exceeds the limit by more than a cycle."""
     time_ns = flown["control"]["time_ns"]
     came_ns, sampled_ns = flown["imu"]["time_ns"], flown["imu"]["sample_time_ns"]
     count = np.searchsorted(came_ns, time_ns, side="right")
@@ -240,10 +242,10 @@ def _is_unmeasured(flown: Run) -> BoolArray:
 
 
 def _blind_current(flown: Run, also_unsteered: bool) -> float:
-    """Return the largest current, A, while measurements were older than the permitted age.
+    """Return the largest current (A) while the age of the measurements exceeds the limit.
 
-    In this time, the estimate may be propagated, but no coil may be driven. `also_unsteered` adds cycles in
-    which the loop has not steered for that long because it refused the measurements.
+    In this time the estimate may be propagated, but no coil may be driven. `also_unsteered` adds cycles in
+    which the loop has not steered for that long because the filter rejected the measurements.
     """
     off = flown["control"]["state"] == 0
     cycles = round(BLIND_GRACE / CYCLE)
@@ -254,7 +256,7 @@ def _blind_current(flown: Run, also_unsteered: bool) -> float:
 
 
 def _carried(flown: Run) -> FloatArray:
-    """Return the largest true coil current in each cycle, A, sampled at the start of the next cycle."""
+    """Return the largest true coil current (A) in each cycle, sampled at the start of the next cycle."""
     current: FloatArray = np.abs(flown["truth"]["current"]).max(axis=1)[1:]
     return current
 
@@ -262,9 +264,9 @@ def _carried(flown: Run) -> FloatArray:
 def _reaction_right(
     flown: Run, kind: FaultKind, at: float, end: float, warned: Sequence[tuple[float, str]]
 ) -> bool | None:
-    """Return whether the table's reaction followed; None if the table has none."""
+    """Return whether the reaction of the table followed, or None if the table has none."""
     part = part_of(kind)
-    # A reversed coil is not isolated, but used with its sign changed.
+    # A reversed coil is not isolated: its sign is changed.
     expected = COIL_JUDGED if part == "coil" else {REACTION.get(part)}
     times = [time for time, name in warned if name in expected]
     control = flown["control"]
@@ -277,12 +279,13 @@ def _reaction_right(
             if lost.any() and driven[(time >= at - 0.5) & (time <= at + 0.5)].any():
                 right = bool(times) and not control["state"][lost].any()
         case "coil" | "bridge":
-            # A coil that is soon isolated is driven too briefly to count as exercised.
+            # A coil that is soon isolated is driven for too short a time to count as exercised.
             if times or _is_exercised(flown, kind, at, end):
                 right = bool(times)
         case "pwm" | "bus":
             if times and driven[(time >= times[0] - 1.0) & (time <= times[0])].any():
-                # An unreachable chip keeps its outputs, and must accept commands soon after it returns.
+                # A chip that cannot be reached keeps its outputs. It must accept commands soon after it
+                # returns.
                 carried = _carried(flown)
                 reported = (time >= times[0] - CYCLE) & (time <= end + BACK_WITHIN)
                 zero = np.abs(control["current_written"]).max(axis=1) < ZERO

@@ -38,7 +38,7 @@ COIL_JUDGED = frozenset({"coil-broken", "coil-corrected"})
 """Events by which a broken coil is isolated, or a reversed one used with its sign changed."""
 
 OWN_OF_KIND: dict[str, frozenset[str]] = {
-    # The packets are valid, but too few or too old for control: only the event of the stream applies.
+    # The packets are valid, but too few or too old for control, so only the event of the stream comes.
     "imu: slow": OWN["imu"] | {"stream-poor"},
     "imu: delayed": OWN["imu"] | {"stream-poor"},
     "imu: intermittent": OWN["imu"] | {"stream-poor"},
@@ -53,11 +53,11 @@ REACTION: Mapping[str, str] = {
     "coil": "coil-broken",
     "bridge": "coil-broken",
 }
-"""The event whose row of the table of events has the reaction that must follow: coils off, or isolation."""
+"""Event whose reaction in the table of events must follow: coils off, or isolation."""
 
 
 def part_of(kind: FaultKind) -> str:
-    """Return the device name in the table, which has one row for the coils of all axes."""
+    """Return the device name of a fault in the table, which has one row for the coils of all axes."""
     return kind.device.partition("-")[0]
 
 

@@ -1,12 +1,12 @@
 """Campaign `faults`: every fault of the catalogue in every mode, at random times, in lock-step.
 
-Each run flies the demonstration's loop for half a minute in one mode and breaks one thing at a random time
-for a random span (coils and bridges to the end), at the wire. The log then shows whether an event of its own
-reported the fault (`fault_table`), whether the table's reaction followed, how long after its end the flight
-recovered, which currents the coils carried without measurements, and whether the log is whole. A fault of an
-unused part (a coil that is not driven, a planner without a request) counts as not exercised: it has no effect
-and cannot be seen. Exercised faults that no event reported are listed with their flight's number;
-`refly(seed, number)` flies one again.
+Each run flies the demonstration's loop for half a minute in one mode and injects one fault at the wire, at a
+random time and for a random duration; faults of coils and bridges last to the end. The campaign then
+evaluates the log: whether a specific event reported the fault (`fault_table`), whether the reaction of the
+table followed, how long after the end of the fault the flight recovered, which currents the coils carried
+without measurements, and whether the log is complete. A fault of an unused part (a coil that is not driven, a
+planner without a request) has no effect and counts as not exercised. Exercised faults that no event reported
+are listed with the number of their flight; `refly(seed, number)` repeats a flight.
 """
 
 from __future__ import annotations
@@ -33,20 +33,23 @@ MODES = ("boot", "safe", "detumble", "hold", "slew", "testbed-demo")
 LASTING = ("coil", "bridge")
 
 COIL_FIELD = ((5e-4, 0.0, 0.0), (0.0, 5e-4, 0.0), (0.0, 0.0, 5e-4))
-"""T/A: the magnetometer feels the coils, 0.07 mT of the field's 0.45 when a coil is fully on."""
+"""Field of the coils at the magnetometer (T/A): 0.07 mT at full current, in a total field of 0.45 mT."""
 
 _LOOKS = {"camera", "vision"}
 
 
 def faults() -> list[FaultKind]:
-    """Return the faults of the testbed's devices in lock-step; `orbit-faults` flies the magnetometer's."""
+    """Return the faults of the testbed's devices in lock-step.
+
+    The campaign `orbit-faults` flies those of the magnetometer.
+    """
     config = demo_config(30.0)
     both = [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
     return [kind for kind in both if fitted(kind.device, config) and part_of(kind) in OWN]
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights: fault by fault, mode by mode, over and over."""
+    """Return `runs` flights, which cycle through all faults in all modes."""
     kinds = faults()
     found = []
     for number in range(runs):
@@ -67,7 +70,7 @@ def run(case: Case) -> Result:
 
 
 def refly(seed: int, number: int) -> Result:
-    """Fly one flight of the campaign of this seed again."""
+    """Repeat one flight of the campaign with this seed."""
     return run(cases(number + 1, seed)[number])
 
 
@@ -100,7 +103,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _named(result: Result) -> str:
-    """Return a flight with all that is needed to fly it again."""
+    """Return the parameters with which a flight can be repeated."""
     others = f"; reported: {', '.join(result['others'])}" if result["others"] else ""
     span = f"{result['at']:.2f} to {result['end']:.2f} s"
     return f"{result['fault']}, {result['mode']}, {span}, number {result.get('number', '-')}{others}"

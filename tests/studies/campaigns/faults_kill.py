@@ -1,10 +1,10 @@
-"""Campaign `faults-kill`: kill -9 of the flight process at random moments of a real-time run.
+"""Campaign `faults-kill`: kill -9 of the flight process at random times of a real-time run.
 
-A case is a board: its emulated devices live in a process of their own all the time, and so does its kept
-state, while one flight after the other is killed, a quarter of them before they are ready. After each kill
-the devices are asked for the coils' currents every few milliseconds, the log and the kept state are read, and
-the next flight must start. The last flight is stopped by SIGTERM: it must know of all kills, and fly in safe
-mode where they reach its configuration's limit.
+A case is a board. Its emulated devices run in a separate process all the time, and its stored state persists.
+One flight after the other is killed, a quarter of them before they are ready. After each kill the campaign
+samples the currents of the coils every few milliseconds and reads the log and the stored state, and the next
+flight must start. The last flight is stopped by SIGTERM. It must have a record of all kills, and fly in safe
+mode if the number of kills reaches the limit of its configuration.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight, devices_running, write_config
 
 START_S = 1.5
-"""s, assumed from exec to READY until the first start was measured."""
+"""Time (s) from exec to READY that is assumed until the first start is measured."""
 
 AT_MOST_S = 60.0
 
 
 @dataclass
 class Board:
-    """What outlives a flight process.
+    """Devices, state and counts that outlive a flight process.
 
     Attributes:
-        boots: flights that have counted themselves.
-        start_s: how long the last start took until READY.
+        boots: number of flights that have counted themselves.
+        start_s: time (s) until READY of the last start.
         left: processes that were children of a flight when it was killed.
     """
 
@@ -58,12 +58,12 @@ class Board:
 
     @property
     def state(self) -> Path:
-        """The folder of the kept state."""
+        """Folder of the stored state."""
         return self.place / "state"
 
     @contextmanager
     def flight(self, number: int, target: float, crash_limit: int) -> Iterator[LiveFlight]:
-        """Start a flight to `target` in a folder of its own; none is left at the end."""
+        """Start a flight to `target` in a folder of its own; end it with the block."""
         folder = self.place / f"flight-{number}"
         folder.mkdir()
         config = write_config(folder)
@@ -84,11 +84,11 @@ class Board:
                     flight.process.stderr.close()
 
     def current(self) -> float:
-        """Return the largest current of the coils now, A, as the devices' process knows it."""
+        """Return the largest true current (A) of the coils now."""
         return float(np.abs(self.bus.call("currents")).max())
 
     def kept(self) -> tuple[StoredState, list[str]]:
-        """Return the kept state, and what was wrong with its files."""
+        """Return the stored state, and the faults of its files."""
         problems: list[str] = []
         state = StateStore(self.state, lambda _, text: problems.append(text)).load()
         return state, problems
@@ -96,29 +96,29 @@ class Board:
 
 LIMIT_S = 0.5
 KILLS = 16
-"""Of a board: the highest `crash_limit` of a configuration."""
+"""Number of kills of a board: the highest `crash_limit` that a configuration may have."""
 
 EARLY = 0.25
-"""Share of the kills that come before the flight is ready."""
+"""Fraction of the kills that come before the flight is ready."""
 
 LONGEST_FLOWN_S = 1.5
 _BEFORE_S = 0.1
 _CALM_S = 0.15
 _GIVE_UP_S = 2.0
 _POLL_S = 0.004
-_LOGGED_S = 1.0  # a flight that was ready for so long has packets on disk
+_LOGGED_S = 1.0  # time (s) after READY from which packets must be on disk
 _GONE_S = 3.0
 _TARGET = 0.3
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return boards that come to `runs` kills together."""
+    """Return boards with `runs` kills in total."""
     sizes = [min(KILLS, runs - done) for done in range(0, runs, KILLS)]
     return [Case(str(number), (seed, number), {"kills": size}) for number, size in enumerate(sizes)]
 
 
 def run(case: Case) -> Result:
-    """Kill one flight of a board after the other; stop the last by SIGTERM."""
+    """Kill the flights of a board one after the other; stop the last by SIGTERM."""
     rng = np.random.default_rng(case.seed)
     begun = time.monotonic()
     kills: list[Result] = []
@@ -141,7 +141,7 @@ def run(case: Case) -> Result:
 
 
 def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
-    """Start a flight, kill it, check coils, log and state."""
+    """Start a flight, kill it, and check coils, log and state."""
     early = bool(rng.random() < EARLY)
     share, target = float(rng.random()), float(rng.uniform(-_TARGET, _TARGET))
     with board.flight(number, target, KILLS) as flight:
@@ -169,9 +169,9 @@ def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def _current_until(board: Board, kill_ns: int) -> float:
-    """Wait for a moment; return the largest current of the last tenth of a second, or of the last sample.
+    """Wait for a time; return the largest current of the last tenth of a second, or of the last sample.
 
-    A flight switches its coils off now and then to read the magnetometer: one sample is not enough.
+    One sample is not enough, because a flight switches its coils off at times to read the magnetometer.
     """
     time.sleep(max(0.0, (kill_ns - time.monotonic_ns()) * 1e-9 - _BEFORE_S))
     current = board.current()
@@ -182,10 +182,10 @@ def _current_until(board: Board, kill_ns: int) -> float:
 
 
 def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
-    """Return when the coils came to zero for good, s after the kill, and the largest current after the limit.
+    """Return the time (s) from the kill to lasting zero current, and the largest current after the limit.
 
-    The first answer of zero counts: it is late by at most the time between two samples, never early.
-    Coils that carried current are watched beyond the limit, others for long enough to see them stay at zero.
+    The first answer of zero counts. It can be late by the time between two samples, but not early. Coils that
+    carried current are watched beyond the limit, and others for long enough to see that they stay at zero.
     """
     zero_after = beyond = 0.0
     driven = before > 0.0
@@ -206,18 +206,18 @@ def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, flo
 
 
 def _log_of(folder: Path, ready_for: float | None) -> Result:
-    """Return whether the log reads to its last whole packet, and how much of the flight is in it."""
+    """Return whether the log can be read to its last complete packet, and how much of the flight it has."""
     try:
         flown = read_run(folder)
     except UsageError as error:
-        # Nothing is on disk yet: that is right for the first moments only.
+        # Without a packet on disk the log is correct only in the first moments of a flight.
         return {"readable": ready_for is None or ready_for < _LOGGED_S, "packets": 0, "problem": str(error)}
     packets = sum(sum(log.counts.values()) for log in flown.logs.values())
     return {"readable": _whole(flown), "packets": packets, "problem": ""}
 
 
 def _whole(flown: Run) -> bool:
-    """Return whether a run's logs are whole, except for one truncated packet at the end of each."""
+    """Return whether a run's logs are complete, except for one truncated packet at the end of each."""
     return all(
         log.skipped_bytes + log.other_versions + sum(log.missing.values()) == 0
         and log.truncated_bytes < LONGEST_PACKET
@@ -226,7 +226,7 @@ def _whole(flown: Run) -> bool:
 
 
 def _state_of(board: Board, counted: bool) -> Result:
-    """Return whether the stored state is whole and lists all kills, except perhaps an early one.
+    """Return whether the stored state is intact and lists all kills, except perhaps an early one.
 
     It must list every boot so far as unclean, the last by `running`, the others by name. A flight that was
     ready must have counted itself.
@@ -240,9 +240,9 @@ def _state_of(board: Board, counted: bool) -> Result:
 
 
 def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
-    """Stop a flight by SIGTERM; return whether its end and its mode were right.
+    """Stop a flight by SIGTERM; return whether its end and its mode are correct.
 
-    The kills that were counted are as many as it may take, or one too few for safe mode.
+    The number of kills equals the crash limit, or is one too small for safe mode.
     """
     crash_limit = int(np.clip(board.boots + rng.integers(2), 1, KILLS))
     with board.flight(number, 0.1, crash_limit) as flight:
@@ -268,7 +268,7 @@ def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return how long the coils stayed on after kills with current, and the other judgements."""
+    """Return for how long the coils carried current after kills, and the other results."""
     del folder
     kills = [kill for result in results for kill in result["kills"]]
     ends = [result["end"] for result in results if result["end"] is not None]

@@ -1,8 +1,9 @@
-"""Campaign `first-orbits`: first orbits from one pass each, with the errors over what they claim.
+"""Campaign `first-orbits`: initial orbits from one pass each, with errors relative to their claims.
 
-Two random low orbits, integrated here by DOP853; the object passes at 100 to 3,000 km and turns the line of
-sight by 0.05 to 0.6 deg/s in the middle. A sighting each two seconds has an error of 0.1 px of a camera of
-1024 px over 20 deg. Light takes its time, while the Earth goes on about the Sun.
+Observer and object move in two random low orbits, which are integrated by DOP853. The object passes at 100 to
+3,000 km and rotates the line of sight by 0.05 to 0.6 deg/s in the middle of the pass. There is a sighting
+every two seconds, with an error of 0.1 px of a camera with 1024 px over 20 deg. The simulation includes light
+time and the motion of the Earth around the Sun.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return a row for each arc: what was determined, the normalised errors, and the errors."""
+    """Return a row for each arc: the determined quantities, their normalised errors, and their errors."""
     rows = [_row(arc, [result for result in results if result["arc"] == arc]) for arc in ARCS]
     for row in rows:
         if not row["passes"]:

@@ -1,10 +1,10 @@
 """Campaign `frames`: mutated, repeated and reordered telecommand frames near the limits of the counter.
 
-Each run starts a link process whose next counter lies at an edge, and gives it 1,000 frames in portions:
-genuine frames in another order, repetitions, damaged frames with a wrong and with a right CRC, parts of two
-frames joined, and authentic frames whose IV of 96 bits lies at an edge. No command may be obeyed twice, none
-may be obeyed that the ground did not make, nothing may end the process, and the next genuine command must be
-obeyed.
+Each run starts a link process whose next counter is near a limit, and sends it 1,000 frames in portions:
+genuine frames in another order, repetitions, damaged frames with a wrong or a correct CRC, joined parts of
+two frames, and authentic frames whose IV of 96 bits is near a limit. The link may execute no command twice
+and no command that the ground did not make, no frame may end the process, and the link must execute the next
+genuine command.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ KINDS = ("repeated", "flipped", "flipped, CRC right", "cut", "joined", "edge", "
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` link processes, with each of the starts in turn."""
+    """Return `runs` link processes that cycle through the start counters."""
     return [Case(f"{run}", (seed, run), {"start": str(STARTS[run % len(STARTS)])}) for run in range(runs)]
 
 
@@ -61,7 +61,7 @@ def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
             for _ in range(PORTION):
                 kind = KINDS[draw.integers(len(KINDS))] if draw.random() > 0.04 or not waiting else "genuine"
                 kinds[kind] += 1
-                if kind == "genuine":  # among the next three, in any order
+                if kind == "genuine":  # one of the next three frames, in any order
                     link.wire.up.append(waiting.pop(int(draw.integers(min(3, len(waiting))))))
                 else:
                     past = genuine[: max(GENUINE - len(waiting), 1)]
@@ -90,7 +90,7 @@ def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
 
 
 def _frame(kind: str, past: list[bytes], forged: list[bytes], draw: np.random.Generator) -> bytes:
-    """Return a frame of the attacker, who has seen the frames `past` and has some authentic frames."""
+    """Return a frame of the attacker, who has recorded `past` and has authentic frames `forged`."""
     known = forged if kind == "edge" else past
     some = known[draw.integers(len(known))]
     match kind:

@@ -1,7 +1,7 @@
-"""A free satellite for campaigns: the simulated world, its orbit of one seed, and ideal sensors with noise.
+"""A free satellite for campaigns: the simulated world, a random orbit, and sensors with noise.
 
-The executive and the wires are left out, so a flight costs the world's time alone; control rates are lower
-than 40 Hz.
+The executive and the emulated devices are left out, so a flight costs only the processor time of the world.
+Control rates are lower than 40 Hz.
 """
 
 from __future__ import annotations
@@ -18,25 +18,27 @@ from sim_hal.worlds.free_body import CRAFTS, FreeBody
 
 SECOND = 1_000_000_000
 CRAFT = {"knightcube": 0.0959, "cubesat_3u": 0.2}
-"""A m^2, the limit of each coil."""
+"""Limit of the dipole moment of each coil (A m^2)."""
 WATTS = {"knightcube": 54.8, "cubesat_3u": 5.0}
-"""W/(A m^2)^2, of the coils."""
+"""Power of the coils per squared dipole moment, W/(A m^2)^2."""
 ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6), "low": (300e3, 51.6), "equator": (500e3, 0.0)}
-"""Altitude m, inclination deg."""
+"""Altitude (m) and inclination (deg)."""
 UTC = "2026-11-23T00:00:00Z"
 FIELD_NOISE, HARD_IRON = 1e-7, 1.5e-7
-"""T: a VN-100's magnetometer at 40 Hz, and what calibration leaves of an axis."""
+"""Noise of a VN-100's magnetometer at 40 Hz (T), and bias of an axis after calibration (T)."""
 GYRO_NOISE, GYRO_BIAS, GYRO_BIAS_WALK = 6.1e-5, 5e-4, 2e-6
-"""rad/s per sqrt(Hz); rad/s; rad/s per sqrt(s): a VN-100's noise, and its bias with its in-run change."""
+"""Noise (rad/s per sqrt(Hz)), bias (rad/s), and random walk of the bias (rad/s per sqrt(s)) of a VN-100's
+gyro.
+"""
 FIX_SIGMA, FIX_VELOCITY_SIGMA = 10.0, 0.05
-"""m, m/s."""
+"""Standard deviations of a fix: position (m) and velocity (m/s)."""
 STILL = {"ring_current": 0.0, "day_bulge": 0.0, "walks": 0.0}
-"""Disturbances without those that other simulators lack."""
+"""Settings without the disturbances that other simulators lack."""
 _STREAM = 0xF11
 
 
 class FreeFlight:
-    """The truth of one seed under the dipole that is commanded."""
+    """True states of one seed under the commanded dipole."""
 
     def __init__(
         self,
@@ -47,7 +49,7 @@ class FreeFlight:
         disturbances: Disturbances | None = None,
         description: DescriptionErrors = NO_ERRORS,
     ) -> None:
-        """Release the craft at time 0 on `orbit`, its node and place in the orbit drawn by the seed.
+        """Release the craft at time 0 on `orbit`, whose node and phase are drawn by the seed.
 
         The true body differs from the described craft by `description`.
         """
@@ -74,22 +76,22 @@ class FreeFlight:
         self.dipole_per_ampere = float(shape.dipoles[0, 0])
         self.time_ns = 0
         self.square = 0.0
-        """A^2 m^4 s: the integral of the commanded dipole squared."""
+        """Integral (A^2 m^4 s) of the squared commanded dipole."""
         self.hard_iron = HARD_IRON * self.generator.standard_normal(3)
         self.gyro_bias = GYRO_BIAS * self.generator.standard_normal(3)
         self.field_error: FloatArray = np.zeros(3)
-        """T, ICRS, of the field beside that of the world."""
+        """Error (3,), T, ICRS, that is added to the field of the world."""
         self.coil_noise = 0.0
-        """A m^2, of an axis of a dipole that is commanded."""
+        """Standard deviation (A m^2) of each axis of a commanded dipole."""
 
     def act(self, dipole: FloatArray) -> None:
-        """Command a dipole (3,) A m^2 from now on."""
+        """Command a dipole (3,), A m^2, until the next command."""
         if self.coil_noise and dipole.any():
             dipole = dipole + self.coil_noise * self.generator.standard_normal(3)
         self._currents = dipole / self.dipole_per_ampere
 
     def advance(self, time_ns: int) -> None:
-        """Let time pass until `time_ns`."""
+        """Advance the simulation to `time_ns`."""
         seconds = (time_ns - self.time_ns) / SECOND
         dipole = self._currents * self.dipole_per_ampere
         self.square += seconds * float(dipole @ dipole)
@@ -100,18 +102,18 @@ class FreeFlight:
         self.time_ns = time_ns
 
     def field(self, samples: int = 1) -> FloatArray:
-        """Return the mean (3,) T of samples of the magnetometer now; the coils must be off."""
+        """Return the mean (3,), T, of samples of the magnetometer now; the coils must be off."""
         noise = FIELD_NOISE / np.sqrt(samples) * self.generator.standard_normal(3)
         astray = attitude_matrix(self.motion.quaternion) @ self.field_error
         return np.asarray(self.motion.field_body + self.hard_iron + astray + noise)
 
     def attitude(self, sigma: float) -> FloatArray:
-        """Return the attitude (4,) with an error of `sigma` rad an axis."""
+        """Return the attitude (4,) with an error of `sigma` (rad) per axis."""
         error = from_rotation_vector(sigma * self.generator.standard_normal(3))
         return multiply(error, self.motion.quaternion)
 
     def ephemeris(self, duration: float) -> Ephemeris:
-        """Return what flight software predicts from a GPS fix now, over `duration` s from the fix on."""
+        """Return the prediction of the flight software from a GPS fix now, over `duration` s."""
         truth = self.body.orbit_truth()
         position = truth.position + FIX_SIGMA * self.generator.standard_normal(3)
         velocity = truth.velocity + FIX_VELOCITY_SIGMA * self.generator.standard_normal(3)

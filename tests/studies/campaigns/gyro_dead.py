@@ -2,13 +2,13 @@
 
 The gyro fails at a random time in the first minute, in every third flight before the start. The coils disturb
 the magnetometer by 5e-4 T/A. With the camera the flight of the testbed has star attitudes and streak rates,
-without it only the magnetometer and the plant model. A step is reached if the true angle stays within 0.5 deg
-of the target in the last 70 s of the step.
+without it only the magnetometer and the plant model. A step counts as reached if the true angle stays within
+0.5 deg of the target in the last 70 s of the step.
 
-The cells `orbit` are flights of `config/orbit.yaml` from a tumble of 3 deg/s to nadir, at a random place of
-the orbit, with a body, coils and sensors that differ from the configuration within the stated accuracies.
-They have neither horizon cameras nor solar cells, so that star attitudes, streak rates, the magnetometer and
-the dynamic model carry the flight. The nadir axis is judged from the end of the slew.
+The cells `orbit` are flights of `config/orbit.yaml` from a tumble of 3 deg/s to nadir, at a random position
+of the orbit, with a body, coils and sensors that differ from the configuration within the stated accuracies.
+They have neither horizon cameras nor solar cells. The estimate uses star attitudes, streak rates, the
+magnetometer and the dynamic model. The error of the nadir axis counts from the end of the slew.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def in_orbit(case: Case) -> Result:
 
 
 def judged_in_orbit(flown: Run, at: float) -> Result:
-    """Return the errors of an orbit flight whose gyro fails at `at` s; NEES are those of an axis."""
+    """Return the errors of an orbit flight whose gyro fails at `at` s; the NEES is that of an axis."""
     packets, truth, names = flown["attitude"], flown["truth"], event_names(flown)
     known = np.isfinite(packets["rate"][:, 0]) & (seconds(packets) > at + 1.0)
     rate = np.column_stack([np.interp(seconds(packets), seconds(truth), one) for one in truth["rate"].T])
@@ -130,7 +130,7 @@ def judged_in_orbit(flown: Run, at: float) -> Result:
 
 
 def _mean_square(values: FloatArray) -> float:
-    """Return the mean square of values, which is zero for a flight without an estimate."""
+    """Return the mean square of values, or zero without values."""
     return float(np.mean(values**2)) if values.size else 0.0
 
 

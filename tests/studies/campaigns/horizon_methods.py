@@ -1,12 +1,13 @@
-"""Campaign `horizon-methods`: the paper's ways to nadir beside the default ones, on the same frames.
+"""Campaign `horizon-methods`: the methods of the paper and the default methods for nadir, on the same frames.
 
-The evaluation that Meller et al. leave open (chapter 5). Three level cameras at 120 deg (VT) see the Earth
-from 380 to 800 km in random light, their lenses known to all methods, the air to none. Attitudes: `level`
-within 2 deg, `tilted` within 15 (as far as the paper's cameras keep the horizon), `any`. Light: `sunlit` in
-the first two cameras, or `terminator` in the first. The default method and the cameras together know what a
-flight knows (as in the campaign `nadir`); the paper's methods know the altitude, `graphic` also where the
-cameras look, and `vector` the true nadir half a second before, at up to 2 deg/s. Wrong is an answer more than
-half a degree off, far wrong more than five.
+Meller et al. leave this evaluation open (chapter 5). Three level cameras at 120 deg (VT) see the Earth from
+380 to 800 km in random light. All methods know the lenses, and none knows the atmosphere. The attitudes are
+`level` (within 2 deg), `tilted` (within 15 deg, as far as the paper's cameras keep the horizon in view) or
+`any`. The limb is `sunlit` in the first two cameras, or the first shows the `terminator`. The default method
+and the method of all cameras together have the prior knowledge of a flight (as in the campaign `nadir`). The
+methods of the paper know the altitude; `graphic` also knows the pointing of the cameras, and `vector` the
+true nadir half a second earlier, at rates up to 2 deg/s. An answer is wrong if it is more than half a degree
+off, and far wrong if more than five.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Answer one instant by all methods."""
+    """Run all methods on one instant."""
     generator = np.random.default_rng(case.seed)
     model, cameras = camera_model(), _cameras()
     instant = _draw(case, generator, model, cameras)
@@ -115,7 +116,7 @@ def _cameras() -> list[MountedCamera]:
 def _draw(
     case: Case, generator: np.random.Generator, model: EarthCameraModel, cameras: Sequence[MountedCamera]
 ) -> dict[str, Any]:
-    """Return an instant whose first camera, and in daylight the second too, has the limb in that light."""
+    """Return an instant whose first camera has the limb in that light; in sunlight also the second."""
     air, widest = random_air(generator), ATTITUDES[case.parameters["attitude"]]
     for _ in range(_MOST_DRAWS):
         position = (SEMI_MAJOR_AXIS + generator.uniform(*ALTITUDES)) * random_direction(generator)
@@ -162,7 +163,7 @@ def _methods(
     knowledge: HorizonKnowledge,
     known: FloatArray,
 ) -> dict[str, Callable[[], FloatArray | None]]:
-    """Return each method as a call that gives nadir (3,) in body axes, or None."""
+    """Return each method as a function that returns nadir (3,) in body axes, or None."""
     settings, first, lens = finder_settings(model), cameras[0], model.lens
     assert knowledge.position is not None
     altitude = float(np.linalg.norm(knowledge.position)) - MEAN_RADIUS

@@ -1,7 +1,7 @@
-"""The imperfections that the campaign `mismatch` flies: how each changes optics, light or counts.
+"""Camera imperfections of the campaign `mismatch`: how each changes optics, signal or counts.
 
-An imperfection is untold unless its name says `told`: the estimator is given the ideal camera, with a global
-shutter; that of `rolling untold` is not known, which is stated.
+The estimator does not know an imperfection unless its name contains `told`: it assumes the ideal camera with
+a global shutter. For `rolling untold` the estimator treats the line time as unknown.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
 from tests.support.supersampled import Optics, coma, disc, gaussian, halo, moffat, ring
 
 Stage = Callable[[FloatArray, np.random.Generator], FloatArray]
-"""Changes electrons or counts (rows, columns); the generator draws what differs from frame to frame."""
+"""Function that changes electrons or counts (rows, columns); the generator draws what differs between frames.
+"""
 
 Encoder = Callable[[FloatArray], Image]
-"""Makes whole numbers of an unsigned type of counts (rows, columns)."""
+"""Function that converts counts (rows, columns) to integers of an unsigned type."""
 
 TOP = 4095.0
 
@@ -52,11 +53,11 @@ class Imperfection:
 
     Attributes:
         optics: lens, point spread, scintillation.
-        electrons: before the photons' noise; collected: after it.
-        gain: e- a count; counts: after the conversion, before `encode` rounds.
-        line_time: s from row to row.
-        known: settings of the estimator that are given beside the ideal camera's.
-        top: counts at which the camera says it clips; None when it does not say.
+        electrons: change before photon noise; collected: change after photon noise.
+        gain: e- per count; counts: change of the counts before `encode` rounds them.
+        line_time: time (s) between rows.
+        known: settings of the estimator that differ from those of the ideal camera.
+        top: saturation level (counts) that the camera reports, or None.
     """
 
     optics: Optics = field(default_factory=Optics)
@@ -71,7 +72,7 @@ class Imperfection:
 
 
 def _grid(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return x, y of the pixels, from -1 to 1 across the frame."""
+    """Return x and y of the pixels, from -1 to 1 across the frame."""
     rows, columns = image.shape
     return np.linspace(-1.0, 1.0, columns)[None, :], np.linspace(-1.0, 1.0, rows)[:, None]
 
@@ -96,7 +97,7 @@ def _gradient(electrons: float) -> Stage:
 
 
 def _wide_light(electrons: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the light with stray light of 5,000 e- around a random place, whose sigma is 250 px."""
+    """Return the frame with stray light: 5,000 e- around a random position with a sigma of 250 px."""
     row, column = np.indices(electrons.shape)
     place = rng.uniform(0.0, electrons.shape)
     away = np.square(row - place[0]) + np.square(column - place[1])
@@ -148,7 +149,7 @@ def _cosmic(count: int) -> Stage:
 
 
 def _blooming(image: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Spill what exceeds 900 e- up and down the column, half each way."""
+    """Move the charge above 900 e- to the neighbours in the column, half in each direction."""
     out = image.copy()
     for _ in range(12):
         excess = np.maximum(out - 900.0, 0.0)
@@ -163,7 +164,7 @@ def _gamma(image: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _nonlinear(image: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Bend the response: 10 % less at the top."""
+    """Return a nonlinear response: 10 % lower at full scale."""
     return image * (1.0 - 0.1 * np.clip(image, 0.0, TOP) / TOP)
 
 

@@ -1,9 +1,9 @@
 """Campaign `installer-kill`: kill -9 of the installer in an update, at a random time or step.
 
-A case is a board that flies one release. Updates to other releases are killed again and again with all that
-they have started, half of them at a random time; of the others one process is killed at a random system call
-that changes files (by strace, where there is one). After each kill the board must fly the old or the new
-release without a complaint. At the end an update must come to its end, and its release flies.
+A case is a board that flies one release. Updates to other releases are killed repeatedly. Half of the kills
+end the installer and its child processes at a random time. The others end one process at a random system call
+that changes files (by strace, if it is installed). After each kill the board must fly the old or the new
+release without an error. At the end an update must complete, and its release must fly.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.deploy.boards import FakeBoard
 
 KILLS = 10
-"""Of a board; then its update comes to its end."""
+"""Number of kills of a board; then its update completes."""
 _CALLS = "mkdir,mkdirat,symlink,symlinkat,rename,renameat,renameat2,unlink,unlinkat,fsync,openat"
 _MOST_CALLS = 1500
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return boards that come to `runs` kills together."""
+    """Return boards with `runs` kills in total."""
     sizes = [min(KILLS, runs - done) for done in range(0, runs, KILLS)]
     return [Case(str(number), (seed, number), {"kills": size}) for number, size in enumerate(sizes)]
 
 
 def run(case: Case) -> Result:
-    """Kill updates of one board; let the last one finish."""
+    """Kill updates of one board; let the last one complete."""
     rng = np.random.default_rng(case.seed)
     with tempfile.TemporaryDirectory() as name:
         board = FakeBoard(Path(name) / "root")
@@ -52,7 +52,7 @@ def run(case: Case) -> Result:
 
 
 def _kill(board: FakeBoard, took: float, old: str, new: str, rng: np.random.Generator) -> Result:
-    """Begin an update from release `old` to `new`, kill it, and start the flight."""
+    """Start an update from release `old` to `new`, kill it, and start the flight."""
     words, by_time = board.words(new), bool(rng.random() < 0.5) or shutil.which("strace") is None
     place = float(rng.random())
     if not by_time:

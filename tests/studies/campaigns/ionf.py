@@ -25,7 +25,7 @@ from tests.support.flights import fly
 SATELLITES = {"uw": "ionf", "vt": "ionf_vt", "usu": "ionf_usu"}
 METHODS = ("cameras", "magnetometer", "fused", "filtered", "flown")
 SETTLED = 30.0
-"""s, from which on attitudes count."""
+"""Time (s) after which attitudes count."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -50,7 +50,7 @@ def run(case: Case) -> Result:
 
 
 def judged(flown: Run, since: float) -> Result:
-    """Return the share of rounds with each attitude, its rms error and claim per axis (deg), and its NEES."""
+    """Return the share of frames with each attitude, its rms error and claim per axis (deg), and its NEES."""
     rows, truth = flown["separate_attitudes"], flown["truth"]
     rows = rows[rows["middle_ns"] > since * 1e9]
     seen = flown["directions"]

@@ -1,10 +1,11 @@
 """Campaigns `aged-elements` and `calendar`: errors and claimed errors of the predicted environment.
 
-`aged-elements` gives the environment elements of up to 60 days, whose B* is wrong by up to 100 %, and a
-receiver that is good, silent or false. `calendar` flies a revolution in every month from 2026 to 2036, over
-the rollover of the GPS week in November 2038 and over a leap second, with fixes as the driver reads them from
-NAV-PVT, whose date is 1024 weeks early in every second case. Each craft flies its own orbit, and its attitude
-filter follows its own body for `FOLLOWED` seconds, by its magnetometer alone after the first star attitudes.
+`aged-elements` gives the flight software elements that are up to 60 days old with a B* that is wrong by up to
+100 %, and a receiver that is good, silent or false. `calendar` flies a revolution in every month from 2026 to
+2036, over the rollover of the GPS week in November 2038, and over a leap second. The fixes are those that the
+driver reads from NAV-PVT, with a date that is 1024 weeks early in every second case. Each craft flies its own
+orbit. Its attitude filter follows its own body for `FOLLOWED` seconds, by magnetometer and gyro alone after
+the first star attitudes.
 """
 
 from __future__ import annotations
@@ -59,16 +60,18 @@ from sim_hal.worlds.orbit import sun_position
 from tests.support.flights import CONFIG
 
 HONEST = 4.0
-"""Largest error of the position in units of its claim."""
+"""Largest position error in units of its claim."""
 SPAN, STEP, USED_WITHIN = 1200, 10, 600
-"""s: duration of a flight with old elements, time between fixes, and time within which good ones are used."""
+"""Duration (s) of a flight with old elements, time (s) between fixes, and time (s) within which the flight
+must use good fixes.
+"""
 FALSE = ("jump", "shift", "radius", "velocity", "date", "field", "sun")
 KINDS = ("good", "good", "good", "good", "silent", "silent", *FALSE)
 DAYS_NS = 86_400 * SECOND_NS
 STAR_SIGMA = 5e-5
-"""rad, standard deviation of a star attitude about each axis."""
+"""Standard deviation (rad) of a star attitude about each axis."""
 FIELD_ERROR = 5.0e-8
-"""T, error of the field model within its validity, per axis, as the filter assumes it."""
+"""Error (T) of the field model per axis within its validity, as the filter assumes."""
 
 
 def lines(epoch: datetime, drag: float, angles: Sequence[float], motion: float) -> tuple[str, str]:
@@ -99,7 +102,7 @@ class Receiver:
         return UNIX_EPOCH + (self.begin_ns + seconds * SECOND_NS) / (DAY * SECOND_NS)
 
     def reading(self, seconds: float) -> GpsReading:
-        """Return the fix of a time, s, with noise."""
+        """Return the fix at a time (s), with noise."""
         state, turn = self.true.at(self.date(seconds)), celestial_to_terrestrial(self.date(seconds))
         noise = self._rng.standard_normal(6)
         position = turn @ state.position
@@ -109,7 +112,7 @@ class Receiver:
         return GpsReading(time_ns, time_ns, utc_ns, position + 3.0 * noise[:3], velocity, 5.0, 0.05, 9, True)
 
     def error(self, known: EstimatedEnvironment, seconds: float) -> tuple[float, float] | None:
-        """Return the error of the known position, m, and the error over the claim, or None if unknown.
+        """Return the error (m) of the predicted position, and the error over its claim; None if unknown.
 
         Positions are compared in ITRS, because a leap second changes UTC but not the Earth's rotation.
         """
@@ -122,19 +125,19 @@ class Receiver:
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights, whose receivers take turns."""
+    """Return `runs` flights that cycle through the kinds of receivers."""
     kinds = [KINDS[run % len(KINDS)] for run in range(runs)]
     return [Case(f"{run}/{kind}", (seed, run), {"kind": kind}) for run, kind in enumerate(kinds)]
 
 
 Orbit = tuple[datetime, float, Sequence[float], float]
-"""Epoch, B*, angles and mean motion of an orbit, as `lines` takes them."""
+"""Epoch, B*, angles and mean motion of an orbit, in the form of `lines`."""
 
 
 def run(case: Case) -> Result:
-    """Fly one receiver with old elements; `step`, s, is the time between two fixes."""
+    """Fly one receiver with old elements; `step` is the time (s) between two fixes."""
     rng, kind = np.random.default_rng(case.seed), case.parameters["kind"]
-    # Field and Sun refute an orbit only if the elements agree with them.
+    # Field and Sun can refute another orbit only if the elements agree with them.
     age, wrong = rng.uniform(0.0, 2.0 if kind in ("field", "sun") else 60.0), rng.uniform(0.0, 1.0)
     other: Receiver | None = None
     while True:
@@ -196,7 +199,7 @@ def _field_sigma(strength: float) -> float:
 
 
 def _contradicts(kind: str, receiver: Receiver, other: Receiver) -> bool:
-    """Return whether field or Sun, as `kind` states, at the true place contradict the other place."""
+    """Return whether field or Sun, as `kind` states, at the true position contradict the other position."""
     places = [(_measured(receiver, seconds), _measured(other, seconds)) for seconds in range(0, SPAN, 60)]
     if kind == "sun":
         return all(here[1] == 1.0 and there[1] == 0.0 for here, there in places)
@@ -205,14 +208,17 @@ def _contradicts(kind: str, receiver: Receiver, other: Receiver) -> bool:
 
 
 def _witness(kind: str, receiver: Receiver, seconds: int, bias: float) -> Witness:
-    """Return what magnetometer and solar cells measure on the true orbit; kind "sun" has only the cells."""
+    """Return the measurements of magnetometer and solar cells on the true orbit.
+
+    Kind "sun" has only the cells.
+    """
     strength, share = _measured(receiver, seconds, with_field=seconds % 60 == 0 and kind != "sun")
     measured = None if math.isnan(strength) else strength + bias
     return Witness(measured, _field_sigma(strength), share > 0.5 and kind != "field")
 
 
 def _sent(kind: str, receiver: Receiver, rng: np.random.Generator) -> Callable[[int], GpsReading | None]:
-    """Return what a receiver of a kind sends at each time."""
+    """Return the function that gives the fix of a kind of receiver at each time."""
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
     size, factor, back = 10.0 ** rng.uniform(4.0, 6.0), rng.uniform(0.0, 0.9), rng.uniform(3.0, 200.0)
@@ -267,16 +273,17 @@ CRAFT = {
     "orbit.yaml": None,
     "orbit_3u.yaml": ((51.64, 0.0006, 130.5, 0.0), 15.50),
 }
-"""Configurations, and inclination, eccentricity, perigee and anomaly (deg) and daily revolutions of orbits.
+"""Configurations, with inclination, eccentricity, perigee and anomaly (deg) and revolutions per day of their
+orbits.
 
 The KnightCube flies the orbit of its configuration, and the 3U that of the ISS.
 """
 FOLLOWED, STARS_UNTIL, FILTER_STEP = 300, 60, 2
 """Time (s) for which the attitude is followed, time until which there are star attitudes, and filter step."""
 ROLLOVER = "2038-11-20T23:15:00"
-"""UTC three quarters of an hour before the ten-bit week of GPS begins again."""
+"""UTC three quarters of an hour before the ten-bit week of GPS restarts."""
 LEAP = "2035-06-30T23:15:00"
-"""UTC before a leap second that this campaign assumes at the end of June 2035."""
+"""UTC shortly before a leap second that this campaign assumes at the end of June 2035."""
 
 
 def months(runs: int, seed: int) -> list[Case]:
@@ -290,7 +297,7 @@ def months(runs: int, seed: int) -> list[Case]:
 
 
 def fly_month(case: Case) -> Result:
-    """Fly a revolution with a fix in every minute and compare place, Sun, field and eclipse."""
+    """Fly a revolution with a fix every minute; compare position, Sun, field and eclipse."""
     rng, given = np.random.default_rng(case.seed), case.parameters
     begin = datetime.fromisoformat(given["utc"]).replace(tzinfo=UTC)
     config = as_orbit(configuration.load(CONFIG.parent / given["craft"]))
@@ -369,7 +376,7 @@ class _UnlikeBody:
 
 
 def _followed(config: OrbitConfig, receiver: Receiver, rng: np.random.Generator) -> Result:
-    """Return errors of the attitude of a craft; `attitude_sigmas` is the largest in units of its claim."""
+    """Return the errors of a craft's attitude; `attitude_sigmas` is the largest in units of its claim."""
     body, unit = _UnlikeBody(config, rng), config.inertial_unit
     free = FreeFilter(config.craft.inertia_matrix(), filter_settings(config))
     known = EstimatedEnvironment(None, SimClock(receiver.begin_ns))
@@ -411,7 +418,7 @@ def _angle_deg(one: FloatArray, other: FloatArray) -> float:
 
 
 def _as_received(sound: GpsReading, given: Result) -> GpsReading:
-    """Return a fix as the driver reads it, with the date of the former week epoch and a leap second."""
+    """Return a fix as the driver reads it, with the date of the previous week epoch or with a leap second."""
     utc_ns = sound.utc_ns
     leap_ns = round(datetime(2035, 7, 1, tzinfo=UTC).timestamp()) * SECOND_NS
     if given["utc"] == LEAP and utc_ns >= leap_ns:
