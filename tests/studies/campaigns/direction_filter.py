@@ -218,7 +218,7 @@ class AttitudeDetermination:
         self.starts += 1
 
     def _moved(self, waiting: _Waiting, time_ns: int) -> VectorObservation:
-        """Return a direction at `time_ns`; its covariance includes the possible rotation of the body since."""
+        """Return a direction at `time_ns`; its covariance includes the possible body rotation since."""
         assert self._rate is not None
         rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
         turned = rate * (time_ns - waiting.time_ns) * 1e-9

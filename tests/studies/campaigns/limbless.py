@@ -1,7 +1,8 @@
 """Pictures without a limb for the campaign `false-horizons`: ground, weather, skylines, marks, glare.
 
-Independent of `sim_hal.earth_camera`: each picture is light of 0 to 1 on a plane, made of noise with a
-power-law spectrum, ramps, polygons and discs. `photographed` adds blur, noise, response and quantisation.
+The pictures are independent of `sim_hal.earth_camera`. Each is an intensity of 0 to 1 on a plane, composed of
+noise with a power-law spectrum, ramps, polygons and discs. `photographed` adds blur, noise, camera response
+and quantisation.
 """
 
 from __future__ import annotations
@@ -18,17 +19,17 @@ Maker = Callable[[Size, np.random.Generator], FloatArray]
 
 
 def spectral_noise(size: Size, slope: float, generator: np.random.Generator) -> FloatArray:
-    """Return noise (rows, columns) of zero mean and unit variance, its amplitude as wave number^-slope."""
+    """Return noise (rows, columns) of zero mean and unit variance with the amplitude (wave number)^-slope."""
     rows, columns = size
     wave = np.hypot(np.fft.fftfreq(2 * rows)[:, None] * 2 * rows, np.fft.rfftfreq(2 * columns) * 2 * columns)
     white = np.fft.rfft2(generator.standard_normal((2 * rows, 2 * columns)))
-    # Twice the picture, cut: its opposite borders must not be alike.
+    # The noise is cut from a field of twice the size, so that opposite borders are not alike.
     noise = np.fft.irfft2(white * np.maximum(wave, 1.0) ** -slope * (wave > 0.0))[:rows, :columns]
     return np.asarray((noise - noise.mean()) / noise.std())
 
 
 def clouds(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return clouds over dark sea, with sharp or soft rims."""
+    """Return clouds over dark sea, with sharp or soft edges."""
     noise = spectral_noise(size, generator.uniform(1.2, 2.2), generator)
     cover = np.clip((noise - generator.normal(0.0, 0.8)) / generator.uniform(0.02, 1.0) + 0.5, 0.0, 1.0)
     bright = 0.8 + 0.1 * spectral_noise(size, 1.3, generator)
@@ -36,7 +37,7 @@ def clouds(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def coast(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return a fractal coast: textured land, dark sea, a few clouds in half of the pictures."""
+    """Return a fractal coast of textured land and dark sea, with a few clouds in half of the pictures."""
     land = spectral_noise(size, generator.uniform(1.6, 3.0), generator) > generator.normal(0.0, 0.5)
     ground = 0.25 + 0.05 * spectral_noise(size, 1.2, generator)
     light = np.where(land, ground, generator.uniform(0.02, 0.08))
@@ -46,7 +47,7 @@ def coast(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def terminator(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return ground or clouds that fade into the night along a straight or bent line."""
+    """Return ground or clouds that fade into the night along a straight or curved line."""
     x, y = _turned(size, generator)
     ramp = x + generator.normal(0.0, 0.3) * y**2 - generator.uniform(-0.5, 0.5)
     ground = clouds(size, generator) if generator.random() < 0.7 else coast(size, generator)
@@ -54,7 +55,7 @@ def terminator(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def bands(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return stripes, straight or bent: streets of clouds, waves, interference."""
+    """Return straight or curved stripes: cloud streets, waves, interference."""
     x, y = _turned(size, generator)
     bent = (
         x
@@ -66,7 +67,7 @@ def bands(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def gradient(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return a smooth ramp or a vignette, faintly mottled."""
+    """Return a smooth ramp or a vignette with faint mottling."""
     x, y = _turned(size, generator)
     ramp = x if generator.random() < 0.5 else -np.hypot(x - generator.normal(), y - generator.normal())
     ramp = (ramp - ramp.min()) / np.ptp(ramp)
@@ -75,12 +76,12 @@ def gradient(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def flat(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return an even frame, dark or bright."""
+    """Return a uniform frame, dark or bright."""
     return np.full(size, generator.uniform(0.0, 1.0))
 
 
 def noise(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return noise alone: white, blurred, or hot pixels on black."""
+    """Return noise only: white, blurred, or hot pixels on black."""
     kind = generator.integers(3)
     if kind == 2:
         return np.asarray((generator.random(size) < generator.uniform(1e-4, 0.05)).astype(float))
@@ -89,7 +90,7 @@ def noise(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def stars(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return stars above trees, hills, a roof or a dome that are darker or brighter than the sky."""
+    """Return stars above trees, hills, a roof or a dome, which are darker or brighter than the sky."""
     rows, columns = size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
     sky = generator.uniform(0.0, 0.3) * (0.3 + 0.7 * np.clip(y, -1.0, 1.0) ** 2)
@@ -115,7 +116,7 @@ def stars(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def marks(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return a logo or a test card: letters of bars, rings and polygons on an even ground."""
+    """Return a logo or a test card: bars, rings and polygons on a uniform background."""
     rows, columns = size
     y, x = np.mgrid[0:rows, 0:columns] / max(size)
     light = np.full(size, generator.uniform(0.0, 0.3))
@@ -133,7 +134,7 @@ def marks(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def flares(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return the Sun's glare with its ghosts in a dark sky: no Earth."""
+    """Return the Sun's glare and its ghost images in a dark sky without Earth."""
     rows, columns = size
     y, x = np.mgrid[0:rows, 0:columns] / max(size)
     sun, middle = generator.uniform(-0.1, 1.1, 2), np.array([0.5, 0.5])
@@ -148,7 +149,7 @@ def flares(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def day_sky(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return a bright sky over darker textured ground, with hills, trees or clouds, as aircraft see it."""
+    """Return a bright sky over darker textured ground, with hills, trees or clouds, as seen from aircraft."""
     x, y = _turned(size, generator) if generator.random() < 0.5 else _level(size)
     bend = generator.choice([0.01, 0.1]) * generator.normal() * x**2
     walk = generator.choice([0.0, 0.003, 0.01, 0.04]) * spectral_noise(
@@ -176,7 +177,7 @@ MAKERS: dict[str, Maker] = {
 
 
 def photographed(light: FloatArray, generator: np.random.Generator) -> Image:
-    """Return light of 0 to 1 as a camera of 8 bits takes it: blur, exposure, noise, a bent response."""
+    """Return the 8-bit image of an intensity of 0 to 1: blur, exposure, noise, nonlinear response."""
     light = gaussian_filter(light, generator.uniform(0.4, 1.2)) * generator.uniform(0.6, 1.5)
     light = light + generator.uniform(0.002, 0.02) * generator.standard_normal(light.shape)
     counts = 4.0 + 251.0 * np.clip(light, 0.0, 1.0) ** generator.uniform(0.5, 1.0)
@@ -184,7 +185,7 @@ def photographed(light: FloatArray, generator: np.random.Generator) -> Image:
 
 
 def _turned(size: Size, generator: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return two coordinates (rows, columns) of about -1 to 1, turned at random."""
+    """Return two coordinates (rows, columns) of about -1 to 1 in axes that are rotated at random."""
     rows, columns = size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
     turn = generator.uniform(0.0, 2.0 * np.pi)
@@ -192,7 +193,7 @@ def _turned(size: Size, generator: np.random.Generator) -> tuple[FloatArray, Flo
 
 
 def _level(size: Size) -> tuple[FloatArray, FloatArray]:
-    """Return two coordinates (rows, columns) of -1 to 1 along the rows and the columns."""
+    """Return two coordinates (rows, columns) from -1 to 1 along the rows and the columns."""
     rows, columns = size
     x, y = np.meshgrid(np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows))
     return x, y

@@ -1,12 +1,11 @@
-"""Campaign `lost-in-space`: how every method of identification fares, one difficulty at a time.
+"""Campaign `lost-in-space`: all methods of star identification, with one difficulty at a time.
 
-The survey that Michalski's thesis promised. About a nominal list (15 deg, 0.3 px, 2 false stars, 10 %
-missing, 0.2 mag) the centroid noise, the false stars, the missing stars, the field and the magnitudes'
-error are varied, each alone; the field of view is known. Every method sees the same lists. Right is an
-answer whose boresight is right to 0.05 deg and by which four in five of the stars named are those drawn;
-every other answer is wrong. Times are of the processor. `rate` is given what it needs besides: velocities,
-of a turn of 1 deg/s seen for 0.5 s; half of the false points stand still on the detector, half move as they
-please.
+Michalski's thesis proposes this survey. The nominal list has a field of 15 deg, centroid noise of 0.3 px, 2
+false stars, 10 % missing stars and magnitude errors of 0.2 mag. Each of these parameters is varied alone; the
+field of view is known. All methods solve the same lists. An answer is right if its boresight is correct to
+0.05 deg and at least four in five of the identified stars are correct. All other answers are wrong. Times are
+processor times. The method `rate` also gets velocities, of a rotation of 1 deg/s that is observed for 0.5 s.
+Half of the false points are at rest on the detector; the other half have random velocities.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ EXPOSURE = 0.5
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` lists of each cell; the nominal cell stands once, under no axis."""
+    """Return `runs` lists of each cell; the nominal cell occurs once, without an axis."""
     cells: list[tuple[str, float, int]] = [("nominal", 0.0, 0)]
     for number, (axis, values) in enumerate(AXES.items()):
         cells += [
@@ -64,7 +63,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Let every method see one list."""
+    """Solve one list by every method."""
     axis, value = case.parameters["axis"], case.parameters["value"]
     setting = {**NOMINAL, axis: value} if axis in NOMINAL else NOMINAL
     sky = known_sky(setting["field_deg"])
@@ -89,7 +88,7 @@ def run(case: Case) -> Result:
 
 @lru_cache(maxsize=8)
 def known_sky(field_deg: float) -> KnownSky:
-    """Return what the methods know for a field, all tables made."""
+    """Return the catalogue and tables of the methods for a field of view."""
     half = float(np.tan(np.deg2rad(0.5 * field_deg)))
     sky = KnownSky(default_index(), (half, half))
     for table in ("pairs", "tree", "planar", "spherical", "grid"):
@@ -98,14 +97,14 @@ def known_sky(field_deg: float) -> KnownSky:
 
 
 def answer_of(name: str, field: StarField, sky: KnownSky, motion: StarMotion) -> StarMatch:
-    """Return the answer of a method, with all that it can use."""
+    """Return the answer of a method, with all inputs that it can use."""
     if name == "rate":
         return identify_by_rate(field, sky, motion=motion)
     return METHODS[name].identify(field, sky)
 
 
 def moving(drawn: StarList, generator: np.random.Generator) -> StarMotion:
-    """Return the velocities of a list's points as the two ends of their streaks would give them."""
+    """Return the velocities of a list's points, as the two ends of their streaks would give them."""
     field = drawn.field()
     axis = generator.standard_normal(3)
     rate = BODY_RATE * axis / np.linalg.norm(axis)
@@ -148,7 +147,7 @@ def _results_of(results: Sequence[Result], axis: str, value: float) -> list[Resu
 
 
 def cell(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the counts and times of every method over some lists."""
+    """Return the counts and times of every method over a set of lists."""
     row: dict[str, Any] = {"lists": len(results)}
     for name in METHODS:
         verdicts = [r[name]["verdict"] for r in results]

@@ -1,13 +1,13 @@
-"""Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, by a renderer of its own.
+"""Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, with an independent renderer.
 
-`mismatch` flies each of `imperfections.IMPERFECTIONS` at turns of 10 and 30 % of the field; `vibration` a
-body that shakes by up to 5 px at 5 to 50 Hz in one of `SHAPES`, with exposures of 0.2 and 1 s. Pointings
-are uniform over the sky, the axis is 0 to 90 deg off the boresight, and five stars must be usable
+`mismatch` uses each of `imperfections.IMPERFECTIONS` at rotations of 10 and 30 % of the field. `vibration`
+adds a vibration of up to 5 px at 5 to 50 Hz with one of `SHAPES`, at exposures of 0.2 and 1 s. Pointings are
+uniform over the sky, the axis is 0 to 90 deg off the boresight, and at least five stars must be usable
 (`scenes.usable`).
 
-An answer is judged by its error in its own standard deviations (the square root of its NEES) and as a part
-of the rate. More than 6 is confidently wrong: chance makes it so once in 13 million. The true rate of a body
-that shakes is its mean rate, from attitude to attitude at the exposure's ends.
+The error of an answer is given in its own standard deviations (the square root of its NEES) and relative to
+the rate. An error of more than 6 standard deviations counts as confidently wrong; its probability is 1 in 13
+million. The true rate of a vibrating body is its mean rate between the attitudes at the ends of the exposure.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ _VIBRATION_TURN = 10.0
 # Smallest and largest amplitudes of a vibration, px.
 _AMPLITUDES = ((0.2, 1.0), (1.0, 5.0))
 SHAPES = ("sine", "two sines", "decaying", "noise")
-"""How a vibration depends on time. A decaying vibration loses 86 % of its amplitude during the exposure."""
+"""Time function of a vibration. A decaying vibration loses 86 % of its amplitude during the exposure."""
 
 
 def mismatch_cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` random motions of each imperfection and turn."""
+    """Return `runs` random motions of each imperfection and rotation."""
     cells = [(name, percent) for name in IMPERFECTIONS for percent in TURNS]
     found = []
     for cell, (name, percent) in enumerate(cells):
@@ -69,7 +69,7 @@ def mismatch_cases(runs: int, seed: int) -> list[Case]:
 
 
 def vibration_cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` shaking motions: each exposure and amplitude in turn, half of them sinusoidal."""
+    """Return `runs` vibrations that cycle through exposures and amplitudes; half of them are sinusoidal."""
     found = []
     for run in range(runs):
         draw = np.random.default_rng((seed, run, 0))
@@ -88,7 +88,7 @@ def vibration_cases(runs: int, seed: int) -> list[Case]:
 
 
 def attitudes_of(parameters: dict[str, Any], camera: StarCameraModel, rng: np.random.Generator) -> Attitudes:
-    """Return a case's attitude as a function of time: a random pointing, a steady turn, what it shakes."""
+    """Return a case's attitude as a function of time: random pointing, constant rate, and vibration."""
     theta, azimuth = np.deg2rad(parameters["theta"]), rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
     turn = axis * parameters["percent"] / 100.0 * camera.field_of_view
@@ -161,7 +161,7 @@ def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
 def seen_stars(
     camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float
 ) -> tuple[IntArray, int]:
-    """Return the stars that may throw light on the frame, and how many are usable."""
+    """Return the stars that may contribute to the frame, and the number of usable ones."""
     vectors = np.einsum("tij,nj->tni", attitude_matrix(attitudes(np.array([-0.5, 0.0, 0.5]))), sky.directions)
     reach = np.cos(camera.pinhole.half_diagonal + 0.4 * camera.field_of_view)
     near = np.flatnonzero(vectors[1, :, 2] > reach)
@@ -180,7 +180,7 @@ def detected(
     exposure: float,
     rng: np.random.Generator,
 ) -> Image:
-    """Return the frame of counts of light: photons, detector, conversion."""
+    """Return the frame of an image in electrons: photon noise, detector, analogue-to-digital conversion."""
     if imperfection.electrons is not None:
         electrons = imperfection.electrons(electrons, rng)
     collected = rng.poisson(electrons + camera.dark_current * exposure).astype(float)
@@ -200,13 +200,13 @@ def run_mismatch(case: Case) -> Result:
 
 
 def run_vibration(case: Case) -> Result:
-    """Estimate one frame of a body that shakes and judge the answer."""
+    """Estimate one frame of a vibrating body and judge the answer."""
     imperfection = IMPERFECTIONS["none"]
     return judge(case, *expose(case, imperfection), imperfection)
 
 
 def judge(case: Case, pixels: Image, rate: FloatArray, imperfection: Imperfection) -> Result:
-    """Return status, errors and time of the estimator on a frame; `rate` (3,) is true and the prior."""
+    """Return status, errors and time of the estimator on a frame; the true `rate` (3,) is also the prior."""
     camera = StarCameraModel(field_of_view=FIELD)
     settings = LikelihoodSettings(
         **{
@@ -238,7 +238,7 @@ def judge(case: Case, pixels: Image, rate: FloatArray, imperfection: Imperfectio
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return availability and errors of each row, and of all."""
+    """Return availability and errors of each row, and of all rows together."""
     rows = list(dict.fromkeys((result["row"], result["percent"]) for result in results))
     table = [
         {

@@ -1,13 +1,15 @@
-"""Campaign `nadir`: the way down from random frames of the Earth's limb, in daylight and with the terminator.
+"""Campaign `nadir`: nadir from random frames of the Earth's limb, in daylight and with the terminator.
 
-Positions, attitudes, Suns and ground are random, altitudes uniform over 200..2,000 km
-(`tests.sim_hal.earth_camera.scenes`); the camera is the logarithmic Fuga 15d of 67 deg with distortion, noise
-and blemishes. The finder knows the position (GPS), the Sun's direction and the field's from models, and both
-coarsely in camera axes: solar strings to 5 deg an axis, magnetometer to 2 deg. Each view comes with air that
-the finder knows, its limb's height to 1 km, and with air that it does not: scale height and haze are drawn.
+Positions, attitudes, Sun directions and ground are random. Altitudes are uniform over 200 to 2,000 km
+(`tests.sim_hal.earth_camera.scenes`). The camera is the logarithmic Fuga 15d with a field of 67 deg,
+distortion, noise and blemishes. The prior knowledge is the position (GPS), the directions of Sun and magnetic
+field from models, and coarse measurements of both in camera axes (solar cells to 5 deg per axis, magnetometer
+to 2 deg). Each view is rendered with a known atmosphere, whose limb height is known to 1 km, and with an
+unknown one, whose scale height and haze are random.
 
-Errors are angles between true and found nadir (both axes together); NEES is of the two axes, 2 by chance.
-An accepted answer more than half a degree off is wrong; refused and ambiguous frames count as unanswered.
+Errors are angles between true and measured nadir (both axes together). The NEES of the two axes is 2 if the
+covariance is correct. An accepted answer more than half a degree off is wrong. Refused and ambiguous frames
+count as unanswered.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ RIGHT, WRONG = "right", "wrong"
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` frames of each view with each air."""
+    """Return `runs` frames of each view with each atmosphere."""
     return [
         Case(f"{view}-{air}-{run}", (seed, number, run), {"view": view, "air": air})
         for air in AIRS
@@ -85,7 +87,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the table of both views, each with both airs, and the frames to look at."""
+    """Return the table of both views with both atmospheres, and the list of notable frames."""
     rows = [
         {"view": view, "air": air, **row(of)}
         for air in AIRS
@@ -97,7 +99,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def row(results: Sequence[Result]) -> dict[str, Any]:
-    """Return counts, errors, NEES and times of some frames."""
+    """Return counts, errors, NEES and times of a set of frames."""
     verdicts = Counter(r["verdict"] for r in results)
     answers = [r for r in results if r["nees"] is not None]
     errors = np.array([r["error_deg"] for r in answers])
@@ -118,7 +120,7 @@ def row(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _worth_a_line(result: Result) -> bool:
-    """Return whether a frame is to be looked at: wrong, none, far beyond its covariance, or warned."""
+    """Return whether a frame is listed: wrong, unanswered, far beyond its covariance, or with a warning."""
     return bool(result["verdict"] != RIGHT or result["nees"] > 20.0 or result["warnings"])
 
 

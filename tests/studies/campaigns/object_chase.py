@@ -1,9 +1,9 @@
-"""One flight of campaign `object-flights`: a craft that looks for an object and follows it.
+"""One flight of campaign `object-flights`: a craft that searches for an object and follows it.
 
-The flight is that of `orbit_pointing_flight`: filter, planner's job and pointing law. What is pointed to is
-decided by the flight's own `ObjectAim` from the flight's own `ObjectTracker`. A frame each two seconds gives
-an attitude of the stars and a sighting, two seconds late, as is the planner's table; the sightings are drawn.
-The object falls on an orbit of its own, integrated by DOP853.
+The flight has the filter, the planner's job and the pointing law of `orbit_pointing_flight`. The flight's own
+`ObjectAim` chooses the target from the tracks of the flight's own `ObjectTracker`. A frame every two seconds
+gives a star attitude and a sighting, whose error is drawn at random. They arrive after two seconds, as does
+the planner's table. The object moves on its own orbit, which is integrated by DOP853.
 """
 
 from __future__ import annotations
@@ -30,12 +30,16 @@ from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, Poi
 from tests.support.short_arcs import flow, passing_object
 
 NEAREST, END = 120.0, 210.0
-"""s: when the object turns the line of sight by the rate that was drawn, and when the flight ends."""
+"""Time (s) at which the object rotates the line of sight at the drawn rate, and time (s) at which the flight
+ends.
+"""
 FIELD = np.radians(10.0)
-"""rad from the boresight to the nearest edge, of 512 px over 20 deg."""
+"""Angle (rad) from the boresight to the nearest edge of a frame of 512 px over 20 deg."""
 PIXEL = 2.0 * FIELD / 512
 FASTEST, DEAR = np.radians(1.0), 0.8
-"""rad/s of no path that is flown (`fastest_rate` of orbit_object.yaml), and the part of it that is dear."""
+"""Largest rate (rad/s) of a path that is flown (`fastest_rate` of orbit_object.yaml), and the fraction of it
+above which the planner adds a cost.
+"""
 SIGHTING = {
     2.0: (0.004, 0.005, 0.99),
     3.0: (0.005, 0.005, 0.99),
@@ -43,27 +47,32 @@ SIGHTING = {
     5.0: (0.010, 0.010, 0.99),
     6.0: (0.016, 0.017, 0.99),
 }
-"""By magnitude: px of error and claim, and the share of frames that show the object.
+"""By magnitude: error and claim (px) of a sighting, and the fraction of frames that show the object.
 
-Those of rendered frames (`object-passes --runs 3 --seed 22`).
+The values are those of rendered frames (`object-passes --runs 3 --seed 22`).
 """
 GAP = 10.0
-"""s without the object, in the flights that have it."""
+"""Time (s) without sightings, in the flights with a gap."""
 BORESIGHT: FloatArray = np.array([0.0, -1.0, 0.0])
 
 
 class ObjectChase(PointingFlight):
-    """A flight after an object.
+    """A flight that follows an object.
 
     Attributes:
-        told: names of the events; `refused`: how many tables turned the body too fast to be flown.
-        notes: each cycle the time, rad from the boresight to the object, the body's rate about the boresight
-            and its whole rate, rad/s, the number of the followed track, and whether the frame showed it.
-        shown, directions, fields: boresight (3,), true direction (3,) and field (3,) T, of each cycle, ICRS.
+        told: names of the events.
+        refused: number of planner tables that were rejected because the body would rotate too fast.
+        notes: for each cycle the time, the angle (rad) from the boresight to the object, the body's rate
+        about the boresight and its whole rate (rad/s), the number of the followed track, and whether the
+        frame showed the object.
+        shown, directions, fields: boresight (3,), true direction (3,) and field (3,), T, of each cycle, ICRS.
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
-        """`wanted`: craft, orbit, share of the worst disturbances, rate_deg, magnitude, gap (s or None)."""
+        """Create the flight.
+
+        Keys of `wanted`: craft, orbit, share of the worst disturbances, rate_deg, magnitude, gap (s or None).
+        """
         self._draw = np.random.default_rng([seed, 23])
         super().__init__({**wanted, "target": PointingTarget(Goal.OBJECT)}, seed)
         self.told: list[str] = []
@@ -83,16 +92,16 @@ class ObjectChase(PointingFlight):
             self.cycle(k * CYCLE)
 
     def direction(self, time: float) -> FloatArray:
-        """Return the true direction (3,) of the object now, `time` s."""
+        """Return the true direction (3,) of the object at `time` (s)."""
         place = self._state(time)[:3] - self.flight.body.orbit_truth().position
         return np.asarray(place / np.linalg.norm(place))
 
     def _state(self, time: float) -> FloatArray:
-        """Return the object's state (6,) m and m/s at a time."""
+        """Return the object's state (6,), m and m/s, at a time."""
         return np.asarray((self._before if time < NEAREST else self._after)(time))
 
     def _release(self, held: FreeFlight) -> TipOff:
-        """Return the release at rest, the boresight where the object will pass."""
+        """Return the release at rest, with the boresight at the point where the object will pass."""
         ahead, near = held.ephemeris(END), np.array([NEAREST])
         own = np.concatenate([ahead.position_at(near)[0], ahead.velocity_at(near)[0]])
         other = self._passing(own)
@@ -115,7 +124,7 @@ class ObjectChase(PointingFlight):
         return TipOff(rate=(0.0, 0.0, 0.0), attitude=(qx, qy, qz, qw))
 
     def _passing(self, own: FloatArray) -> FloatArray:
-        """Return the state (6,) of an object at its nearest whose line of sight turns by the wanted rate."""
+        """Return the closest state (6,) of an object whose line of sight rotates at the drawn rate."""
         rng, wanted = self._draw, self._wanted["rate_deg"]
         while True:
             direction, away, other = passing_object(rng, own)
@@ -126,7 +135,7 @@ class ObjectChase(PointingFlight):
                 return other
 
     def cycle(self, time: float) -> None:
-        """Fly one cycle: what the frame and the planner of the last one gave comes first."""
+        """Simulate one cycle; the results of the last cycle's frame and planner arrive first."""
         if self._frame is not None:
             self._tracker.ingest(self._frame)
             self._aim.accept(self._tracker.objects, self.flight.time_ns)
@@ -157,10 +166,10 @@ class ObjectChase(PointingFlight):
         return replace(job, origin_ns=self.flight.time_ns, weights=weights)
 
     def _note(self, time: float, square: float) -> None:
-        """Leave the notes to the frames."""
+        """Record no notes here; the frames record them."""
 
     def _see_stars(self, time: float) -> None:
-        """Give the filter the attitude of the frame of a cycle ago; expose the next frame."""
+        """Give the filter the star attitude of the frame of the previous cycle; expose the next frame."""
         if self._stars is not None:
             self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE)
         self._stars = self.flight.attitude(STAR_SIGMA)
@@ -170,7 +179,7 @@ class ObjectChase(PointingFlight):
         _, claim, share = SIGHTING[self._wanted["magnitude"]]
         gap = self._wanted["gap"]
         hidden = gap is not None and gap <= time < gap + GAP
-        # The square field, its rows along x.
+        # The field is square, with rows along x.
         inside = place @ BORESIGHT > 0.0 and np.abs(place[[0, 2]]).max() < np.tan(FIELD) * (place @ BORESIGHT)
         seen = bool(inside and not hidden and self._draw.random() < share)
         self._frame = self._sightings(true, claim, seen)
@@ -185,7 +194,7 @@ class ObjectChase(PointingFlight):
         )
 
     def _sightings(self, true: FloatArray, claim: float, seen: bool) -> FrameSightings:
-        """Return a frame with the object, or without."""
+        """Return a frame with or without a sighting of the object."""
         draw, magnitude = self._draw, self._wanted["magnitude"]
         basis, error = tangent_basis(true), SIGHTING[magnitude][0]
         off = PIXEL * error * draw.normal(size=2) @ basis

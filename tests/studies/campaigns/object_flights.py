@@ -1,9 +1,10 @@
-"""Campaign `object-flights`: objects kept in view by coils alone, with filter, planner and law.
+"""Campaign `object-flights`: objects kept in view by coils alone, with filter, planner and pointing law.
 
-Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`); every other flight does
-not see the object for ten seconds. From the frame on in which a track is followed the object is to stay
-within the field. Whether a body at rest there could have kept it, with the authority that issue 16 states,
-and no more roll than the rate at which it is braked, is judged by a linear programme (`least_deviation`).
+Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`). Every other flight has
+no sighting for ten seconds. From the frame in which a track is followed, the object should stay within the
+field. A linear programme (`least_deviation`) computes whether a body that starts at rest could keep it there,
+with the control authority that issue 16 states and with no more roll than the rate at which the flight
+detumbles.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ from tests.studies.campaigns.object_chase import FASTEST, FIELD, GAP, NEAREST, S
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
 
 _SIDES = 16
-"""Of the polygons about the circles of deviation and authority; the authority's lies outside the circle."""
+"""Number of sides of the polygons around the circles of deviation and authority; the authority's polygon lies
+outside its circle.
+"""
 
 
 def least_deviation(
@@ -34,10 +37,11 @@ def least_deviation(
     authority: float,
     roll: float,
 ) -> float:
-    """Return the least that the largest deviation can be, rad, over instants each `seconds` s.
+    """Return the smallest possible largest deviation (rad) over instants that are `seconds` apart.
 
-    `directions` (n, 3) of the object, `boresight` (3,) at the first instant, at rest there; `field` (n, 3);
-    all in axes of the sky. `authority` rad/s^2; `roll` rad/s, the fastest about the boresight.
+    `directions` (n, 3) are those of the object, and `boresight` (3,) is the one at the first instant, at
+    rest. `field` is (n, 3). All are in inertial axes. `authority` is in rad/s^2. `roll` is the fastest rate
+    (rad/s) about the boresight.
     """
     axes, count = _carried(directions), len(directions)
     speed = np.gradient(directions, seconds, axis=0)
@@ -46,7 +50,8 @@ def least_deviation(
     turned = _turned(directions, axes, field)
     first = axes[0] @ boresight
     first = first / np.linalg.norm(first) * np.arccos(np.clip(boresight @ directions[0], -1.0, 1.0))
-    # Unknowns of each instant: deviation, its rate, roll rate, two turning accelerations; last, the largest.
+    # Unknowns of each instant: deviation, its rate, roll rate, two angular accelerations. The last unknown is
+    # the largest deviation.
     right = np.zeros(5 * count)
     rows = lil_array((5 * count, 7 * count + 1))
     rows[:5, :5] = np.eye(5)
@@ -71,7 +76,7 @@ def least_deviation(
 
 
 def _polygons(count: int, authority: float) -> tuple[csr_array, FloatArray]:
-    """Return rows and right sides: every deviation within the largest, the accelerations within authority."""
+    """Return the constraints: each deviation at most the largest, accelerations within the authority."""
     sides = np.arange(_SIDES) * 2.0 * np.pi / _SIDES
     corner = np.stack([np.cos(sides), np.sin(sides)], axis=1)
     bounds, most = lil_array((2 * _SIDES * count, 7 * count + 1)), np.zeros(2 * _SIDES * count)
@@ -85,7 +90,7 @@ def _polygons(count: int, authority: float) -> tuple[csr_array, FloatArray]:
 
 
 def _carried(directions: FloatArray) -> FloatArray:
-    """Return two axes (n, 2, 3) across each direction, each pair the last one's after the shortest turn."""
+    """Return two axes (n, 2, 3) across each direction, propagated by the shortest rotations."""
     first = np.cross(directions[0], np.eye(3)[int(np.argmin(np.abs(directions[0])))])
     first /= np.linalg.norm(first)
     axes = [np.array([first, np.cross(directions[0], first)])]
@@ -95,7 +100,7 @@ def _carried(directions: FloatArray) -> FloatArray:
 
 
 def _turned(directions: FloatArray, axes: FloatArray, field: FloatArray) -> FloatArray:
-    """Return (n, 3, 2): acceleration of deviation and roll by each of two turns across the field."""
+    """Return the accelerations (n, 3, 2) of deviation and roll by each of two torques across the field."""
     found = np.zeros((len(directions), 3, 2))
     for n, (direction, both, strength) in enumerate(zip(directions, axes, field, strict=True)):
         along = strength / np.linalg.norm(strength)
@@ -107,9 +112,9 @@ def _turned(directions: FloatArray, axes: FloatArray, field: FloatArray) -> Floa
 
 
 AUTHORITY = {"knightcube": 0.18, "cubesat_3u": 0.012}
-"""deg/s^2 across the field."""
+"""Angular acceleration (deg/s^2) of the coils across the field."""
 BANDS = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.35), (0.35, 0.6))
-"""deg/s."""
+"""Bands of rates (deg/s)."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:

@@ -1,11 +1,11 @@
 """Campaign `object-passes`: passes of an object in rendered frames, through star tracker, sighting and track.
 
-Craft and object fall about the Earth; the object turns by 0.05 to 0.6 deg/s where it is nearest. The camera
-stands still for six frames, in which the object leaves a streak, and then turns with it, when the stars do:
-ten frames of a `short` pass, one each second, or a frame each 5 s for 3 to 6 min of a `long` one. A frame of
-0.2 s, 512 x 512 px over 20 deg. Each case without an object has as many frames of the same motion: what is
-tracked there is false. A sighting's error is beside the Cramer-Rao bound of a point under that motion in that
-frame.
+Craft and object orbit the Earth. The object moves at 0.05 to 0.6 deg/s at closest approach. The camera holds
+its attitude for six frames, in which the object leaves a streak. Then it rotates with the object, and the
+stars leave streaks. A `short` pass has ten frames at 1 Hz; a `long` one has a frame every 5 s for 3 to 6 min.
+Exposures are 0.2 s, with 512 x 512 px over 20 deg. Each case without an object has the same number of frames
+and the same motion, so every track in it is false. The error of a sighting is compared with the Cramer-Rao
+bound of a point with that motion in that frame.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ from tests.support.streak_bound import star_information
 
 EXPOSURE, STILL, TURNING = 0.2, 6, 10
 LONG, LONG_PERIOD = (180.0, 360.0), 5.0
-"""s: how long a long pass lasts, and from frame to frame."""
+"""Duration of a long pass (s, smallest and largest), and period of its frames (s)."""
 MAGNITUDES = (2.0, 3.0, 4.0, 5.0, 6.0)
 SLOWEST, FASTEST = 0.05, 0.6
-"""deg/s."""
+"""Slowest and fastest rate (deg/s)."""
 JUDGED = 8
-"""Frames from one judgement of a track to the next."""
+"""Number of frames between two judgements of a track."""
 OWN_TRACK = 0.01
-"""rad: a track nearer to the object than this is its."""
+"""Largest angle (rad) between the object and a track that counts as its own."""
 OWN_PX = 3.0
-"""A sighting nearer to the object than this is its."""
+"""Largest distance (px) between the object and a sighting that counts as its own."""
 CAMERA = StarCameraModel(columns=512, rows=512)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` passes of each length at each magnitude, and as many without an object."""
+    """Return `runs` passes of each duration at each magnitude, and as many without an object."""
     return [
         Case(
             f"{length}/{run}/{magnitude}",
@@ -90,7 +90,7 @@ def run(case: Case) -> Result:
             tracker.ingest(FrameSightings(round(frame.time * 1e9), *seen, observer=frame.observer))
             if number % JUDGED == JUDGED - 1:
                 nees += [_nees(track.line, frame) for track in tracker.objects if _is_own(track.line, frame)]
-    # A frame without an attitude leaves the tracks where they were before it.
+    # A frame without an attitude does not change the tracks.
     lines = [tracker.predicted(track.number, round(times[-1] * 1e9)) for track in tracker.objects]
     own = [n for n, line in enumerate(lines) if line and _is_own(line, frame)]
     result = {**case.parameters, "rate_deg": math.degrees(rate), "frames": frames}
@@ -109,8 +109,9 @@ def _times(case: Case, rng: np.random.Generator) -> FloatArray:
 
 
 def _frames(flown: Pass, still: int, rng: np.random.Generator) -> list[_Frame]:
-    """Return the frames of a pass: the camera stands for `still` of them and then turns with the object."""
-    # Towards the boresight and past it, in camera axes; the turn that follows it is about `axis`.
+    """Return the frames of a pass: the camera is fixed for `still` of them, and then follows the object."""
+    # Direction in camera axes in which the object crosses the boresight; the rotation that follows it is
+    # about `axis`.
     towards = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.cos(towards), np.sin(towards), 0.0])
     first = attitude_matrix(from_rotation_vector(axis * math.radians(2.0)))[2]
@@ -133,9 +134,10 @@ def _frames(flown: Pass, still: int, rng: np.random.Generator) -> list[_Frame]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frame:
-    """One frame: the camera at `quaternion` turns by `turn` (3,) rad/s.
+    """One frame of a camera with the attitude `quaternion` and the rate `turn` (3,), rad/s.
 
-    At mid-exposure the object is at `place` (3,), ICRS, with a `motion` (3,) rad/s, the `observer` (3,) m.
+    At mid-exposure the object is in the direction `place` (3,), ICRS, and moves by `motion` (3,), rad/s.
+    `observer` is (3,), m.
     """
 
     time: float
@@ -146,7 +148,7 @@ class _Frame:
     observer: FloatArray
 
     def sighted(self, magnitude: float | None, rng: np.random.Generator) -> MeasuredObjects | None:
-        """Return what the frame shows, by the flight's own vision."""
+        """Return the sightings and attitude that the flight's own vision finds in the frame."""
         times = np.linspace(-0.5 * EXPOSURE, 0.5 * EXPOSURE, 9)
         attitudes = np.array([multiply(from_rotation_vector(self.turn * t), self.quaternion) for t in times])
         places = self.place + times[:, None] * self.motion
@@ -174,7 +176,7 @@ class _Frame:
         return look(job).objects
 
     def judged(self, sighted: MeasuredObjects | None, magnitude: float | None) -> Result:
-        """Return the sighting's error and claim, px of an axis, the bound, and how many others there are."""
+        """Return error, claim and bound of the sighting (px per axis), and the number of false sightings."""
         if sighted is None:
             return {"solved": False, "others": 0}
         if magnitude is None:
@@ -196,7 +198,7 @@ class _Frame:
         }
 
     def _bound(self, place: FloatArray, magnitude: float) -> float:
-        """Return the bound on the object's place, px of an axis, in the middle of the exposure."""
+        """Return the bound on the object's position (px per axis) at mid-exposure."""
         own = attitude_matrix(self.quaternion) @ np.cross(self.place, self.motion)
         light = float(CAMERA.electrons([magnitude], EXPOSURE)[0])
         floor = CAMERA.read_noise**2 + CAMERA.dark_current * EXPOSURE + CAMERA.gain**2 / 12.0
@@ -207,12 +209,12 @@ class _Frame:
 
 
 def _is_own(line: LineOfSightState, frame: _Frame) -> bool:
-    """Return whether a track is the object's."""
+    """Return whether a track belongs to the object."""
     return bool(np.linalg.norm(line.direction - frame.place) < OWN_TRACK)
 
 
 def _nees(line: LineOfSightState, frame: _Frame) -> list[float]:
-    """Return the squared errors of direction and rate over their covariance, two degrees of freedom each."""
+    """Return the NEES of direction and of rate, each with two degrees of freedom."""
     basis = tangent_basis(line.direction)
     found = []
     for error, part in (
@@ -225,7 +227,7 @@ def _nees(line: LineOfSightState, frame: _Frame) -> list[float]:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return a row for each length and magnitude."""
+    """Return a row for each duration and magnitude."""
     rows = []
     for length in ("short", "long"):
         for magnitude in MAGNITUDES:
@@ -242,7 +244,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _row(own: Sequence[Result]) -> Result:
-    """Return the figures of passes of one length and magnitude."""
+    """Return the figures of passes of one duration and magnitude."""
     seen = [frame for result in own for frame in result["frames"] if "error" in frame]
     found = [result["nees"] for result in own if result["nees"] is not None]
     made = [nees for track in found for nees in track]

@@ -1,9 +1,8 @@
-"""Campaign `orbit-attitude`: attitude, sigma and NEES of the flight filter over one orbit with eclipse.
+"""Campaign `orbit-attitude`: attitude, sigma and NEES of a direction filter over one orbit with eclipse.
 
-Each run is one revolution from sunrise to sunrise (`orbit_world`) through
-`direction_filter`; its last 36 minutes are dark. Variants lose a sensor for good after ten
-minutes, or all cameras; one has worse gyros.
-NEES is of attitude and gyro bias, six errors, over independent runs; 1 is honest.
+Each run is one revolution from sunrise to sunrise (`orbit_world`) through `direction_filter`; its last 36
+minutes are dark. Some variants lose a sensor, or all cameras, permanently after ten minutes; one has worse
+gyros. The NEES is that of attitude and gyro bias divided by six, over independent runs; 1 is expected.
 """
 
 from __future__ import annotations
@@ -29,18 +28,19 @@ from tests.support.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, 
 from tests.support.sensor_suite import SensorSuite
 
 SETTLED = 300.0
-"""s after which the sunlit figures count."""
+"""Time (s) after which the sunlit figures count."""
 WHENS = {"both": "Sun and nadir in view", "sunlit": "all sunlight", "eclipse": "end of eclipse"}
 
 
 def variant_facts(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the figures of one variant's runs."""
+    """Return the figures of the runs of one variant."""
     parts = [_parts(np.array(result["notes"])) for result in results]
     low, high = band(len(results) * 6)
-    # Instants that all runs have, counted from the end: eclipses end together.
+    # Instants that all runs have, counted from the end, because all eclipses end at the end of the run.
     shortest = min(len(result["notes"]) for result in results)
     nees = np.array([np.array(result["notes"])[-shortest:, 8] for result in results])
-    # Only instants at which every run has an attitude: the band is for their number.
+    # Only instants at which every run has an attitude count, because the confidence band is for this number
+    # of runs.
     whole = np.all(np.isfinite(nees), axis=0)
     whole[: round(SETTLED / 10.0)] = False
     settled = np.mean(nees[:, whole], axis=0) / 6.0
@@ -62,9 +62,9 @@ def variant_facts(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _parts(notes: FloatArray) -> dict[str, float]:
-    """Return rms errors of an axis, deg, what was said of them, and NEES.
+    """Return rms errors of an axis (deg), claimed errors, and NEES.
 
-    "both" with Sun and nadir in use, "sunlit" with or without, "eclipse" in its last minute.
+    "both" has Sun and nadir in use, "sunlit" has sunlight, "eclipse" is the last minute of the eclipse.
     """
     seconds, sunlit = notes[:, 0], notes[:, 1] > 0.5
     error, sigma, nees = notes[:, 2:5], notes[:, 5:8], notes[:, 8] / 6.0
@@ -80,7 +80,7 @@ def _parts(notes: FloatArray) -> dict[str, float]:
 
 
 def _figures(parts: Sequence[dict[str, float]], name: str) -> dict[str, float | None]:
-    """Return over the runs: rms, the worst run's, the median of what was said, and the mean NEES."""
+    """Return the rms over the runs, that of the worst run, the median claim, and the mean NEES."""
     rms = np.array([part[name] for part in parts])
     known = rms[np.isfinite(rms)]
     if not known.size:
@@ -94,13 +94,13 @@ def _figures(parts: Sequence[dict[str, float]], name: str) -> dict[str, float | 
 
 
 def _rms(values: FloatArray) -> float:
-    """Return the root mean square of an axis, of rows (n, 3)."""
+    """Return the root mean square per axis of rows (n, 3)."""
     return float(np.sqrt(np.nanmean(values**2))) if np.any(np.isfinite(values)) else float("nan")
 
 
 SUITE = "uw"
 LOST_AT = 600.0
-"""s, when a variant loses its sensor."""
+"""Time (s) at which a variant loses its sensor."""
 VARIANTS: dict[str, frozenset[str]] = {
     "all sensors": frozenset(),
     "no magnetometer": frozenset({"field"}),
@@ -111,14 +111,16 @@ VARIANTS: dict[str, frozenset[str]] = {
     "restless gyros": frozenset(),
 }
 RESTLESS = {"bias_walk": 3.5e-6}
-"""rad/s per sqrt(s): 0.002 deg/s in 100 s, were the short-term stability of the QRS-11's class a walk."""
+"""Random walk of the gyro bias (rad/s per sqrt(s)): 0.002 deg/s in 100 s, the short-term stability of the
+QRS-11's class interpreted as a random walk.
+"""
 SECOND = 1_000_000_000
 NOTED = round(10.0 / STEP)
-"""Steps between notes."""
+"""Number of steps between two recorded samples."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` orbits of each variant, the same worlds for each."""
+    """Return `runs` orbits of each variant, in the same worlds."""
     return [
         Case(
             f"{variant}/{run}",
@@ -131,7 +133,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def settings_of(suite: SensorSuite) -> DeterminationSettings:
-    """Return the filter's settings: the suite's noise, and how the body is pushed."""
+    """Return the filter's settings: the noise of the suite, and the disturbance torques of the body."""
     assert suite.gyros is not None
     assert suite.magnetometer is not None
     return DeterminationSettings(
@@ -170,7 +172,7 @@ def _suite(case: Case) -> SensorSuite:
 
 
 class _Flight:
-    """One orbit through the filter, with notes every ten seconds."""
+    """One orbit through the filter, with a recorded sample every ten seconds."""
 
     def __init__(self, suite: SensorSuite, truth: World, said: Readings, case: Case) -> None:
         self._truth, self._said, self._case = truth, said, case
@@ -189,12 +191,12 @@ class _Flight:
         self._nis: dict[str, list[float]] = {}
 
     def step(self, k: int) -> None:
-        """Give the filter what there is at instant k."""
+        """Give the filter the measurements of instant k."""
         truth, said = self._truth, self._said
         seconds = float(truth.pass_.times[k] - truth.pass_.times[0])
         now_ns = round(seconds * SECOND)
         lost = self._lost if seconds >= self._lost_at else frozenset()
-        # A gyro's sample is the mean of its period: the rate in its middle.
+        # A gyro sample is the mean rate over its period, which is the rate at mid-period.
         if "gyro" not in lost:
             self._filter.rate(now_ns - round(0.5 * STEP * SECOND), said.gyro[k])
             self._count("gyro", 3)
@@ -238,7 +240,7 @@ class _Flight:
         )
 
     def result(self) -> Result:
-        """Return the notes: time, sunlit, errors (3) and sigmas (3) in deg, NEES, Sun and nadir in use."""
+        """Return the samples: time, sunlit, errors (3) and sigmas (3) in deg, NEES, Sun and nadir in use."""
         notes = np.array(self._notes)
         return {
             **self._case.parameters,
@@ -251,7 +253,7 @@ class _Flight:
 
 
 def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tuple[FloatArray, float]:
-    """Return the attitude's error (3,) rad about the body's axes, and error^T P^-1 error of both."""
+    """Return the attitude error (3,), rad, body axes, and error^T P^-1 error of attitude and bias."""
     turn = rotation_vector(multiply(attitude, conjugate(estimate.quaternion)))
     error = np.concatenate([turn, bias - estimate.bias])
     pick = np.r_[ATTITUDE, BIAS]
@@ -262,7 +264,7 @@ def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tup
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return accuracy and NEES of each variant, and the picture of one orbit."""
+    """Return accuracy and NEES of each variant, and the plot of one orbit."""
     facts: dict[str, Any] = {}
     for variant in VARIANTS:
         mine = [result for result in results if result["variant"] == variant]

@@ -1,7 +1,7 @@
-"""The flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 100 s in each of its modes.
+"""Flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 100 s in each of its modes.
 
-The world has no release of 10 deg/s to be braked first: each flight begins near its mode. Cameras, receiver
-and planner are asked more often than in a real flight, so that a fault of a few seconds meets them.
+No flight begins with a release at 10 deg/s: each begins near its mode. Cameras, receiver and planner run more
+often than in a real flight, so that a fault of a few seconds affects them.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tests.support.flights import CONFIG
 
 MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
 DURATION = 100.0
-"""s, of each flight."""
+"""Duration (s) of each flight."""
 SPEEDS = {"detumble": 0.15, "acquire": 0.004, "safe": 0.08}
-"""rad/s at the release, 0.001 in the other modes; SAFE brakes a spin."""
+"""Rates (rad/s) at the release; 0.001 in the other modes. SAFE detumbles first."""
 SLEWED = math.radians(60.0)
 FRAME_PERIOD = 2.5
 WIDE_OFTEN = {"period": 2.0, "fine_period": 2.0, "max_age": 4.5}
 OLD_DAYS, OLD_OFF = 7.0, 4.0
-"""Days of the old element set, and s by which it is off along the orbit: 30 km [assumed, of a week]."""
+"""Age (days) of the old element set, and its along-track error (s): 30 km [assumed for a week]."""
 ORBIT = CONFIG.parent / "orbit.yaml"
 TEXT = ORBIT.read_text(encoding="utf-8")
 _JULIAN = 2_440_587.5
@@ -42,7 +42,7 @@ _JULIAN = 2_440_587.5
 def config_for(mode: str, elements: str = "", replans: bool = False, wide_often: bool = False) -> OrbitConfig:
     """Return the configuration of a run; `elements` is "old", "none", or empty for the elements of the orbit.
 
-    If `wide_often`, each wide camera takes an image every 2 s, even if none is needed.
+    If `wide_often`, each horizon camera takes an image every 2 s, even if none is needed.
     """
     config = _orbit()
     assert config.camera is not None
@@ -73,7 +73,7 @@ def config_for(mode: str, elements: str = "", replans: bool = False, wide_often:
 
 
 def world_for(mode: str, seed: int, faults: tuple[FaultEntry, ...]) -> Simulation:
-    """Return the world of a flight: the attitude of its release is the one that the mode wants."""
+    """Return the world of a flight, with the attitude at release that the mode requires."""
     section = _world()
     assert section.free_body is not None
     speed = SPEEDS.get(mode, 0.001)
@@ -83,7 +83,7 @@ def world_for(mode: str, seed: int, faults: tuple[FaultEntry, ...]) -> Simulatio
 
 
 def _targets(mode: str) -> tuple[TargetStep, ...]:
-    """Return one inertial target: the attitude of the release, or one that must be slewed to."""
+    """Return one inertial target: the attitude at release, or an attitude that requires a slew."""
     x, y, z, w = release_attitude()
     if mode == "slew":
         turn = quaternion.from_rotation_vector(np.array([0.0, SLEWED, 0.0]))
@@ -93,7 +93,7 @@ def _targets(mode: str) -> tuple[TargetStep, ...]:
 
 @cache
 def release_attitude() -> tuple[float, float, float, float]:
-    """Return the attitude with +z to the Sun and the star camera, -y, as far from the Earth as may be."""
+    """Return the attitude with +z to the Sun and the star camera (-y) as far from the Earth as possible."""
     around = _at_release()
     sun, up = np.array(around.sun), np.array(around.position)
     camera = up - sun * float(sun @ up)
@@ -104,7 +104,7 @@ def release_attitude() -> tuple[float, float, float, float]:
 
 @cache
 def old_elements() -> tuple[str, str]:
-    """Return the configured elements as a set of a week before, `OLD_OFF` s off along the orbit by now."""
+    """Return the configured elements as a set that is a week old and `OLD_OFF` s off along the orbit."""
     config = _orbit()
     assert config.elements is not None
     known = Satrec.twoline2rv(*config.elements)
@@ -126,7 +126,7 @@ def old_elements() -> tuple[str, str]:
         return first, second
 
     shift = 0.0
-    for _ in range(3):  # the anomaly that brings it there, whatever the secular rates leave
+    for _ in range(3):  # iterate for the anomaly that gives this position under the secular rates
         found = TwoLineElements(*lines(shift)).at(_begin())
         ahead = np.cross(found.position, found.velocity)
         ahead = np.cross(ahead / np.linalg.norm(ahead), found.position)

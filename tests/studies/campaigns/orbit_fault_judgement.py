@@ -1,4 +1,4 @@
-"""Judges a run of campaign `orbit-faults` by its log and its true states."""
+"""Evaluation of a run of campaign `orbit-faults` by its log and its true states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.studies.campaigns.orbit_fault_flights import DURATION
 
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
-"""s after the end of a fault: later events have another cause."""
+"""Time (s) after the end of a fault within which its event must come: later events have another cause."""
 BLIND_GRACE, FIELD_GRACE = 0.1, 5.0
 """Longest times (s) to zero current: after the last reading, and after the last valid field."""
 ZERO, DRIVEN = 1e-3, 6e-3
@@ -32,13 +32,15 @@ SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 DIPOLE_PER_AMPERE = 0.648
 """Dipole moment per current (m^2) of the coils of config/orbit.yaml."""
 LOOKED, FEW = 3.0, 3
-"""Time (s) after an upset in which its effect is searched for, and largest number of missing IMU samples."""
+"""Time (s) after an upset in which its effect is searched for, and largest number of missing IMU samples
+without effect.
+"""
 LAST = 12.0
 """Time (s) at the end of a flight in which the body must fulfil the purpose of its mode again."""
 SET_UP = 0.53
 """Time (s) until the PWM chip is set up. Losses before this time are not counted."""
 ACTS, RATE_OFF = 2e-3, 0.0175
-"""Current (A) of coils that steer with little torque, and error (rad/s) of the rate by the magnetometer."""
+"""Current (A) of coils that steer with little torque, and error (rad/s) of the rate from the magnetometer."""
 
 ORBIT_OWN: Mapping[str, frozenset[str]] = {
     **OWN,
@@ -50,15 +52,15 @@ ORBIT_OWN: Mapping[str, frozenset[str]] = {
     "clock": OWN["clock"] | {"clock-off"},
     "elements": frozenset({"gps-refused", "gps-lost"}),
 }
-"""Events that report a fault of a device in orbit, beside those of its stream."""
+"""Events that report a fault of a device in orbit, in addition to those of its stream."""
 _STREAMS = {"imu": ("imu", "field"), "magnetometer": ("field",), "gps": ("gps",), "camera": ("camera",)}
 _KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
 _AT_ZERO_COMMAND = ("bridge", "coil", "pwm", "bus")
-"""Faults with which a coil may carry current though none is commanded."""
+"""Faults with which a coil may carry current although none is commanded."""
 
 
 def judge(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> Result:
-    """Return the judgement of a fault from `at` to `end` s."""
+    """Return the evaluation of a fault from `at` to `end` s."""
     reported = [(float(e["time_ns"]) * 1e-9, to_text(e["name"]), to_text(e["text"])) for e in flown["event"]]
     warned = [
         (time, name, text)
@@ -83,7 +85,7 @@ def judge(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> Resu
 
 
 def is_own(kind: FaultKind, name: str, text: str) -> bool:
-    """Return whether an event reports a fault by its part's name."""
+    """Return whether an event reports a fault by the name of its part."""
     part = part_of(kind)
     if name == "stream-poor":
         return text.startswith(tuple(f"{stream}:" for stream in _STREAMS.get(part, ("none",))))
@@ -98,7 +100,8 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
     match part_of(kind):
         case "coil" | "bridge":
             found = kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
-        case part if kind.kind == "upset":  # not reported: exercised only if the unit misses samples
+        # an upset need not be reported; it counts as exercised only if the unit misses samples
+        case part if kind.kind == "upset":
             came = int(_within(flown, "imu", at, at + LOOKED).sum())
             found = part == "imu" and round(LOOKED / CYCLE) - came > FEW
         case "monitor" if kind.kind == "delayed":
@@ -110,7 +113,7 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
         case "camera":
             found = mode not in SPINS and end - at > 6.0
         case "planner" if kind.kind == "slow":
-            found = False  # 1.5 s of the 8 that a plan is given
+            found = False  # 1.5 s of the 8 s that a plan may take
         case "planner" | "vision":
             jobs = flown["job_timing"]
             when = seconds(jobs)
@@ -118,9 +121,9 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
             found = bool((mine & (when > at + 0.3) & (when < end)).any())
         case "strings" if kind.kind == "dead":
             found = _is_string_lit(flown, at, end)
-        case "strings" if kind.kind == "wrong":  # a fine attitude needs none
+        case "strings" if kind.kind == "wrong":  # a fine attitude does not use the solar cells
             found = mode == "safe" or not _is_fine(flown, at, end)
-        case "wide":  # pictures upside down may look as they must; an outage of 3 s costs a round
+        case "wide":  # upside-down pictures may look correct; an outage of 3 s costs one round of pictures
             found = kind.kind not in {"wrong", "intermittent"} and (
                 kind.kind not in {"garbage", "blinded"} or _is_fine(flown, at, end)
             )
@@ -130,20 +133,20 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
 
 
 ALWAYS = {"off", "nack", "slow", "intermittent", "garbage"}
-"""Faults of a part that it shows whatever is asked of it."""
+"""Faults that a part shows whatever its commands are."""
 SPINS = ("detumble", "safe")
-"""Modes in which the body turns too fast for the camera at first."""
+"""Modes in which the body rotates too fast for the camera at first."""
 
 
 def _is_fine(flown: Run, at: float, end: float) -> bool:
-    """Return whether the attitude was fine all the while."""
+    """Return whether the attitude was fine all the time."""
     packets = flown["navigation"]
     inside = _within(flown, "navigation", at, end)
     return bool(inside.any() and (packets["knowledge"][inside] >= FINE).all())
 
 
 def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -> BoolArray:
-    """Return when a broken axis was to be driven in the direction that its fault concerns."""
+    """Return when a broken axis was commanded in the direction that its fault affects."""
     axis = "xyz".index(kind.device[-1])
     signed = flown["attitude"]["dipole"][inside][:, axis]
     wanted = {"a-low": signed > 0.0, "b-low": signed < 0.0}.get(kind.kind, np.ones(len(signed), dtype=bool))
@@ -151,7 +154,7 @@ def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
-    """Return whether the commands, ten a second, differed from those of an old answer for a second."""
+    """Return whether the commands (10 Hz) differed from those of the stuck answer for at least a second."""
     asked = np.abs(flown["attitude"]["dipole"]).sum(axis=1) / DIPOLE_PER_AMPERE
     behind = round(10.0 * (kind.parameters["delay"].default or 0.0))
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
@@ -160,7 +163,7 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
 
 
 def _long(driven: BoolArray) -> bool:
-    """Return whether a command of the attitude packets, ten a second, lasted for 2.5 s in all."""
+    """Return whether the commands of the attitude packets (10 Hz) drove the coil for 2.5 s in total."""
     return bool(driven.sum() > 25)
 
 
@@ -170,7 +173,7 @@ def _within(flown: Run, packet: str, at: float, end: float) -> BoolArray:
 
 
 def _is_string_lit(flown: Run, at: float, end: float) -> bool:
-    """Return whether the first string, on +x, would see the Sun within 60 deg of its normal."""
+    """Return whether the Sun was within 60 deg of the normal of the first solar cell string, on +x."""
     around = flown["orbit_truth"]
     if not len(around):
         return False
@@ -180,10 +183,10 @@ def _is_string_lit(flown: Run, at: float, end: float) -> bool:
 
 
 def works(flown: Run, mode: str) -> bool:
-    """Return whether at the flight's end the body does what its mode is for.
+    """Return whether the body fulfils the purpose of its mode at the end of the flight.
 
-    It brakes, and where the spin packet tells knows its rate, or is slow; or it is fine and, where it points,
-    steers.
+    A detumbling body must brake, and know its rate if the spin packet has one, or be slow. In other modes the
+    attitude must be fine, and the body must steer if the mode points.
     """
     truth, known = flown["truth"], flown["navigation"]["knowledge"]
     last = seconds(truth) > DURATION - LAST
@@ -201,7 +204,7 @@ def works(flown: Run, mode: str) -> bool:
 
 
 def _rate_off(flown: Run) -> float:
-    """Return by how much, rad/s, the rate by the magnetometer was off in the last seconds, in the median."""
+    """Return the median error (rad/s) of the rate from the magnetometer in the last seconds."""
     spin, truth = flown["spin"], flown["truth"]
     spin = spin[(seconds(spin) > DURATION - LAST) & (spin["known"] == 1)]
     if not len(spin):
@@ -211,7 +214,7 @@ def _rate_off(flown: Run) -> float:
 
 
 def blind_current(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> float:
-    """Return the largest current A of a coil that was driven blind, sensor by sensor."""
+    """Return the largest current (A) of a coil that was driven without valid data, sensor by sensor."""
     if part_of(kind) in _AT_ZERO_COMMAND:
         return 0.0
     truth = flown["truth"]
@@ -239,7 +242,7 @@ def _points(flown: Run, times: np.ndarray) -> BoolArray:
 
 
 def beyond(flown: Run) -> float:
-    """Return for how long, s, the coils were driven by an attitude that was false."""
+    """Return for how long (s) the coils were driven by a wrong attitude."""
     errors = attitude_errors(flown)
     if not len(errors.times):
         return 0.0

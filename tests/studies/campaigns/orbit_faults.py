@@ -1,13 +1,13 @@
 """Campaign `orbit-faults`: every fault of an orbit's devices in every mode of the satellite, in lock-step.
 
-Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and breaks one
-thing at a random time for a random span (coils and bridges to the end), at the wire. Beside the catalogue
-there are conditions: an element set a week old, none at all, a wall clock wrong from the start on. Judged
-are: whether an event of its own told of the fault; whether at the end the body does again what its mode is
-for; the current of coils that were driven blind, sensor by sensor (readings, field, attitude); and for how
-long they were driven by an attitude that was further off than five of its claimed deviations and 0.1 deg. A
-fault of an unused part (a coil that is not driven, a camera that rests) is not exercised. `refly(seed,
-number)` flies one flight again.
+Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and injects one
+fault at the wire, at a random time and for a random duration; faults of coils and bridges last to the end.
+There are also initial conditions: an element set that is a week old, no element set, and a wall clock that is
+wrong from the start. The campaign checks whether a specific event reported the fault, whether the body
+fulfils the purpose of its mode at the end, and the current of coils that were driven without valid data,
+sensor by sensor (readings, field, attitude). It also checks for how long the coils were driven by an attitude
+whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an unused part (a coil that
+is not driven, a camera that is idle) counts as not exercised. `refly(seed, number)` repeats one flight.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from tests.support.flights import fly
 LASTING = ("coil", "bridge")
 ZERO = 1e-3
 BEYOND = 1.0
-"""s, for which an attitude may be beyond its claim while coils act."""
+"""Time (s) for which the error of an attitude may exceed its claim while the coils act."""
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A flight that begins wrong: its element set, and faults from the start on."""
+    """A flight with wrong initial conditions: its element set, and faults from the start."""
 
     elements: str
     faults: tuple[str, ...]
@@ -52,14 +52,14 @@ CONDITIONS: Mapping[str, Condition] = {
 
 
 def faults() -> list[str]:
-    """Return the faults that make sense in orbit, and the conditions, by name."""
+    """Return the names of the faults that are meaningful in orbit, and of the conditions."""
     config = config_for("point")
     both = [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
     return [kind.name for kind in both if fitted(kind.device, config)] + list(CONDITIONS)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights: fault by fault, mode by mode, over and over."""
+    """Return `runs` flights, which cycle through all faults in all modes."""
     names = faults()
     found = []
     for number in range(runs):
@@ -80,14 +80,14 @@ def run(case: Case) -> Result:
 
 
 def refly(seed: int, number: int) -> Result:
-    """Fly one flight of the campaign of this seed again."""
+    """Repeat one flight of the campaign with this seed."""
     return run(cases(number + 1, seed)[number])
 
 
 def fly_with(
     kind: FaultKind, mode: str, entries: tuple[FaultEntry, ...], seed: int, elements: str = ""
 ) -> Result:
-    """Fly with faults of one begin and end, judged as of `kind`."""
+    """Fly with faults of one start and end, evaluated as faults of `kind`."""
     config = config_for(mode, elements, replans=kind.device == "planner", wide_often=kind.device == "wide")
     at = entries[0].at or 0.0 if entries else 0.0
     span = entries[0].span if entries else None
@@ -98,7 +98,10 @@ def fly_with(
 
 
 def _when(name: str, mode: str, rng: np.random.Generator) -> tuple[FaultKind, float, float | None]:
-    """Return the kind that judges, and begin and span, s: before the first plan, attitude, or after both."""
+    """Return the kind to evaluate, and start and duration (s) of the fault.
+
+    It starts before the first plan, before the first attitude, or after both.
+    """
     condition = CONDITIONS.get(name)
     if condition is not None:
         device, _, kind = name.partition(": ")
@@ -146,7 +149,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _named(result: Result) -> str:
-    """Return a flight with all that is needed to fly it again."""
+    """Return the parameters with which a flight can be repeated."""
     span = f"{result['at']:.2f} to {result['end']:.2f} s"
     figures = f"blind {1e3 * result['blind_current_a']:.0f} mA, beyond {result['beyond_s']:.1f} s"
     said = ", ".join(result["reported"]) or "nothing"

@@ -1,17 +1,19 @@
 """Campaign `orbit-frames`: rendered frames, edges, Sun, nadir and attitude filter over one orbit.
 
-The satellite and the sensors of the campaign `orbit-attitude` (`orbit_world`: one revolution that ends with
-an eclipse), but Sun and nadir come out of frames of all the suite's cameras, rendered by
-`sim_hal.earth_camera` with the Fuga 15d, air unknown. Each instant: the strings of six faces give a coarse
-Sun, which chooses the cameras to read for the Sun and stands in where none has it; nadir is one fit through
-all cameras (`nadir_of_cameras`), read in the order of the limb they should see; where no limb is in view, the
-light of all cameras gives a coarse nadir, and with the Sun a coarse attitude, told apart. Gyros at 2 Hz and
-the field at 1 Hz go to the filter throughout; frames, whose rendering takes most of a run, once a minute.
+Satellite and sensors are those of the campaign `orbit-attitude` (`orbit_world`: one revolution that ends with
+an eclipse). Sun and nadir are measured in frames of all cameras of the suite, which `sim_hal.earth_camera`
+renders with the Fuga 15d and an unknown atmosphere. At each instant the solar cells of six faces give a
+coarse Sun direction. It selects the cameras that are read for the Sun, and replaces their result if the Sun
+is in no camera. Nadir is one fit through all cameras (`nadir_of_cameras`), which are read in the order of the
+expected limb. If no limb is in view, the brightness of all cameras gives a coarse nadir, and with the Sun a
+coarse attitude; both are reported separately. Gyros at 2 Hz and the field at 1 Hz go to the filter all the
+time. Frames are taken once a minute, because rendering takes most of a run.
 
-Variants: `level` (UW, swaying about the local vertical), `any` (UW, turned by a random constant rotation),
-`vt` (three cameras, turned in the same way) and `2 Hz` (UW, level, frames at 2 Hz for a minute, 20 min before
-sunset). Time is processor time of one core for all that a flight would do at an instant; the budget of 2 Hz
-is 500 ms. NEES is of attitude and gyro bias over six errors; 1 is honest.
+The variants are `level` (UW, swaying about the local vertical), `any` (UW, in a random constant attitude
+relative to it), `vt` (three cameras, in the same attitudes) and `2 Hz` (UW, level, frames at 2 Hz for a
+minute, 20 min before sunset). Time is the processor time of one core for all that a flight computes at an
+instant; the budget at 2 Hz is 500 ms. The NEES is that of attitude and gyro bias divided by six; 1 is
+expected.
 """
 
 from __future__ import annotations
@@ -54,13 +56,17 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "2 Hz": {"suite": "uw", "turned": False, "period": 0.5, "seconds": 2000.0, "until": 60.0},
 }
 EARTHLIGHT = 30.0
-"""Counts of the Fuga 15d: a light of 0.025, a dark sea under a low Sun."""
+"""Counts of the Fuga 15d at an intensity of 0.025: a dark sea under a low Sun."""
 FINE = np.radians(2.0)
-"""rad of the worst axis: better ones choose the cameras for the limb, and need no strings."""
+"""Largest sigma (rad) of the worst axis with which the attitude selects the cameras for the limb and the
+solar cells are not used.
+"""
 LEAST_ROUGH = np.radians(0.2)
-"""rad: the least spread of the filter's attitude with which the horizon's finder is helped."""
+"""Smallest sigma (rad) of the filter's attitude that is given to the horizon search as prior."""
 ALIKE = 30.0
-"""s, over which nadir's errors stay alike (ground and clouds behind the limb): more looks weigh as one."""
+"""Correlation time (s) of nadir errors, which come from ground and clouds behind the limb: measurements
+within it count as one.
+"""
 SETTLED = 300.0
 _EARTH_TURN = 7.292e-5
 
@@ -86,20 +92,20 @@ def run(case: Case) -> Result:
 
 @dataclass(slots=True)
 class _Notes:
-    """What is noted at each instant with frames, and of each coarse nadir and attitude."""
+    """Record of each instant with frames, and of each coarse nadir and attitude."""
 
     instants: list[tuple[float, ...]]
     coarse: list[tuple[float, ...]]
 
 
 class _Flight:
-    """One orbit: the truth, what the sensors say, and the filter."""
+    """One orbit: the true states, the measurements, and the filter."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
         parameters, self._rng = case.parameters, np.random.default_rng(case.seed)
         suite = suite_of(parameters["suite"])
-        # All suites have the gyros and the magnetometer of the UW satellite here.
+        # All suites have the gyros and the magnetometer of the UW satellite in this campaign.
         sensors = suite_of("uw")
         truth = orbit_world.world(sensors, self._rng, parameters.get("seconds"))
         self.truth = _turned(truth, self._rng) if parameters["turned"] else truth
@@ -118,7 +124,7 @@ class _Flight:
         self._notes = _Notes([], [])
 
     def step(self, k: int) -> None:
-        """Give the filter what there is at instant k."""
+        """Give the filter the measurements of instant k."""
         seconds = float(self.truth.pass_.times[k] - self.truth.pass_.times[0])
         now_ns = round(seconds * SECOND)
         begun = time.process_time()
@@ -131,7 +137,7 @@ class _Flight:
             self._look(k, seconds, now_ns, spent)
 
     def _look(self, k: int, seconds: float, now_ns: int, spent: float) -> None:
-        """Use the frames of instant k, and note what came of it."""
+        """Process the frames of instant k, and record the results."""
         truth = self.truth
         frames, currents = self._frames(k), self._read_strings(k)
         begun = time.process_time()
@@ -175,7 +181,7 @@ class _Flight:
         )
 
     def _give_sun(self, now_ns: int, sun: SunOfCameras, reference: FloatArray, fine: bool) -> None:
-        """Give the filter a camera's Sun; the strings' only while it knows less than they."""
+        """Give the filter the Sun from a camera; that of the solar cells only while the filter knows less."""
         if sun.direction is None or sun.covariance is None:
             return
         if sun.camera is not None:
@@ -184,7 +190,7 @@ class _Flight:
             self._filter.direction("strings", now_ns, sun.direction, reference, sun.covariance)
 
     def _give_coarse(self, k: int, frames: dict[int, Image], sun: SunOfCameras) -> None:
-        """Note the coarse nadir of the light in all frames, and with the Sun the coarse attitude."""
+        """Record the coarse nadir from the brightness of all frames, and with the Sun the coarse attitude."""
         if sun.direction is None or sun.covariance is None:
             return
         looks = [
@@ -219,7 +225,7 @@ class _Flight:
         )
 
     def _knowledge(self, k: int, report: Report, coarse: CoarseSun) -> HorizonKnowledge:
-        """Return GPS and ephemerides, and the filter's attitude or the coarse sensors' directions."""
+        """Return GPS and ephemerides, and the filter's attitude or the directions of the coarse sensors."""
         truth = self.truth
         known = HorizonKnowledge(position=truth.pass_.positions[k], sun=truth.sun[k])
         if report.estimate is not None:
@@ -236,7 +242,7 @@ class _Flight:
 
     def _frames(self, k: int) -> dict[int, Image]:
         truth, position = self.truth, self.truth.pass_.positions[k]
-        # The Sun at its apparent place: the renderer knows no aberration.
+        # The Sun is at its apparent position, because the renderer has no aberration.
         sun = position + ASTRONOMICAL_UNIT * truth.sun[k]
         rotation = self._rotation + _EARTH_TURN * float(truth.pass_.times[k])
         return {
@@ -261,7 +267,7 @@ class _Flight:
         return self._currents.currents(truth.pass_.positions[k], sun, body, self._rng)
 
     def result(self) -> Result:
-        """Return the notes."""
+        """Return the record."""
         return {
             "variant": self.case.parameters["variant"],
             "instants": np.round(np.array(self._notes.instants), 6).tolist(),
@@ -272,7 +278,7 @@ class _Flight:
 
 
 def _turned(truth: World, rng: np.random.Generator) -> World:
-    """Return the world with its body turned by a constant rotation that is drawn."""
+    """Return the world with its body rotated by a random constant rotation."""
     turn = normalise(rng.standard_normal(4))
     return replace(
         truth, attitudes=multiply(turn, truth.attitudes), rates=truth.rates @ attitude_matrix(turn).T
@@ -280,7 +286,7 @@ def _turned(truth: World, rng: np.random.Generator) -> World:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return accuracy, honesty, availability and time of each variant."""
+    """Return accuracy, NEES, availability and time of each variant."""
     facts: dict[str, Any] = {}
     for variant in VARIANTS:
         mine = [result for result in results if result["variant"] == variant]

@@ -1,16 +1,25 @@
 """Campaign `orbit-pointing`: pointing by coils alone, the attitude estimated, all disturbances.
 
-A 3U and the KnightCube. Cells `hold` start at nadir along the flight with nothing learned and fly two
-revolutions and more; the first one teaches the filter the residual dipole and the torques and is not judged.
-Cells `day` are the same over a day, a quarter of the runs. Cells `heavy` are the same over half a day in the
-dense air of a solar maximum; of their star attitudes it is counted how many the filter rejected, and how
-many in a row. Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the
-described ones by up to the default accuracies. Cells `turn` start 30 to 180 deg off nadir, Sun
-or an inertial attitude, turning at 0.3 deg/s, and fly 100 min: `arrived` counts bodies whose pointing axis
-comes within ARRIVED deg and stays there for the rest, half a revolution at least; `lost` is farther than
-LOST deg off at the end. A turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
-so only the error of three axes has it. `share` multiplies the torques that the coils can not cancel at once:
-drag, sunlight, and the turn of the principal axes; the residual dipole is always whole.
+The craft are a 3U and the KnightCube.
+
+Cells `hold` start at nadir along the flight without learned quantities and last at least two revolutions. In
+the first revolution, which does not count, the filter learns the residual dipole and the torques.
+
+Cells `day` are the same over a day, with a quarter of the runs.
+
+Cells `heavy` are the same over half a day in the dense air of a solar maximum. They count how many star
+attitudes the filter rejected, and how many in a row.
+
+Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the described ones by
+up to the default accuracies.
+
+Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, at a rate of 0.3 deg/s, and last 100
+min. `arrived` counts bodies whose pointing axis comes within ARRIVED deg and stays there for the rest, at
+least half a revolution. `lost` counts bodies farther than LOST deg off at the end. The weight of the rotation
+about that axis is small (WEIGHTS of `orbit_pointing_flight`), so only the error of three axes includes it.
+
+`share` multiplies the torques that the coils cannot cancel immediately: drag, sunlight, and the rotation of
+the principal axes. The residual dipole always has its full size.
 """
 
 from __future__ import annotations
@@ -33,11 +42,14 @@ from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, Pointi
 
 REVOLUTION = 5_700.0
 LOST = 60.0
-"""deg: at the end of a turn, or ever of the pointing axis while holding."""
+"""Angle (deg) off the target at the end of a turn, or at any time of a hold, above which a body counts as
+lost.
+"""
 ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
-"""deg: the KnightCube is the lighter body; issue 19 allows it a larger error."""
+"""Largest angle (deg) of arrival: the KnightCube is the lighter body, and issue 19 permits it a larger error.
+"""
 SPIN = 0.3
-"""deg/s at the start of a turn."""
+"""Rate (deg/s) at the start of a turn."""
 HOLDS = (
     ("cubesat_3u", 0.1, 0.4),
     ("cubesat_3u", 0.3, 1.2),
@@ -45,22 +57,22 @@ HOLDS = (
     ("knightcube", 0.1, 2.0),
     ("knightcube", 0.3, 5.0),
 )
-"""Craft, share, and deg rms wanted of issue 19."""
+"""Craft, share, and required rms error (deg) of issue 19."""
 UNKNOWN = {"cubesat_3u": 1.2, "knightcube": 2.0}
-"""Wanted deg rms of the nadir axis of an unknown body, at a share of 0.3 (issue 34)."""
+"""Required rms error (deg) of the nadir axis of an unknown body, at a share of 0.3 (issue 34)."""
 DAYS = (("cubesat_3u", 1.0), ("knightcube", 0.3))
-"""Craft and share."""
+"""Craft and share of the cells `day`."""
 DAY = 86_400.0
 HEAVY = (("iss", 7e-12), ("low", 4e-11))
 """Orbit, and mean density of the air (kg/m^3) during half a day at a solar maximum."""
 HEAVY_SHARE = 0.3
-"""Share of flights in heavy air: the centre of pressure is 6 mm from the centre of mass."""
+"""Share of the flights in dense air: the centre of pressure is 6 mm from the centre of mass."""
 TURNS = tuple((craft, share) for share in (0.1, 1.0) for craft in ("cubesat_3u", "knightcube"))
-"""Craft and share."""
+"""Craft and share of the cells `turn`."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each cell, the same orbits and starts for each; targets by turns."""
+    """Return `runs` flights of each cell with the same orbits and starts; the targets alternate."""
     found = []
     for run in range(runs):
         turn = float(np.random.default_rng([seed, run, 0x7E]).uniform(30.0, 180.0))
@@ -104,7 +116,7 @@ def run(case: Case) -> Result:
 
 
 def unknown_body(craft: str, seed: int) -> DescriptionErrors:
-    """Return errors of the described inertia, and of the gain and axis of each coil, drawn by a seed."""
+    """Return random errors of the described inertia, and of the gain and axis of each coil."""
     generator, bounds = np.random.default_rng([seed, 0xC011]), BodyErrors()
     coils = np.eye(3) + bounds.coil_axes * generator.uniform(-1.0, 1.0, (3, 3))
     np.fill_diagonal(coils, 1.0 + bounds.coil_gain * generator.uniform(-1.0, 1.0, 3))
@@ -112,7 +124,7 @@ def unknown_body(craft: str, seed: int) -> DescriptionErrors:
 
 
 def _stars(passed: Sequence[bool]) -> Result:
-    """Return how many star attitudes came and were rejected, and the largest number rejected in a row."""
+    """Return the numbers of star attitudes and of rejected ones, and the largest number rejected in a row."""
     longest = row = 0
     for one in passed:
         row = 0 if one else row + 1
@@ -121,7 +133,7 @@ def _stars(passed: Sequence[bool]) -> Result:
 
 
 def _hold(notes: FloatArray, seconds: float) -> Result:
-    """Return rms errors after the first revolution, deg, and what they cost."""
+    """Return rms errors (deg) after the first revolution, and the power of the coils."""
     turns, off = np.degrees(notes[:, 1:4]), off_goal(notes[:, 1:4])
     facts: Result = {"lost": bool(off[-1] > LOST)}
     later = notes[:, 0] > min(REVOLUTION, 0.5 * seconds)
@@ -141,7 +153,7 @@ def _hold(notes: FloatArray, seconds: float) -> Result:
 
 
 def off_goal(turns: FloatArray) -> FloatArray:
-    """Return the angles (n,) deg of the pointing axis, body z, off its goal by the turns (n, 3) rad."""
+    """Return the angles (n,), deg, between body z and its target, from the rotations (n, 3), rad."""
     angle = np.linalg.norm(turns, axis=1)
     share = turns[:, 2] / np.maximum(angle, 1e-12)
     cosine = np.cos(angle) + (1.0 - np.cos(angle)) * share**2
@@ -149,7 +161,7 @@ def off_goal(turns: FloatArray) -> FloatArray:
 
 
 def _arrival(wanted: dict[str, Any], notes: FloatArray) -> Result:
-    """Return when the axis arrived to stay, s, None where it did not, and its error at the end, deg."""
+    """Return the time (s) from which the axis stays at the target, or None, and its last error (deg)."""
     off = off_goal(notes[:, 1:4])
     near = ARRIVED[wanted["craft"]]
     beyond = np.nonzero(off > near)[0]
@@ -194,7 +206,7 @@ def _of(results: Sequence[Result], *cell: Any) -> list[Result]:
 
 
 def _held(mine: Sequence[Result], judged: Sequence[Result], watts: float) -> dict[str, Any]:
-    """Return deg rms of three axes and of nadir, the largest, deg known, and A m^2 not known in sunlight."""
+    """Return the errors (deg) of pointing and attitude, and of the dipole (A m^2) in sunlight."""
     rms = [r["rms"] for r in judged]
     return {
         "runs": len(mine),
@@ -213,7 +225,7 @@ def _held(mine: Sequence[Result], judged: Sequence[Result], watts: float) -> dic
 
 
 def _in_heavy_air(mine: Sequence[Result]) -> dict[str, Any]:
-    """Return flights and losses, rejected star attitudes, deg known and NEES, and deg rms of nadir."""
+    """Return counts of flights, losses and rejected star attitudes, and errors (deg) and NEES."""
     judged = [r for r in mine if "rms" in r]
     return {
         "runs": len(mine),
@@ -229,7 +241,7 @@ def _in_heavy_air(mine: Sequence[Result]) -> dict[str, Any]:
 
 
 def _turned(mine: Sequence[Result], watts: float) -> dict[str, Any]:
-    """Return s until the axis arrived and stayed, and deg rms of the last half hour."""
+    """Return the times (s) until the axis arrived to stay, and the rms error (deg) of the last half hour."""
     times = [r["arrived"] for r in mine if r["arrived"] is not None]
     return {
         "runs": len(mine),

@@ -1,9 +1,10 @@
 """One run of campaign `orbit-pointing`: a craft with its filter, planning job and control law.
 
-The tables are those of the planner worker (`pointing_job`): a slew from far off, as in the loop, then the
-pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been
-held still (`knightcube.gnc.control.pointing_law`). The coils
-pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
+The planner worker's job (`pointing_job`) makes the tables. A far target begins with a slew, as in the loop.
+Then the tables of the pointing law follow. They are renewed every REPLAN s, when the body leaves its path,
+and after the body was lost and has been held still (`knightcube.gnc.control.pointing_law`). The coils pause
+for a tenth of every two seconds for the magnetometer. Star attitudes come every 10 s with a delay of two
+seconds.
 """
 
 from __future__ import annotations
@@ -56,39 +57,42 @@ from tests.studies.campaigns.free_flight import (
 from tests.support.pointing_settings import AXES, WEIGHTS
 
 CYCLE, PAUSE = 2.0, 0.2
-"""s."""
+"""Durations (s) of a cycle and of the pause of the coils."""
 SAMPLES = 4
-"""Of the magnetometer in a pause of the coils."""
+"""Number of magnetometer samples in a pause of the coils."""
 COIL_ERROR = FreeFilterSettings().coil_error
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
-"""s."""
+"""Times (s): between star attitudes, between plans, before a plan is repeated, and of the prediction."""
 COAST = 12.0
-"""s with the coils at rest, while the attitude is made sure of."""
+"""Time (s) with the coils off while the attitude estimate settles."""
 STAR_SIGMA = 5e-5
-"""rad an axis, 10"."""
+"""Standard deviation (rad) of a star attitude per axis: 10 arcsec."""
 TARGETS = {
     "nadir": PointingTarget(Goal.NADIR, roll=0.0),
     "sun": PointingTarget(Goal.SUN),
     "inertial": PointingTarget(Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0)),
 }
 SLEW = {"knightcube": 300.0, "cubesat_3u": 900.0}
-"""s of a slew, as the configurations have it."""
+"""Duration (s) of a slew, as in the configurations."""
 CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
-"""Body axis of the star camera; no cone is kept here."""
+"""Body axis of the star camera, which has no exclusion cone in this campaign."""
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
-"""N m and N m per sqrt(s), as the configurations have them: what the filter expects of each shape."""
+"""Expected torque (N m) and its random walk (N m per sqrt(s)) in the filter, as in the configurations."""
 
 
 class PointingFlight:
     """One craft with its filter and law.
 
-    `notes`: every 10 s the time, the true turn (3,) rad against the law, what is known wrong of the attitude,
-    rad, NEES of attitude and gyro bias, A m^2 that are not known of the residual dipole, the sunlight, and
-    the coils' power, A^2 m^4. `passed`: whether each star attitude passed the gate of the filter.
+    `notes` has a row every 10 s: time, true rotation (3,), rad, from the target of the law, attitude error
+    (rad), NEES of attitude and gyro bias, error of the residual dipole (A m^2), sunlight, and power of the
+    coils (A^2 m^4). `passed`: whether each star attitude passed the gate of the filter.
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
-        """`wanted`: craft, share of the worst disturbances, target, and the first turn, deg, if any.
+        """Create the flight.
+
+        Keys of `wanted`: craft, share of the worst disturbances, target, and the initial rotation (deg), if
+        any.
 
         A `description` (DescriptionErrors) makes the body differ from its description, and `residual`
         multiplies the worst residual dipole of 1e-3 A m^2.
@@ -123,7 +127,7 @@ class PointingFlight:
         self._turn: FloatArray = np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
-        """Return the release: at the law's attitude and rate, or turned and turning at random."""
+        """Return the release: at the law's attitude and rate, or at a random attitude and rate."""
         way = law_of(self._target, AXES, held.motion.quaternion, held.ephemeris(60.0), 2.0)
         start = references(way, held.ephemeris(60.0), np.array([2.0]))
         quaternion, rate = start.quaternion[0], start.rate[0]
@@ -139,7 +143,7 @@ class PointingFlight:
         return TipOff(rate=(wx, wy, wz), attitude=(qx, qy, qz, qw))
 
     def cycle(self, time: float) -> None:
-        """Fly one cycle."""
+        """Simulate one cycle."""
         flight, found = self.flight, self._filter
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
@@ -158,7 +162,8 @@ class PointingFlight:
         acting = flight.motion.rate
         flight.advance(round((time + CYCLE) * SECOND))
         found.advance(CYCLE - PAUSE, dipole, around)
-        # The gyro gives the mean over the cycle. The filter adds its own curvature since `begin_mean`.
+        # The gyro gives the mean over the cycle. The filter adds its own estimate of the curvature since
+        # `begin_mean`.
         mean = _mean(before, acting, flight.motion.rate)
         change = 0.5 * CYCLE * found.acceleration
         spread = COIL_ERROR**2 * float(change @ change) + GYRO_NOISE**2 / CYCLE
@@ -166,7 +171,7 @@ class PointingFlight:
         self._see_stars(time + CYCLE)
 
     def _is_due(self, time: float) -> bool:
-        """Return whether a plan is due: not in a slew, unless the body left it and was held still."""
+        """Return whether a plan is due; during a slew only if the body left it and was held still."""
         since = time - self._begun
         if self._law is None or (self._astray.ready and since >= AGAIN):
             return True
@@ -180,7 +185,7 @@ class PointingFlight:
         )
 
     def _command(self, time: float, around: FilterEnvironment) -> FloatArray:
-        """Return the dipole (3,) A m^2 until the end of the cycle."""
+        """Return the dipole (3,), A m^2, until the end of the cycle."""
         found, flight = self._filter, self.flight
         if time < COAST:
             return np.zeros(3)
@@ -200,7 +205,7 @@ class PointingFlight:
         return np.asarray(dipole)
 
     def _law_at(self, time: float, quaternion: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return attitude and rate of the target at a time; of a free roll, that of the attitude."""
+        """Return attitude and rate of the target at a time; a free roll is that of the attitude."""
         if self._law is not None:
             wanted = self._law.wanted(time - self._begun)
             return wanted.quaternion, wanted.rate
@@ -209,7 +214,7 @@ class PointingFlight:
         return found.quaternion[0], found.rate[0]
 
     def _note(self, time: float, square: float) -> None:
-        """Note the true error against the law, and the filter's own errors."""
+        """Record the true error from the target of the law, and the errors of the filter."""
         flight, found = self.flight, self._filter
         wanted = self._law_at(time, flight.motion.quaternion)[0]
         turn = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(wanted)))
@@ -230,12 +235,15 @@ class PointingFlight:
         self._arrives = time if table.slew is None else time + pointing_job.LEAD + table.slew.horizon
 
     def _wish(self, time: float) -> SlewRequest:
-        """Return how a slew is wanted at a time."""
+        """Return the request for a slew at a time."""
         craft, lit = self._wanted["craft"], self._around(time).sunlit
         return SlewRequest(SLEW[craft], np.full(3, WATTS[craft]), self._filter.residual_dipole(lit), CAMERA)
 
     def _fly(self, table: PointingTable, time: float) -> None:
-        """Fly a table from now on if it is finite, as the flight does. Raises LookupError without any."""
+        """Use a table from now on if it is finite, as the flight does.
+
+        Raises LookupError without any table.
+        """
         if not np.isfinite(table.dipole).all():
             if self._law is None:
                 raise LookupError("the path to the target is not finite")
@@ -245,7 +253,7 @@ class PointingFlight:
         self._astray.planned()
 
     def _job(self) -> PointingJob:
-        """Return the planner's job now."""
+        """Return the job for the planner at this time."""
         flight, found = self.flight, self._filter
         truth, draw = flight.body.orbit_truth(), flight.generator.standard_normal
         place, velocity = truth.position + FIX_SIGMA * draw(3), truth.velocity + 0.05 * draw(3)
@@ -270,11 +278,11 @@ class PointingFlight:
         return FilterEnvironment(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
 
     def _field_at(self, time: float) -> FloatArray:
-        """Return the model's field (3,) T of a time, ICRS."""
+        """Return the model's field (3,), T, ICRS, at a time."""
         return np.asarray(self._ahead.field_at(np.array([time - self._ahead_begun]))[0])
 
     def _see_stars(self, time: float) -> None:
-        """Give the filter the attitude that was exposed a cycle ago; expose the next."""
+        """Give the filter the attitude that was exposed a cycle ago; expose the next one."""
         if self._stars is not None and time % STARS_EVERY < CYCLE:
             self.passed.append(self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE))
         self._stars = self.flight.attitude(STAR_SIGMA)
@@ -294,6 +302,6 @@ def density_ratio(orbit: str, density: float | None) -> float:
 
 
 def _mean(before: FloatArray, acting: FloatArray, after: FloatArray) -> FloatArray:
-    """Return the mean rate (3,) of a cycle from those at begin, end of the pause, and end."""
+    """Return the mean rate (3,) of a cycle from the rates at its start, the end of the pause, and its end."""
     pause = 0.5 * PAUSE / CYCLE
     return np.asarray(pause * (before + acting) + (0.5 - pause) * (acting + after))

@@ -1,17 +1,17 @@
 """Campaign `orbit-slews`: slews in three axes by coils alone, the attitude estimated, all disturbances.
 
 A 3U rotates by 30 to 180 deg in 600 to 1,200 s, the KnightCube in 300 s, among the stars. `share` multiplies
-the worst cases of drag, sunlight and the rotation of the principal axes; all other disturbances are whole.
-The optimum is that of the true body for the same duration.
+the worst cases of drag, sunlight and the rotation of the principal axes; all other disturbances have their
+full size. The optimum is that of the true body for the same duration.
 
 A described body is held for 1,200 s before its slew. An unknown body has moments of inertia up to 5 % and
 principal axes up to 3 deg off, and a residual dipole of 4e-3 A m^2. It flies two slews, each after 60 s: the
 `first`, and a second one with what has been learned by then (`learned`).
 
-The flight is that of `orbit_pointing_flight`. The body is held among the stars by the pointing law, and the
-filter learns torques, residual dipole and inertia; then the body is slewed from where it is by the table of
-the planner worker (`pointing_job`). As in flight, the rest of the slew is planned again every EVERY cycles
-from the newest estimate, and a new path is followed from its begin on.
+The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
+the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
+worker (`pointing_job`). As in flight, the rest of the slew is planned again every EVERY cycles from the
+newest estimate, and each new path is followed from its start.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ SHARES = (0.1, 0.3, 1.0)
 UNKNOWN_SHARE = 0.3
 """Multiple of the worst drag and sunlight of an unknown body, that of the shipped configurations."""
 WANTED = {"knightcube": 2.0, "cubesat_3u": 0.5}
-"""Largest angle (deg) off the target at the end, of issues 16 and 34."""
+"""Largest angle (deg) off the target at the end (issues 16 and 34)."""
 HEAT = 1.3
-"""Largest heat of the median slew over the optimum of the true body, of issue 34."""
+"""Largest ratio of the median heat to that of the true body's optimum (issue 34)."""
 LEARN, FIRST = 1_200.0, 60.0
 """Time (s) for which a described body is held before its slew, and an unknown body before its first slew."""
 HORIZON = {"knightcube": (300.0, 300.0), "cubesat_3u": (600.0, 1200.0)}
@@ -68,14 +68,14 @@ EVERY = 3
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """A slew as flown.
+    """Figures of a flown slew.
 
     Attributes:
         angle, horizon: angle (deg) and duration (s) of the slew.
         off: angle (deg) off the target at the end.
-        heat, optimum: heat of the flown slew and of the optimum of the true body, J.
+        heat, optimum: heat (J) of the flown slew and of the optimum of the true body.
         worst: largest angle (deg) between body and path.
-        plans: number of plans for the rest that were flown.
+        plans: number of flown plans for the rest of the slew.
     """
 
     angle: float
@@ -103,7 +103,10 @@ class SlewFlight(PointingFlight):
     """A flight with slews, whose durations and ends are drawn."""
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
-        """`wanted`: craft, orbit, share of the worst disturbances, how long it is held, and if unknown."""
+        """Create the flight.
+
+        Keys of `wanted`: craft, orbit, share of the worst disturbances, hold time, whether unknown.
+        """
         self._rng = np.random.default_rng([seed, 16])
         start = normalise(self._rng.normal(size=4))
         self._draw(start, wanted["craft"])
@@ -136,7 +139,7 @@ class SlewFlight(PointingFlight):
         return found
 
     def _slew(self, first: int) -> tuple[Flown, int]:
-        """Slew from cycle `first` on; return the slew and the cycle after it."""
+        """Slew from cycle `first` on; return the figures and the number of the cycle after the slew."""
         start, square, watts = first * CYCLE, self.flight.square, WATTS[self._wanted["craft"]]
         self._target = _inertial(self._end)
         path = self._begin(start)
@@ -237,7 +240,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the error at the end (deg), the share within that wanted, and the heat over the optimum."""
+    """Return the error (deg) at the end, the fraction within the limit, and the heat over the optimum."""
     slews: dict[str, Any] = {}
     for craft in HORIZON:
         for name in (*map(str, SHARES), "first", "learned"):

@@ -1,10 +1,10 @@
-"""Campaign `planner-edge`: slews between the ends of the range of q2, where the coil hardly turns the body.
+"""Campaign `planner-edge`: slews near the ends of the range of q2, where the coil hardly rotates the body.
 
-Start and target lie at |q2| of 0.60 to 0.68; a known thread of 0 to 2e-5 N m/rad pulls up to ten times harder
-than the coil can; the horizon is 5 to 60 s. Each slew is planned, and solved by the tests' own collocation
-(`tests.support.collocation_oracle`), which shares nothing with the planner. A slew counts as failed when
-the collocation finds a path within |q2| <= 0.68 over the asked horizon and the planner none, as dear when the
-planner's path costs more than 1.001 times the collocation's, and as late when it is stretched although the
+Start and target are at |q2| of 0.60 to 0.68. The torque of a known thread of 0 to 2e-5 N m/rad is up to ten
+times that of the coil. The horizon is 5 to 60 s. Each slew is planned, and also solved by an independent
+collocation (`tests.support.collocation_oracle`). A slew counts as failed if the collocation finds a path
+within |q2| <= 0.68 over the requested horizon and the planner finds none. It counts as dear if the planner's
+path costs more than 1.001 times the collocation's, and as late if the planner stretches it although the
 collocation keeps the horizon.
 """
 
@@ -58,14 +58,14 @@ def run(case: Case) -> Result:
         result |= {"horizon": None, "energy": None}
     result["cpu_s"] = time.process_time() - begun
     optimum = solve(problem.slew(problem.horizon), INTERVALS)
-    # The collocation does not know of the limit of q2: a path beyond it is none.
+    # The collocation does not enforce the limit of q2, so a path beyond it counts as none.
     within = optimum is not None and np.abs(np.sin(0.5 * optimum.angle)).max() <= Q2_LIMIT * (1.0 + 1e-9)
     result["optimum"] = optimum.energy if optimum is not None and within else None
     return result
 
 
 def verdict(result: Result) -> str:
-    """Return failed, late, dear, solved, or unknown where the collocation has no path."""
+    """Return failed, late, dear, solved, or unknown if the collocation has no path."""
     if result["optimum"] is None:
         return "unknown"
     if result["horizon"] is None:
@@ -76,7 +76,7 @@ def verdict(result: Result) -> str:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Count the verdicts and list what was not solved."""
+    """Count the verdicts and list the slews that were not solved."""
     del folder
     verdicts = [verdict(result) for result in results]
     counts = {name: verdicts.count(name) for name in ("solved", "dear", "late", "failed", "unknown")}

@@ -1,12 +1,12 @@
 """Campaign `process-kill`: kill -9 and SIGSTOP of workers, guardian and flight, in real time.
 
-A case is one flight with planner and vision at work on devices in a process of their own. Workers and
-guardian are killed or stopped at random moments; each must be reported in the log, and be replaced. At last
-the flight process itself is killed or stopped: the coils must come to zero, and nothing of the flight may be
-left, neither a process nor a file in the folder for temporary files or in shared memory.
+A case is one flight with active planner and vision, on devices in a separate process. Workers and guardian
+are killed or stopped at random times; the log must report each, and each must be replaced. Finally the flight
+process itself is killed or stopped. The coils must come to zero current, and no process and no file of the
+flight may remain in the folder for temporary files or in shared memory.
 
-The emulated devices and who watches the coils stand for hardware, which waits for no processor: both run
-under SCHED_FIFO where that is permitted, so that a busy machine delays the flight alone.
+The emulated devices and the process that samples the coils represent hardware, which needs no processor. Both
+run under SCHED_FIFO if it is permitted, so that a busy machine delays only the flight.
 """
 
 from __future__ import annotations
@@ -37,25 +37,29 @@ from tests.support.process_watch import answering, below, command
 
 LIMIT_S = 0.35
 ACTS = 10
-"""On workers and guardian of one flight; the last act is on the flight itself."""
+"""Number of kills and stops of workers and guardian in one flight; the last one hits the flight itself."""
 _LOAD = Load(600.0, camera_period=1.0, replan_period=0.5)
 _NOTICED_S = 8.0
-"""A death is noticed within a second or two, and is on disk a second later, on a busy machine too."""
+"""Time (s) within which a death must be on disk: noticed within two seconds and stored a second later, with a
+margin for busy machines.
+"""
 _HARDWARE = 70
-"""SCHED_FIFO priority of what stands for hardware, above the flight's."""
+"""SCHED_FIFO priority of the processes that represent hardware, above that of the flight."""
 _GONE_S = 30.0
-"""By then every process of a flight has ended by itself; one that is starting must get so far first."""
+"""Time (s) after which all processes of a flight have ended by themselves; a starting process must finish its
+start first.
+"""
 _SHARED = Path("/dev/shm")
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return flights that come to `runs` acts together."""
+    """Return flights with `runs` kills and stops in total."""
     sizes = [min(ACTS, runs - done) for done in range(0, runs, ACTS)]
     return [Case(str(number), (seed, number), {"acts": size}) for number, size in enumerate(sizes)]
 
 
 def run(case: Case) -> Result:
-    """Fly; kill and stop; read the log."""
+    """Fly, kill and stop processes, and read the log."""
     rng = np.random.default_rng(case.seed)
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
@@ -86,12 +90,12 @@ def run(case: Case) -> Result:
 
 
 def _in_shared_memory() -> set[Path]:
-    """Return the files in shared memory but semaphores of Python's process pools, which no flight has."""
+    """Return the files in shared memory, without the semaphores of Python's process pools."""
     return {path for path in _SHARED.iterdir() if not path.name.startswith("sem.mp-")}
 
 
 def _hurt_parts(flight: LiveFlight, number: int, rng: np.random.Generator) -> Counter[str]:
-    """Kill or stop a worker or the guardian, one after the other; return how often which."""
+    """Kill or stop a worker or the guardian, one after the other; return the counts by process."""
     acts: Counter[str] = Counter()
     hurt: set[int] = set()
     deadline = time.monotonic() + 20.0 * max(number, 1)
@@ -105,14 +109,14 @@ def _hurt_parts(flight: LiveFlight, number: int, rng: np.random.Generator) -> Co
         role = str(rng.choice(sorted(victims)))
         number_sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
         hurt.add(victims[role])
-        with suppress(ProcessLookupError):  # a guardian that was replaced just now
+        with suppress(ProcessLookupError):  # the guardian was replaced just now
             os.kill(victims[role], number_sent)
             acts[role] += 1
     return acts
 
 
 def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> Result:
-    """Kill or stop the flight; return when the coils came to zero and how many processes were left."""
+    """Kill or stop the flight; return the time until the coils were off, and the remaining processes."""
     children = flight.children()
     before = max(board.current() for _ in range(20))
     sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
@@ -126,7 +130,7 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
         time.sleep(0.02)
     gone_after = _GONE_S - (deadline - time.monotonic())
     orphans = [child for child in children if lives(child)]
-    for child in orphans:  # counted, and gone: one that is stopped would hold the flight's pipe for ever
+    for child in orphans:  # already counted; a stopped one would keep the flight's pipe open
         with suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
     return {
@@ -139,7 +143,7 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
 
 
 def _reported(folder: Path) -> dict[str, int]:
-    """Return how many deaths of each part the log has."""
+    """Return the number of deaths of each process in the log."""
     log = read_run(folder)["event"]
     died = log["code"] == events.WORKER_DIED.code
     found = Counter(text.decode().partition(":")[0] for text in log["text"][died].tolist())
@@ -148,7 +152,7 @@ def _reported(folder: Path) -> dict[str, int]:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return how many deaths were reported, when the coils came to zero, and what was left."""
+    """Return the number of reported deaths, the times until the coils were off, and what remained."""
     del folder
     acts: Counter[str] = sum((Counter(result["acts"]) for result in results), Counter())
     reported = sum(

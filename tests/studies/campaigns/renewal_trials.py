@@ -1,9 +1,9 @@
-"""Campaign `renewal-trials`: good, damaged and unflyable renewals over the link, killed at random moments.
+"""Campaign `renewal-trials`: good, damaged and unflyable renewals over the link, killed at random times.
 
-A case is a board that flies a release and a configuration. The ground sends one bundle up, activates it, and
-confirms it or not. Every second run of the privileged program is killed with all that it has started, at a
-random time; the link is restarted at random. After the hours of the trial the old or the new version must
-fly, the old one if the bundle had a flaw, and the link must obey a command.
+A case is a board that flies a release and a configuration. The ground sends one bundle, activates it, and may
+confirm it. Every second run of the privileged program is killed with all its child processes at a random
+time; the link is restarted at random. After the trial period the old or the new version must fly, and the old
+one if the bundle had a flaw. The link must execute a command.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FLAWS = {
     "configuration": ("", "", "byte", "cut", "foreign key", "bounds", "body", "world", "keys", "reacts"),
     "release": ("", "crashes", "self-test", "cut", "packages"),
 }
-"""Flaws of the bundles of each kind; an empty text stands for none."""
+"""Flaws of the bundles of each kind; an empty text means no flaw."""
 HOURS, STEPS, LONGEST_S = 2.0, 12, 8.0
 _REPLACED = {
     "bounds": ("duration:", "duration: -1 #"),
@@ -60,7 +60,7 @@ def _made() -> RenewedBoard:
 
 
 def run(case: Case) -> Result:
-    """Activate one bundle, with kills, and return what flies after the trial."""
+    """Activate one bundle, with kills, and return the version that flies after the trial."""
     rng = np.random.default_rng(case.seed)
     kind, flaw = case.parameters["kind"], case.parameters["flaw"]
     with tempfile.TemporaryDirectory(prefix="renewal-") as name:
@@ -151,7 +151,7 @@ def _step(ends: RenewedEnds, rng: np.random.Generator) -> bool:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return which version flies after the trials, and the cases that ended wrongly."""
+    """Return the versions that fly after the trials, and the cases that ended wrongly."""
     del folder
     wrong = [
         result

@@ -1,11 +1,12 @@
 """Campaign `resting`: attitudes from frames whose stars hardly move, of cameras unlike the model.
 
-Each of `imperfections.IMPERFECTIONS` with trails of 0, 1 and 3 px, an exposure of 0.2 s and the priors of a
-flight; frames are drawn by `supersampled`. An attitude is judged by its error in its own standard deviations
-(the square root of its NEES): more than 6 is confidently wrong. An optical axis off the middle, or a point
-spread whose light has its middle elsewhere, turns all attitudes alike. A flight calibrates that turn, its
-mounting, with the same stars: of these rows (`SHIFTED`) the median error is taken off, and the axis is in the
-prior. The row `none` states an exact lens, all others the default doubt of one that nobody calibrated.
+The frames have each of `imperfections.IMPERFECTIONS`, streaks of 0, 1 and 3 px, an exposure of 0.2 s and the
+priors of a flight. `supersampled` renders them. The error of an attitude is given in its own standard
+deviations (the square root of its NEES): more than 6 is confidently wrong. A displaced optical axis, or a
+point spread function with a displaced centroid, rotates all attitudes by the same angle. A flight calibrates
+this rotation, as part of its mounting, with the same stars. From these rows (`SHIFTED`) the median error is
+subtracted, and the axis is in the prior. The row `none` has an exactly known lens; all others have the
+default uncertainty of an uncalibrated lens.
 """
 
 from __future__ import annotations
@@ -40,15 +41,15 @@ from tests.support.supersampled import Sky, light
 
 EXPOSURE = 0.2
 TRAILS = (0.0, 1.0, 3.0)
-"""px."""
+"""Lengths of the streaks (px)."""
 _PRIOR = 1e-4
-"""rad and rad/s: of the attitude and of the rate that navigation predicts."""
+"""Standard deviations (rad and rad/s) of the predicted attitude and rate."""
 SHIFTED = ("coma", "axis 5 px off")
 CAMERA = StarCameraModel(columns=512, rows=512, field_of_view=FIELD)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` frames of each imperfection and trail."""
+    """Return `runs` frames of each imperfection and length."""
     return [
         Case(f"{name} {trail:g} {run}", (seed, cell, run), {"row": name, "trail": trail})
         for cell, (name, trail) in enumerate((name, trail) for name in IMPERFECTIONS for trail in TRAILS)
@@ -62,9 +63,9 @@ def run(case: Case) -> Result:
 
 
 def look_at(case: Case, imperfection: Imperfection, about: float) -> Result:
-    """Solve one frame whose stars move by `trail` px in its middle, and judge its attitude.
+    """Solve one frame whose stars move by `trail` px in its centre, and judge its attitude.
 
-    The turn about the boresight is up to `about` times that across.
+    The rotation about the boresight is up to `about` times that across it.
     """
     rng, trail = np.random.default_rng(case.seed), case.parameters["trail"]
     middle, way = normalise(rng.normal(size=4)), rng.uniform(0.0, 2.0 * np.pi)
@@ -87,7 +88,7 @@ def look_at(case: Case, imperfection: Imperfection, about: float) -> Result:
 def expose(
     imperfection: Imperfection, middle: FloatArray, turn: FloatArray, rng: np.random.Generator
 ) -> Image:
-    """Return a frame about the attitude `middle` (4,), turning by `turn` (3,) rad over the exposure."""
+    """Return a frame with mid-exposure attitude `middle` (4,) and a rotation `turn` (3,), rad."""
     stars, directions = catalogue(8.5)
     near = np.flatnonzero(
         directions @ attitude_matrix(middle)[2] > np.cos(CAMERA.pinhole.half_diagonal + 0.02)
@@ -108,7 +109,7 @@ def expose(
 def job(
     pixels: Image, imperfection: Imperfection, middle: FloatArray, turn: FloatArray, rng: np.random.Generator
 ) -> FrameJob:
-    """Return a flight's job: its camera is the model's, its priors are off by their deviations."""
+    """Return a flight's job with the model's camera and priors whose errors are their claims."""
     known: dict[str, Any] = {"gain": CAMERA.gain, "psf_sigma": CAMERA.psf_sigma, "line_time": 0.0}
     known |= {"saturation": imperfection.top} | imperfection.known
     detection = DetectionSettings(
@@ -117,7 +118,8 @@ def job(
     lens = EXACT if imperfection is IMPERFECTIONS["none"] else CameraKnowledge()
     off, faster = rng.normal(scale=_PRIOR, size=(2, 3))
     x, y = imperfection.optics.offset
-    off = off + np.array([y, -x, 0.0]) / CAMERA.pinhole.focal_length  # the mounting as a flight calibrates it
+    # the mounting as a flight calibrates it: it includes the displaced axis
+    off = off + np.array([y, -x, 0.0]) / CAMERA.pinhole.focal_length
     return FrameJob(
         pixels,
         CAMERA.pinhole,
@@ -130,7 +132,7 @@ def job(
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return attitudes and errors of each row, and of all."""
+    """Return attitudes and errors of each row, and of all rows."""
     named = dict.fromkeys(result["row"] for result in results)
     judged = [judged for row in named for judged in _judged([r for r in results if r["row"] == row])]
     rows = list(dict.fromkeys((result["row"], result["trail"]) for result in judged))
@@ -147,7 +149,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _judged(results: Sequence[Result]) -> list[Result]:
-    """Return the results of a row with NEES, and error and claim across the boresight, px of an axis."""
+    """Return the results of a row with NEES, and error and claim across the boresight (px per axis)."""
     errors = np.array([result["error"] for result in results if result["error"] is not None])
     shift = np.zeros(3)
     if len(errors) and results[0]["row"] in SHIFTED:

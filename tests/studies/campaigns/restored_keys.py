@@ -95,16 +95,19 @@ class Order:
             shutil.rmtree(folder)
             shutil.copytree(copies[int(self._rng.integers(len(copies)))], folder)
             self.facts["restored"] += 1
-            if folder == self._ground:  # the operator has the present keys, but not the present counters
+            if folder == self._ground:  # the operator has the current keys, but outdated counters
                 for spi in _SPIS:
                     present = self._vault.read(spi)
                     if present is not None:
                         Vault(folder).write(Association(spi, present.generation, 0, present.key))
-            elif self._rng.random() < 0.7:  # otherwise the running link does not notice
+            elif self._rng.random() < 0.7:  # otherwise the running link does not notice the change
                 self._start()
 
     def _command(self, spi: int) -> bool:
-        """Send a command; if the primary key is refused, set a new one by the reserve. Return the success."""
+        """Send a command; if the primary key is refused, set a new one by the reserve SPI.
+
+        Return the success.
+        """
         if self._send(spi):
             return True
         if self._gate.association(COMMAND_SPIS[0]) is None and self._send(COMMAND_SPIS[1]):

@@ -1,15 +1,16 @@
-"""Campaign `robust-controllers`: the step demonstration in worlds that are not what the loop believes.
+"""Campaign `robust-controllers`: the step demonstration in worlds that differ from the loop's model.
 
-Each run draws a world: inertia +-20 %, field and coil resistance +-10 %, the thread's stiffness 0 to 3 times
-that of the demonstration (the loop knows of none), a gyro bias, noise up to 3 times, readings one to three
-cycles late, the inertial unit silent for up to a second in a slew and in a hold, and 5 % of its packets
-damaged. Every controller of `COMPARED` flies the same worlds, tuned in the believed world by one criterion:
-the whole loop in lock-step on the emulated devices, PWM counts and all; two of the demonstration's steps, the
-slew from the release and the first tenth, 65 s each. All figures are of the truth.
+Each run draws a world: inertia within 20 %, field and coil resistance within 10 %, a thread stiffness of 0 to
+3 times that of the demonstration (which the loop does not model), a gyro bias, noise of up to 3 times,
+readings that are one to three cycles late, an inertial unit that is silent for up to a second in a slew and
+in a hold, and 5 % of damaged packets. Every controller of `COMPARED` flies the same worlds. All are tuned in
+the modelled world by one criterion. Each flight runs the whole loop in lock-step on the emulated devices. It
+has two of the demonstration's steps, the slew from the release and the first tenth, 65 s each. All figures
+are those of the true body.
 
-While the unit is silent the coils are at zero, and the thread alone turns the body: by k theta t^2 / (2 J),
-up to half a degree in a second. That is the excursion; the steady state is judged outside the drop-outs and
-of `RECOVERY` s after each.
+While the unit is silent the coils are at zero, and the thread alone rotates the body: by k theta t^2 / (2 J),
+up to half a degree in a second. This is the excursion. The steady state excludes the silent intervals and
+`RECOVERY` s after each.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ from tests.support.flights import Rigged, demo_world, event_names, fly
 STEPS = (Step(at=0.0, q2=-0.3), Step(at=65.0, q2=-0.2))
 DURATION = 130.0
 LOST_DEG = 5.0
-"""A body that is further than this from its target in the last 30 s is lost."""
+"""Error (deg) in the last 30 s above which a body counts as lost."""
 
 RECOVERY = 5.0
-"""s."""
+"""Time (s) after a silent interval that the steady state excludes."""
 
 CYCLE_NS = 25_000_000
 DAMAGED = 0.05
 GYRO_BIAS = math.radians(30.0) / 3600.0
-"""rad/s, bound: three times the 10 deg/h of the VN-100's data sheet."""
+"""Largest gyro bias (rad/s): three times the 10 deg/h of the VN-100's data sheet."""
 
 COMPARED = ("this loop", "thesis", "pid", "adaptive")
 FIGURES = ("steady_state_deg", "excursion_deg", "settling_s", "overshoot_percent", "rise_s")
@@ -58,7 +59,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def draw(seed: tuple[int, ...]) -> dict[str, Any]:
-    """Return one world, as factors on the demonstration's where the name has no unit."""
+    """Return one world; values without a unit in their name are factors on those of the demonstration."""
     rng = np.random.default_rng(seed)
 
     def about_one(share: float) -> float:
@@ -103,14 +104,14 @@ def world_of(drawn: dict[str, Any], config: TestbedConfig) -> Simulation:
 
 
 def disturb(rigged: Rigged, drawn: dict[str, Any]) -> None:
-    """Make the line late, damage its packets, and silence it for the drawn spans."""
+    """Delay the line, damage its packets, and silence it in the drawn intervals."""
     wire = rigged.lock.line.to_host
     usual = LineFaults(cut_probability=DAMAGED, delay_ns=drawn["delay_cycles"] * CYCLE_NS)
 
     def become(faults: LineFaults) -> None:
         wire.faults = faults
 
-    # Only after the release: late samples of the held body would look like samples of the flight.
+    # Only after the release, because late samples of the held body would look like samples of the flight.
     rigged.at(0.5, lambda: become(usual))
     for begin, span in drawn["dropouts_s"]:
         rigged.at(begin, lambda: become(LineFaults(silent=True)))
@@ -124,7 +125,7 @@ def run(case: Case) -> Result:
 
 
 def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
-    """Fly the two steps in a drawn world with the loop of `config`."""
+    """Fly the two steps in a drawn world with the loop of `config`; return the figures."""
     config = configuration.replace(config, steps=STEPS, duration=DURATION)
     with tempfile.TemporaryDirectory() as place:
         flown = fly(
@@ -137,7 +138,7 @@ def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
         names = event_names(flown)
     slew, tenth = summary["steps"]
     excursion = _worst(slew["steady_state_deg"], tenth["steady_state_deg"])
-    # None stands for a band that was never entered, or an attitude beyond all bounds.
+    # None stands for a band that was never entered, or an attitude beyond all limits.
     figures = {
         "steady_state_deg": _steady_state(flown, drawn["dropouts_s"]),
         "excursion_deg": excursion,
@@ -155,7 +156,7 @@ def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
 
 
 def _steady_state(flown: Run, dropouts: Sequence[Sequence[float]]) -> float:
-    """Return the largest error, deg, in the last half minutes of the steps, where nothing disturbs it."""
+    """Return the largest error (deg) in the last half minutes of the steps, without disturbed intervals."""
     time = flown["truth"]["time_ns"] * 1e-9
     angle = 2.0 * np.arcsin(np.clip(flown["truth"]["quaternion"][:, 1], -1.0, 1.0))
     judged = np.zeros(len(time), dtype=bool)

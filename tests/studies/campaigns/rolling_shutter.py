@@ -1,9 +1,10 @@
-"""Campaign `rolling-shutter`: the rate from frames whose rows are exposed one after another, line time known.
+"""Campaign `rolling-shutter`: the rate from frames whose rows are exposed in sequence, with known line time.
 
-Random fields, theta over 0..90 deg, streaks of 20 to 300 px, exposures of 0.2 and 1 s, 10 to 50 us a line.
-Each frame is estimated twice: with a prior, which gives the direction of time, and without one. The frames
-are summed row by row (`row_exposure`), not by the estimator's model. An answer without a prior may have the
-opposite sign; its covariance has to span both directions. The bound is that of a global shutter.
+The fields are random, theta is 0 to 90 deg, streaks have 20 to 300 px, exposures are 0.2 and 1 s, and line
+times 10 to 50 us. Each frame is estimated twice: with a prior, which gives the direction of time, and without
+one. The frames are summed row by row (`row_exposure`), not by the estimator's model. An answer without a
+prior may have the opposite sign; its covariance must span both directions. The bound is that of a global
+shutter.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ def _bound(scene: RowScene, camera: StarCameraModel, rate: FloatArray, exposure:
 
 
 def _judged(found: MotionResult, rate: FloatArray, bound: FloatArray) -> Result:
-    """Return status, NEES, the squared error over the bound's, and the error over the rate."""
+    """Return status, NEES, squared error over the bound, and error relative to the rate."""
     if found.rate is None or found.covariance is None:
         return {"status": found.status.value}
     error = found.rate - rate

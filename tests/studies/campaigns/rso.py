@@ -25,15 +25,15 @@ SLEW_RATE = 0.05
 TRACK_RATE = float(np.deg2rad(2.0))
 STAR_LIMIT = 8.5
 MATCH_PX = 4.0
-# Objects stay so far inside the frame: the thesis, too, uses whole streaks.
+# Smallest distance (px) of an object from the border; the thesis also uses complete streaks.
 MARGIN_PX = 20.0
-# Of the objects' motion among the stars, rad/s: streaks of 9 to 87 px.
+# Slowest and fastest motion (rad/s) of an object among the stars: streaks of 9 to 87 px.
 SLOWEST, FASTEST = 0.006, 0.06
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """A scene without its noise: attitudes (k, 4) at times (k,) s, and an object's directions there.
+    """A scene without noise: attitudes (k, 4) at times (k,), s, and the object's directions at these times.
 
     `rate` (3,) is the camera's in rad/s, `path` (k, 2) the object's in px.
     """
@@ -53,9 +53,9 @@ class Sky:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a frame's report says of the one object that is there: error of its ends in px, None if missed.
+    """Detections of a report: error (px) of the true object's ends, None if missed, and false detections.
 
-    `false` counts the objects that are not there.
+    `false` counts detections of objects that do not exist.
     """
 
     error: float | None
@@ -73,7 +73,7 @@ def draw_sky(camera: StarCameraModel, generator: np.random.Generator, tracked: b
     while True:
         place = pinhole.unit_vectors(generator.uniform(MARGIN_PX, camera.columns - MARGIN_PX, (1, 2)))[0]
         motion = rate if tracked else _motion(generator, place)
-        # In the axes of the middle attitude: an object on which a camera is that turns by `motion`.
+        # Axes of the middle attitude: a camera that rotates by `motion` follows the object.
         among_stars = np.swapaxes(attitude_matrix(from_rotation_vector(since * motion)), 1, 2) @ place
         directions = among_stars @ attitude_matrix(middle)
         seen = (attitude_matrix(attitudes) @ directions[..., None])[..., 0]
@@ -83,14 +83,14 @@ def draw_sky(camera: StarCameraModel, generator: np.random.Generator, tracked: b
 
 
 def _motion(generator: np.random.Generator, place: FloatArray) -> FloatArray:
-    """Return a turn (3,) rad/s across `place`, its speed drawn evenly in its logarithm."""
+    """Return a rotation (3,), rad/s, across `place`, with a speed that is uniform in its logarithm."""
     speed = np.exp(generator.uniform(np.log(SLOWEST), np.log(FASTEST)))
     axis = np.cross(place, generator.normal(size=3))
     return np.asarray(speed * axis / np.linalg.norm(axis))
 
 
 def look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> tuple[ObjectReport | None, float]:
-    """Return the report on a frame, by the likelihood's rotation, and the processor seconds of both."""
+    """Return the report on a frame, which uses the likelihood estimate, and the processor time (s)."""
     return warm_call("rso", lambda: _look(pixels, camera, rate))
 
 
@@ -105,24 +105,24 @@ def _look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> ObjectRep
 
 
 def match(report: ObjectReport | None, truth: FloatArray | None) -> Found:
-    """Return which object of a report is the true one, of ends (2, 2) px, and how many are none."""
+    """Return the detection of the true object with ends (2, 2), px, and the number of false detections."""
     if report is None:
         return Found(None, 0)
     if truth is None:
         return Found(None, len(report.objects))
     errors = [ends_error(item.endpoints, truth) for item in report.objects]
     hits = [error for error in errors if error < MATCH_PX]
-    # A second find of the same object is false as well.
+    # A second detection of the same object is false too.
     return Found(min(hits, default=None), len(errors) - min(len(hits), 1))
 
 
 def ends_error(ends: FloatArray, truth: FloatArray) -> float:
-    """Return the larger error of two ends (2, 2) px; one frame does not show which came first."""
+    """Return the larger error of two ends (2, 2), px; one frame does not show which came first."""
     return float(min(np.linalg.norm(ends - other, axis=1).max() for other in (truth, truth[::-1])))
 
 
 def by_magnitude(results: Sequence[Result], magnitude: float) -> dict[str, Any]:
-    """Return how many objects of a magnitude were found, and how well."""
+    """Return the number of detected objects of a magnitude, and their errors."""
     here = [r for r in results if r["magnitude"] == magnitude]
     errors = [r["error_px"] for r in here if r["error_px"] is not None]
     return {

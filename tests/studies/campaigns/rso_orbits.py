@@ -1,12 +1,13 @@
 """Campaign `rso-orbits`: the ten orbits of Table 4.3, Table 4.4, and the faintest detected object.
 
-The camera turns at 0.05 rad/s about its y axis for ten orbits, with a frame every second; those in which the
-object is observable are the opportunities. Run 0 starts as the thesis does; the others start turned about
-that axis by a random angle, and all draw noise of their own. Each indicator alone, by the thesis's strict 2.5
-sigma of the frame, and with the lower bounds that the thesis asks for, is counted beside the default: the
-judge of pixels. What an indicator singles out is correct if it is the object, an overlap if other stars lie
-on the streak, else false. Table 4.4 is also counted with the 7,000 brightest stars alone (to V 6.3), and the
-rates of the ten orbits are estimated by Harris's corners with OLAE, as in the thesis, and by the default.
+The camera rotates at 0.05 rad/s about its y axis for ten orbits, with a frame every second. The frames in
+which the object is observable are the opportunities. Run 0 starts as the thesis does; the others start at a
+random angle about that axis, and all have independent noise. The default detector, which uses the pixels, is
+compared with each indicator alone, by the thesis's strict 2.5 sigma of the frame and with the lower bounds
+that the thesis requires. The streak that an indicator selects is correct if it is the object, an overlap if
+other stars lie on it, and otherwise false. Table 4.4 is also counted with the 7,000 brightest stars alone (to
+V 6.3). The rates of the ten orbits are estimated by Harris's corners with OLAE, as in the thesis, and by the
+default method.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ from tests.support.opportunities import (
 )
 from tests.support.scenes import BRIGHTEST, FIELD, catalogue, faintest
 
-# 2026-05-18 0 h TT: with a frame a second and the Sun and Earth kept out of half the field, as in 2.17 and
-# 2.19, the thesis's number of opportunities.
+# 2026-05-18 0 h TT: with a frame a second and with Sun and Earth outside half the field (2.17 and
+# 2.19), this epoch gives the thesis's number of opportunities.
 EPOCH = 2_461_178.5
 CADENCE = 1.0
 HALF_ANGLE = 0.5 * FIELD
@@ -55,10 +56,11 @@ RATE = np.array([0.0, 0.05, 0.0])
 TABLE_MAGNITUDE = 4.0
 MAGNITUDES = (3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0)
 WANTED = 0.95
-# Another star this near lies on a streak, if it is not fainter by more than this.
+# Largest distance (px) of another star that counts as lying on a streak, unless it is fainter by more than
+# FAINTER.
 NEAR_PX = 6.0
 FAINTER_MAG = 4.0
-# Table 4.4: correct, overlapping streak, false.
+# Table 4.4 of the thesis: correct, overlapping and false streaks.
 THESIS = ((12, 0, 3), (10, 2, 0), (12, 2, 0))
 RULES = ("strict", "bounded")
 ESTIMATORS = ("harris", "likelihood")
@@ -100,7 +102,7 @@ def run(case: Case) -> Result:
 
 
 def one_frame(scenario: Scenario, at: Opportunity, case: Case, number: int) -> Result:
-    """Expose at an opportunity, and count what each indicator and the judge of pixels single out."""
+    """Expose at an opportunity; count the selections of each indicator and of the default detector."""
     camera = StarCameraModel(field_of_view=FIELD)
     magnitude, stars = case.parameters["magnitude"], case.parameters.get("stars")
     limit = STAR_LIMIT if stars is None else faintest(stars)
@@ -190,7 +192,7 @@ def count_indicators(
 
 
 def _strict(deviations: FloatArray) -> BoolArray:
-    """Return which deviations (n, 3) lie 2.5 standard deviations of the frame from its mean."""
+    """Return which deviations (n, 3) are beyond 2.5 standard deviations of the frame from its mean."""
     away = np.abs(deviations - deviations.mean(axis=0))
     return np.asarray(away > 2.5 * deviations.std(axis=0))
 
@@ -233,7 +235,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def table_4_4(results: Sequence[Result]) -> dict[str, Any]:
-    """Return Table 4.4 by each rule and by the judge of pixels, and the mean errors of the rates."""
+    """Return Table 4.4 by each rule and by the default detector, and the mean errors of the rates."""
     frames = [f for result in results for f in result["frames"] if f["magnitude"] == TABLE_MAGNITUDE]
     counts = {rule: np.zeros((3, 3), dtype=int) for rule in RULES}
     for frame in frames:
@@ -249,7 +251,7 @@ def table_4_4(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def weakest(rows: Sequence[dict[str, Any]]) -> float | None:
-    """Return the faintest magnitude to which 95 % are found at every one."""
+    """Return the faintest magnitude down to which 95 % are detected at every magnitude."""
     found = None
     for row in rows:
         if not row["frames"] or row["found"] < WANTED * row["frames"]:

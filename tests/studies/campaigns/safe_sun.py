@@ -1,10 +1,11 @@
-"""Campaign `safe-sun`: SAFE's way to the Sun by solar strings, gyro and magnetometer alone, and its hold.
+"""Campaign `safe-sun`: sun acquisition in SAFE mode by solar cells, gyro and magnetometer, and its hold.
 
-Both craft, by turns in two orbits, any attitude and a turn of 0.5 deg/s as the brake leaves it, two
-revolutions of 97 min. Drag, sunlight and the turn of the principal axes are `share` of the worst; gravity
-gradient and residual dipole are whole. The strings have gain errors and see the sunlit Earth. `found` is when
-the axis first comes within NEAR deg; `rms` is of the axis off the Sun in sunlight from SETTLED s on, the time
-after each eclipse included; `again` is the longest time from an eclipse's end to within NEAR deg.
+Both craft fly alternately in two orbits for two revolutions of 97 min, from a random attitude and a rate of
+0.5 deg/s, at which detumbling ends. Drag, sunlight and the rotation of the principal axes are `share` of the
+worst case; gravity gradient and residual dipole have their full size. The solar cells have gain errors and
+see the sunlit Earth. `found` is the time at which the axis first comes within NEAR deg of the Sun. `rms` is
+the angle of the axis off the Sun in sunlight after SETTLED s, including the time after each eclipse. `again`
+is the longest time from the end of an eclipse until the axis is within NEAR deg.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 SPEED = math.radians(0.5)
 SECONDS, SETTLED = 11_600.0, 1_800.0
 NEAR = 20.0
-"""deg."""
+"""Largest angle (deg) off the Sun at which it counts as found."""
 SHARES = (0.3, 1.0)
 CYCLES = 6
-"""Commands in a window; the flight gives 72."""
+"""Number of commands in a window; the flight has 72."""
 GAIN_ERROR, STRING_NOISE = 0.02, 2e-3
-"""Of the strings: relative, and A of a peak of one."""
+"""Relative gain error of the solar cells, and noise (A) for a peak current of one."""
 _STREAM = 0x5AFE
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each craft and share, in the two orbits by turns."""
+    """Return `runs` flights of each craft and share, alternately in two orbits."""
     orbits = list(ORBITS)
     return [
         Case(
@@ -57,10 +58,13 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 class SafeFlight:
-    """One craft with its seeker; `notes`: each window's time, angle off the Sun, deg, light and deg/s."""
+    """One craft with its sun acquisition.
+
+    `notes` has a row for each window: time, angle (deg) off the Sun, sunlight and rate (deg/s).
+    """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
-        """`wanted`: craft, share of the worst disturbances, orbit."""
+        """Create the flight. Keys of `wanted`: craft, share of the worst disturbances, orbit."""
         share = wanted["share"]
         disturbances = Disturbances(drag=share, solar_pressure=share, principal_turn_deg=3.0 * share)
         release = TipOff(speed=wanted.get("speed", SPEED))
@@ -74,7 +78,7 @@ class SafeFlight:
         self.notes: list[tuple[float, float, float, float]] = []
 
     def window(self, seconds: float) -> None:
-        """Fly one window of the coils' pauses from `seconds` on."""
+        """Simulate one window of the coils' pauses from `seconds` on."""
         flight, start_ns = self._flight, round(seconds * SECOND)
         flight.act(np.zeros(3))
         for phase_ns in SAMPLES_NS:
@@ -92,7 +96,7 @@ class SafeFlight:
         self.law.sample(time_ns, flight.field(), flight.motion.rate + flight.gyro_bias + noise)
 
     def _see(self) -> None:
-        """Give the seeker what the strings show, and note the truth."""
+        """Give the sun acquisition the readings of the solar cells, and record the true states."""
         flight = self._flight
         truth = flight.body.orbit_truth()
         body = attitude_matrix(truth.quaternion)
@@ -120,7 +124,7 @@ def run(case: Case) -> Result:
 
 
 def judged(notes: FloatArray, settled: float) -> Result:
-    """Return the figures of notes (n, 4); those of a light that was not met are None."""
+    """Return the figures of notes (n, 4); those of a light condition that did not occur are None."""
     times, off, lit, rate = notes.T
     near, sunlit = off <= NEAR, lit > 0.5
     later = times > settled
@@ -147,7 +151,7 @@ def _rms(values: FloatArray) -> float | None:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return how the axis was held, by craft and share."""
+    """Return the pointing errors of the axis by craft and share."""
     facts: dict[str, Any] = {}
     for craft in CRAFT:
         for share in SHARES:

@@ -54,7 +54,7 @@ class TrueLens:
     Attributes:
         pinhole: pinhole of the true focal length.
         optics: point spread, optical axis and distortion.
-        line_time: s.
+        line_time: time (s) between rows.
     """
 
     pinhole: Pinhole
@@ -124,7 +124,7 @@ def expose(lens: TrueLens, rng: np.random.Generator) -> tuple[Image, FloatArray,
 
 
 def described(row: str) -> tuple[FrameJob, LensKnowledge]:
-    """Return the job without a frame, and the lens, of the camera as it is described in a row."""
+    """Return the job without a frame, and the lens, of the camera as a row describes it."""
     known = CameraKnowledge(distortion=0.02 if row == "distortion" else 0.005)
     spread = 0.05 if row == "field" else 0.0
     solve = SolveSettings(
@@ -141,7 +141,7 @@ def described(row: str) -> tuple[FrameJob, LensKnowledge]:
 
 
 def run(case: Case) -> Result:
-    """Learn one lens, and judge each frame and the lens after it."""
+    """Estimate one lens; judge each frame, and the lens after each frame."""
     rng, row = np.random.default_rng(case.seed), case.parameters["row"]
     job, lens = described(row)
     known = job.tracker.solve.lens if job.tracker is not None else None
@@ -161,7 +161,7 @@ def run(case: Case) -> Result:
 
 
 def _judged(found: FrameFound, rate: FloatArray, bound: FloatArray) -> dict[str, Any]:
-    """Return status, NEES, and the claim as a multiple of the bound."""
+    """Return status, NEES, and the claimed uncertainty as a multiple of the bound."""
     motion, solved = found.motion, found.solution is not None and found.solution.fix is not None
     if motion.status is not StreakStatus.RATE or motion.rate is None or motion.covariance is None:
         return {"status": motion.status.value, "solved": solved}
@@ -191,7 +191,7 @@ def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return the claims and their honesty by row, before and after the lens is learned."""
+    """Return claimed uncertainties and NEES by row, before and after the lens is learned."""
     del out
     facts: dict[str, dict[str, Any]] = {}
     for row in ROWS:

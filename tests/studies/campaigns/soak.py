@@ -1,10 +1,11 @@
 """Campaign `soak`: hours of simulated operation in lock-step with repeated faults.
 
-Each run is some hours of the demonstration's loop without a break: a new attitude every 50 to 150 s, a fault
-of the catalogue every minute or so, at the wire, lifted again after seconds; axes that were taken out of use
-are trusted again by command. Memory and files may not grow beyond their budget, no coil may carry more than
-its limit, and after a last quiet minute the body points where it should. `--hours 24` is four flights of six
-hours: long enough to see memory creep, short enough that an interrupted campaign loses little.
+Each run is some hours of the demonstration's loop without a break. A new target attitude comes every 50 to
+150 s. About once a minute a fault of the catalogue is injected at the wire for some seconds. A command puts
+isolated axes back into use. Memory and files may not grow beyond their budget, no coil may carry more than
+its limit, and after a last minute without faults the body must point to its target. `--hours 24` is four
+flights of six hours: long enough to show growing memory, and short enough that an interrupted campaign loses
+little.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ MEMORY_BYTES_PER_HOUR = 8 << 20
 BUDGET_BYTES = 4 << 20
 _SEGMENT_BYTES = 256 << 10
 _UNHEARD = ("camera", "vision", "disk")
-"""No camera is fitted; a full disk would hide what the rest did."""
+"""Parts without faults: there is no camera, and a full disk would lose the records of the other faults."""
 
 
 def cases(hours: int, seed: int) -> list[Case]:
@@ -49,7 +50,7 @@ def cases(hours: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly as long as the case says."""
+    """Fly for the duration of the case."""
     seconds = case.parameters["seconds"]
     rng = np.random.default_rng(case.seed)
     entries, cleared = break_things(rng, seconds - QUIET_S)
@@ -84,7 +85,7 @@ def run(case: Case) -> Result:
 def break_things(
     rng: np.random.Generator, until: float
 ) -> tuple[tuple[FaultEntry, ...], tuple[CommandStep, ...]]:
-    """Draw faults, and the commands by which axes that were isolated are trusted again."""
+    """Return random faults, and the commands that put isolated axes back into use."""
     kinds = [kind for kind in faults() if kind.device not in _UNHEARD]
     entries, cleared = [], []
     time = 0.0
@@ -99,7 +100,7 @@ def break_things(
 
 
 def config_for(rng: np.random.Generator, seconds: float, cleared: tuple[CommandStep, ...]) -> TestbedConfig:
-    """Return the loop with an attitude to go to every now and then, and a small log."""
+    """Return the configuration with a sequence of target attitudes and a small log."""
     base = demo_config(seconds, camera=False)
     times, time = [0.0], 0.0
     while (time := time + float(rng.uniform(50.0, 150.0))) < seconds - QUIET_S:
@@ -116,7 +117,7 @@ def config_for(rng: np.random.Generator, seconds: float, cleared: tuple[CommandS
 
 @contextmanager
 def without_what_is_there() -> Iterator[None]:
-    """Exempt from collections what this process holds already: to search it takes longer than to fly."""
+    """Exclude the present objects from garbage collection, which would take longer than the flight."""
     gc.freeze()
     try:
         yield
@@ -125,20 +126,20 @@ def without_what_is_there() -> Iterator[None]:
 
 
 def resident_bytes() -> int:
-    """Return what this process holds, after what it has done with is gone."""
+    """Return the resident memory (bytes) of this process after a garbage collection."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _slope(memory: Sequence[tuple[float, int]]) -> float:
-    """Return bytes an hour over the second half."""
+    """Return the growth of memory (bytes per hour) over the second half."""
     half = np.array(memory[len(memory) // 2 :], dtype=float)
     return float(np.polyfit(half[:, 0], half[:, 1], 1)[0]) * HOUR_S
 
 
 def _pointing(flown: Run, config: TestbedConfig) -> float:
-    """Return how far the body is from its last target in the last ten seconds, deg."""
+    """Return the angle (deg) between the body and its last target in the last ten seconds."""
     truth = flown["truth"]
     late = truth["time_ns"] * 1e-9 > config.duration - 10.0
     angle = 2.0 * np.arcsin(np.clip(truth["quaternion"][late, 1], -1.0, 1.0))
@@ -146,7 +147,7 @@ def _pointing(flown: Run, config: TestbedConfig) -> float:
 
 
 def broken(result: Result) -> list[str]:
-    """Return which of its limits a run has broken."""
+    """Return the limits that a run exceeded."""
     found = {
         "memory": result["memory_slope"] > MEMORY_BYTES_PER_HOUR * HOUR_S / result["seconds"],
         "log size": result["log_bytes"] > BUDGET_BYTES,
@@ -159,7 +160,7 @@ def broken(result: Result) -> list[str]:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return the worst of each figure and the flights that broke a limit."""
+    """Return the worst of each figure, and the flights that exceeded a limit."""
     del folder
     worst: dict[str, Any] = {
         key: max(result[key] for result in results)

@@ -1,14 +1,14 @@
-"""Campaign `start`: each system call of a board's start fails once, and the board flies all the same.
+"""Campaign `start`: each system call of a board's start fails once, and the board must still fly.
 
-A point is one call of the main thread, counted from the start of its process, and one error that strace
-injects into it. The list of points is all calls of a traced start times all errors; their number changes by
-some from start to start. The campaign flies the list in an order that its seed draws: calls after the
-configuration was opened and calls before, nearly all of which read modules, in turn while there are both.
-With as many runs as there are points it flies the whole list.
+A point is one call of the main thread, numbered from the start of its process, with one error that strace
+injects into it. The list of points is all calls of a traced start times all errors. Their number varies
+slightly between starts. The seed determines the order of the list. It alternates between calls after and
+calls before the opening of the configuration, as long as both remain, because nearly all earlier calls only
+read modules. With as many runs as points, the campaign covers the whole list.
 
-A case is a board whose emulated devices live in a process of their own; its flight starts again and again,
-each time with one point. This campaign stands for the service manager: a process that ends is started again
-without the fault, unless its status is 2. Then the board is grounded for good, which must not happen.
+A case is a board whose emulated devices run in a separate process. Its flight starts repeatedly, each time
+with one point. The campaign replaces the service manager: it restarts a process that ends, without the fault,
+unless its exit status is 2. With that status the board would stay grounded, which must not happen.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
 CALLS = ("open", "openat", "read", "getdents64", "fsync", "rename", "bind", "ioctl")
 ERRORS = ("EIO", "ENOSPC", "ENOENT", "EACCES")
 FAULTS = 10
-"""Of one board."""
+"""Number of points of one board."""
 
 _LONGEST_S = 120.0
 _CONFIG = "flight.yaml"
@@ -49,7 +49,7 @@ _GROUNDED = 2
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One call that fails: the `number`th of its kind in the process, before or after the configuration."""
+    """One failing call: the `number`th of its kind, before or after the configuration was opened."""
 
     begun: bool
     call: str
@@ -58,7 +58,7 @@ class Point:
 
 
 def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
-    """Return all points of a start with these numbers of calls, in all and before the configuration."""
+    """Return all points of a start from the numbers of calls: all, and those before the configuration."""
     return [
         Point(number > before[call], call, number, error)
         for call in CALLS
@@ -68,7 +68,7 @@ def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
 
 
 def in_turn(listed: Sequence[Point], seed: int) -> list[Point]:
-    """Return the points in the order of a seed, those after and before the configuration in turn."""
+    """Return the points in a seeded order that alternates between after and before the configuration."""
 
     def rank(point: Point) -> bytes:
         return hashlib.sha256(f"{seed} {point.call} {point.number} {point.error}".encode()).digest()
@@ -91,9 +91,9 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Start one board's flight with one fault after the other."""
+    """Start the flight of one board repeatedly, with one fault each time."""
     with _board() as board:
-        board.trace()  # leaves state and an archive behind, as any board has but a new one
+        board.trace()  # leaves state and an archive, which every board except a new one has
         faults = [
             {"fault": f"{call} {number}: {error}", "begun": begun}
             | board.start(f"{call}:error={error}:when={number}")
@@ -104,11 +104,11 @@ def run(case: Case) -> Result:
 
 @contextmanager
 def _board() -> Iterator[Board]:
-    """Provide a board; its devices run beside it. Raises UsageError without strace."""
+    """Provide a board with running devices. Raises UsageError without strace."""
     if shutil.which("strace") is None:
         raise UsageError("the campaign start needs strace")
     _check_injection()
-    # The socket's name must be short.
+    # The path of a socket must be short.
     with tempfile.TemporaryDirectory(prefix="kc-") as name:
         place = Path(name)
         (place / "devices").mkdir()
@@ -121,7 +121,7 @@ def _board() -> Iterator[Board]:
 
 
 def _check_injection() -> None:
-    """Raise UsageError if strace cannot make calls fail here, as in some containers."""
+    """Raise UsageError if strace cannot inject errors here, as in some containers."""
     fault = ["-e", "trace=none", "-e", "inject=openat:error=EIO:when=1+"]
     words = ["strace", "-o", "/dev/null", *fault, sys.executable, "-c", "open('/dev/null')"]
     if subprocess.run(words, capture_output=True, check=False).returncode == 0:
@@ -129,7 +129,7 @@ def _check_injection() -> None:
 
 
 class Board:
-    """A board with its configuration, state and archive, and the service manager's end of its line."""
+    """A board with configuration, state and archive, and the service manager's notification socket."""
 
     def __init__(self, place: Path, devices: Path) -> None:
         """Write the configuration of a flight on emulated devices."""
@@ -156,7 +156,7 @@ class Board:
         }
 
     def trace(self) -> tuple[Counter[str], Counter[str]]:
-        """Return how often each call is made in a start, and how often before the configuration is opened."""
+        """Return the numbers of calls by kind in a start: all, and those before the configuration is opened."""
         path = self._place / "trace"
         strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)
@@ -170,7 +170,7 @@ class Board:
         return Counter(name for name, _ in calls), Counter(name for name, _ in calls[:opened])
 
     def start(self, fault: str) -> Result:
-        """Start with a fault, and again without it after an end; return how it went."""
+        """Start with a fault, and again without it if the process ends; return the outcome."""
         strace = ["strace", "-o", "/dev/null", "-e", "trace=none", "-e", f"inject={fault}"]
         begun_s = time.monotonic()
         restarts, flies, status, said = 0, False, 0, ""
@@ -190,7 +190,7 @@ class Board:
         }
 
     def close(self) -> None:
-        """Close the line."""
+        """Close the notification socket."""
         self._line.close()
 
     def _begin(self, wrapper: Sequence[str]) -> subprocess.Popen[str]:
@@ -217,7 +217,7 @@ class Board:
         return False
 
     def _end(self, begun: subprocess.Popen[str]) -> str:
-        """End a flight, its own guardian being the last; return what it wrote on standard error."""
+        """End a flight, of which the guardian ends last; return its standard error."""
         if begun.poll() is None:
             os.killpg(begun.pid, signal.SIGKILL)
         said = begun.communicate()[1] or ""
@@ -231,7 +231,7 @@ class Board:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Count how the starts went; name each that did not fly."""
+    """Count the outcomes of the starts; name each start that did not fly."""
     faults = [fault for result in results for fault in result["faults"]]
     flew = [fault for fault in faults if fault["flies"]]
     at_once = sum(not fault["waited"] and not fault["restarts"] for fault in flew)

@@ -1,8 +1,8 @@
 """Campaign `streaked`: attitudes from frames of streaks, of cameras unlike the model.
 
-As `resting`, by the same imperfections, with streaks of 10, 20 and 40 px in the middle of the frame and a
-turn about the boresight of up to that across it. Beside them rolling shutters of 0, 20 and 30 us a row,
-stated and not.
+The frames have the imperfections of the campaign `resting`, and streaks of 10, 20 and 40 px in the centre.
+The rotation about the boresight is at most that across it. Additional cameras have rolling shutters of 0, 20
+and 30 us per row, with known and unknown line time.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.resting import look_at, summarise
 
 STREAKS = (10.0, 20.0, 40.0)
-"""px."""
+"""Lengths of the streaks (px)."""
 ROLLING = (0.0, 20e-6, 30e-6)
-"""s from row to row."""
+"""Line times (s)."""
 _ABOUT = 1.0
 SHUTTERS = {
     f"rolling {1e6 * line_time:.0f} us, {'stated' if stated else 'unstated'}": Imperfection(

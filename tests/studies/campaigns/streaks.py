@@ -1,13 +1,16 @@
 """Campaigns `streaks` and `streaks-thesis`: Table 3.1, Figures 3.7-3.10, five estimators, Cramer-Rao bound.
 
-A cell is one theta (axis to boresight) and one turn in percent of the field (3.28). Every estimator sees the
-same frames. The magnitude's error is the thesis's metric for the rate; the vector's is larger, since the
-boresight component is weak, and has its own column. The attitude is that at an end of the exposure by ESOQ2
-with the true stars injected, in px by 3.29, across the boresight and whole. `streaks-thesis` has the thesis's
-camera, bilinear spots and uniform noise (2.5-2.11); its bound is of a camera with Poisson noise, for scale.
-As in the thesis (3.28), its streaks are lengthened by the exposure, at 0.05 rad/s, and the detectors' end
-biases are those of its spots (`measured_bias`). Its sky has the 7,000 brightest stars: those of the whole
-catalogue cross one another at 50 % of the field, which displaces ends by up to 1 px.
+A cell is one theta (axis to boresight) and one rotation in percent of the field (3.28). All estimators get
+the same frames. The error of the magnitude is the thesis's metric for the rate. The error of the vector has
+its own column; it is larger, because the component about the boresight is poorly determined. The attitude is
+that at an end of the exposure by ESOQ2 with the true identifications; its error is given in px by 3.29,
+across the boresight and in total.
+
+`streaks-thesis` has the thesis's camera, bilinear spots and uniform noise (2.5-2.11). Its bound, given for
+comparison, is that of a camera with Poisson noise. As in the thesis (3.28), the exposure determines the
+length of its streaks, at 0.05 rad/s. The biases of the detected ends are those of the thesis's spots
+(`measured_bias`). Its sky has the 7,000 brightest stars. With the whole catalogue, streaks would cross at 50
+% of the field, which displaces ends by up to 1 px.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ LIKELIHOOD = "likelihood"
 NO_BIAS: Mapping[str, float] = {}
 THESIS_CAMERA = StarCameraModel(field_of_view=FIELD, psf="bilinear", noise="uniform")
 THESIS_RATE = 0.05
-"""Rate (rad/s) at which the exposure gives a turn on the thesis's camera: that of its chapter 4."""
+"""Rate (rad/s) of the thesis's camera, at which the exposure gives the rotation: that of its chapter 4."""
 THESIS_BIAS: dict[str, float] = {
     "harris": -0.07,
     "minimum-eigenvalue": 0.36,
@@ -55,7 +58,7 @@ ESTIMATORS = (*DETECTOR_NAMES, LIKELIHOOD)
 BOUND_STARS = 30
 MATCH_PX = 6.0
 WRONG = 25.9
-# Table 3.1: rate % at 10 and 50 %, attitude px at 10 and 50 %, least theta in deg.
+# Table 3.1: rate error (%) at 10 and 50 %, attitude error (px) at 10 and 50 %, smallest theta (deg).
 THESIS = {
     "harris": (0.69, 0.07, 0.10, 0.10, 20),
     "minimum-eigenvalue": (1.20, 0.19, 0.19, 0.20, 30),
@@ -75,12 +78,12 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Let every estimator see one frame."""
+    """Run every estimator on one frame."""
     return see(case, StarCameraModel(field_of_view=FIELD))
 
 
 def run_thesis(case: Case) -> Result:
-    """Let every estimator see one frame of the thesis's camera."""
+    """Run every estimator on one frame of the thesis's camera."""
     exposure = case.parameters["percent"] / 100.0 * FIELD / THESIS_RATE
     return see(case, THESIS_CAMERA, exposure, THESIS_BIAS, faintest(BRIGHTEST))
 
@@ -92,7 +95,7 @@ def see(
     biases: Mapping[str, float] = NO_BIAS,
     limit: float = STAR_LIMIT,
 ) -> Result:
-    """Let every estimator see one frame of a camera; `biases` (px) replace those of the detectors."""
+    """Run every estimator on one frame of a camera; `biases` (px) replace those of the detectors."""
     generator = np.random.default_rng(case.seed)
     theta, fraction = np.deg2rad(case.parameters["theta"]), case.parameters["percent"] / 100.0
     scene = slew(generator, float(theta), fraction, exposure, limit, camera)
@@ -112,7 +115,7 @@ def see(
 def measured_bias(
     name: DetectorName, frames: int, seed: int, camera: StarCameraModel = THESIS_CAMERA
 ) -> float:
-    """Return the median inward displacement (px) of a detector's streak ends, over turns of 10 and 20 %."""
+    """Return the median inward displacement (px) of a detector's streak ends at rotations of 10 and 20 %."""
     settings = StreakSettings.of(name, saturation=float(camera.highest_count))
     inward: list[float] = []
     for frame in range(frames):
@@ -130,7 +133,7 @@ def measured_bias(
 
 
 def _nearest(ends: FloatArray, true: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the distance (n,) px from each streak (n, 2, 2) to the nearest true one (m, 2, 2), and which."""
+    """Return distance (n,), px, and index of the true streak (m, 2, 2) nearest to each of (n, 2, 2)."""
     distance = np.linalg.norm(true[None] - ends[:, None], axis=-1).max(axis=-1)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     star = distance.argmin(axis=1)
@@ -138,7 +141,7 @@ def _nearest(ends: FloatArray, true: FloatArray) -> tuple[FloatArray, IntArray]:
 
 
 def _bound(scene: Scene, camera: StarCameraModel) -> list[float] | None:
-    """Return the bound on magnitude and vector, 1 sigma, relative; None when the stars fix nothing."""
+    """Return the relative bounds (1 sigma) of magnitude and vector, or None if undetermined."""
     pinhole = camera.pinhole
     places = (scene.start, scene.middle, scene.end)
     seen = np.flatnonzero(np.any([pinhole.contains(place) for place in places], axis=0))
@@ -178,7 +181,7 @@ def _errors(found: Any, scene: Scene, camera: StarCameraModel) -> Result:
 
 
 def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float | None, float | None]:
-    """Return the mean error of the two ends' attitudes in px (3.29), whole and across; None without one."""
+    """Return the mean attitude error of the two ends in px (3.29), in total and across; None without one."""
     ends = found.endpoints[found.used]
     true = np.stack([scene.start, scene.end], axis=1)
     distance, star = _nearest(ends, true)
@@ -201,7 +204,7 @@ def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float 
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return the table by cell and estimator, the table of the thesis, and Figures 3.7-3.10."""
+    """Return the table by cell and estimator, the table of the thesis, and Figures 3.7 to 3.10."""
     cells = []
     for theta in THETAS_DEG:
         for percent in PERCENTS:
@@ -235,9 +238,10 @@ def _cell(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _overall(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return the likelihood estimator's figures by turn, all theta together.
+    """Return the likelihood estimator's figures by rotation, over all theta.
 
-    Wrong is a rate whose normalised squared error exceeds what one in 100,000 has (chi-square of 3).
+    A rate is wrong if its normalised squared error exceeds the 1 - 1e-5 quantile (chi-square of 3 degrees of
+    freedom).
     """
     rows = []
     for percent in PERCENTS:
@@ -275,9 +279,9 @@ def _ratio(errors: Sequence[float], bound: FloatArray) -> float | None:
 
 
 def _table_3_1(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return Table 3.1: the largest mean error within each detector's precise region, thesis and here.
+    """Return Table 3.1: the largest mean error within each detector's precise region, of the thesis and here.
 
-    Of the rate in parts, here, and in percent in the thesis; of the attitude in px.
+    Rate errors are fractions here and percentages in the thesis. Attitude errors are in px.
     """
     rows = []
     for name in ESTIMATORS:

@@ -1,10 +1,10 @@
-"""Campaign `structured-limbs`: sunlit limbs behind the spacecraft's own structure, field of view wrong.
+"""Campaign `structured-limbs`: sunlit limbs behind the spacecraft's structure, with a wrong field of view.
 
 A boom, panel or rim of random shape and brightness (dark, grey, or lit and textured) covers 5 to 20 % of the
-frame and at most half of the limb in view. Its mask is `configured` with the polygon, or `learned` from 30
-earlier frames of the same camera at random attitudes, or there is `none`. The focal length is wrong by a
-normal error of 5 %, which the finder knows. Altitudes, air and cameras are those of the campaign `nadir`.
-The kind `real` is the photograph of OPS-SAT, turned and mirrored; its truth is the limb without structure.
+frame and at most half of the visible limb. The mask is `configured` as a polygon, `learned` from 30 earlier
+frames of the same camera at random attitudes, or `none`. The focal length has a normal error of 5 %, which is
+known as its uncertainty. Altitudes, atmosphere and cameras are those of the campaign `nadir`. The kind `real`
+is the photograph of OPS-SAT, rotated and mirrored; its truth is the limb found without structure.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MASKS = ("configured", "learned", "none")
 KNOWN = ("nothing", "altitude", "flight")
 FIELD_SIGMA = 0.05
 EARLIER = 30
-"""Frames from which a mask is learned."""
+"""Number of frames from which a mask is learned."""
 PHOTOGRAPH = Path(__file__).resolve().parents[4] / "shared/data/limb/opssat1_2020-08-16T062350.png"
 PHOTOGRAPH_FIELD, PHOTOGRAPH_ALTITUDE = np.radians(12.8), 515e3
 
@@ -56,7 +56,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Search one limb with each kind of knowledge."""
+    """Search one limb with each kind of mask and prior knowledge."""
     generator = np.random.default_rng(case.seed)
     search = _photograph if case.parameters["kind"] == "real" else _rendered
     return {**case.parameters, "seed": list(case.seed), **search(case.parameters["mask"], generator)}
@@ -90,10 +90,10 @@ def levels_of(frame: Image) -> tuple[float, float]:
 
 
 def covered(frame: Image, mask: BoolArray, look: tuple[str, int], levels: tuple[float, float]) -> Image:
-    """Return the frame with a structure whose light does not change.
+    """Return the frame with a structure of constant brightness.
 
-    `look` is the kind of the structure and the seed of its surface, `levels` the counts of dark and of bright
-    pixels.
+    `look` is the kind of the structure and the seed of its surface; `levels` are the counts of dark and of
+    bright pixels.
     """
     (kind, seed), (low, high) = look, levels
     generator = np.random.default_rng(seed)
@@ -188,7 +188,7 @@ def _photograph(_: str, generator: np.random.Generator) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the fraction of limbs found and NEES, of each mask and knowledge."""
+    """Return the fraction of detected limbs and the NEES, for each mask and prior knowledge."""
     rows = []
     for kind, mask in dict.fromkeys((r["kind"], r["mask"]) for r in results):
         of = [r for r in results if (r["kind"], r["mask"]) == (kind, mask)]

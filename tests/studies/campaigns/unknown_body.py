@@ -1,10 +1,10 @@
 """Campaign `unknown-body`: attitude knowledge of satellites that differ from their description, in the loop.
 
-Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another place of the orbit with a
+Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another position of the orbit with a
 tumble, whose rate is lower than the configured one so that all phases fit into the flight. Body, coils and
 sensors differ from the configuration within the accuracies that the configuration states
 (`simulation.free_body.errors`). Cells `NAME-tumble` are the beginnings of these flights, in which most bodies
-are still tumbling; they show within minutes whether the filter is honest.
+are still tumbling; they show within minutes whether the claimed uncertainty is correct.
 
 The attitude is judged in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse. NEES
 is that of one axis, from samples 10 s apart, about the body axes and about those of the star camera. The
@@ -105,7 +105,7 @@ def facts(flown: Run, config: OrbitConfig) -> Result:
     """Return the figures of one flight."""
     body, camera = attitude_errors(flown), camera_errors(flown)
     packets, stars, rates = flown["navigation"], flown["stars"], flown["streak"]
-    # A measurement that comes before the first estimate is not refused by the filter.
+    # The filter has not rejected a measurement that comes before the first estimate.
     begun = body.times[0] if len(body.times) else math.inf
     measured = np.isfinite(stars["quaternion"][:, 0]) & (seconds(stars) > begun)
     rated = np.isfinite(rates["rate"][:, 0]) & (seconds(rates) > begun)
@@ -173,7 +173,7 @@ def _figures(errors: AttitudeErrors, inside: BoolArray) -> list[float]:
 
 
 def _excursions(flown: Run, body: AttitudeErrors) -> dict[str, float]:
-    """Return how many samples of an axis are fine and how many are beyond, and the longest excursion, s."""
+    """Return the counts of fine and of excessive samples of an axis, and the longest excursion (s)."""
     packets = flown["navigation"]
     at = np.maximum(np.searchsorted(seconds(packets), body.times, side="right") - 1, 0)
     fine = packets["knowledge"][at] == FINE

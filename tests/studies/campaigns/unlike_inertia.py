@@ -45,7 +45,7 @@ DURATIONS = {
 }
 """Time (s) of the flights of each phase and state of the coils."""
 _FIRST = 4
-"""Number of the states that were flown first; their numbers, and so their seeds, stay the same."""
+"""Number of the states that were flown first; their numbers and seeds stay the same."""
 ONSET = 10.0
 """Latest onset (s) of a fault."""
 SOON = 30.0

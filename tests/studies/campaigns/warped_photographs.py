@@ -87,7 +87,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return how often warped photographs are solved within their claims, of each kind."""
+    """Return how often warped photographs of each kind are solved within their claims."""
     rows = []
     for kind in dict.fromkeys(r["kind"] for r in results):
         of = [r for r in results if r["kind"] == kind]

@@ -1,10 +1,10 @@
 """Campaign `worlds`: runs of the same craft in the project's world and in Basilisk.
 
-`detumble/` flies the campaign `detumble`'s KnightCube by its two laws in turns, `nadir/` holds nadir as
-`orbit-pointing` does, 3U and KnightCube in turns at SHARE of the worst torques; only the world is another.
-Day bulge, ring current and the walks of air and dipole, which Basilisk lacks, are off in both; its field is
-WMM2025, ours IGRF-14. Wanted: times, errors and coil energies within 20 % in the median. Needs the extra
-`worlds`.
+`detumble/` flies the KnightCube of the campaign `detumble`, alternately by two laws. `nadir/` holds nadir as
+`orbit-pointing` does, alternately with 3U and KnightCube, at SHARE of the worst torques. Only the worlds
+differ. Basilisk has no day bulge, no ring current and no random walks of air density and dipole, so they are
+off in both worlds. Its field is WMM2025; that of this project is IGRF-14. Times, errors and coil energies
+should agree within 20 % in the median. The campaign needs the extra `worlds`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ LAWS = ("magnetometer", "attitude")
 WITHIN = 0.2
 SHARE = 0.3
 FIGURES = {"detumble": ("seconds",), "nadir": ("nadir_rms", "knowledge_rms", "mean_square")}
-"""Of each kind of flight what is compared: s; deg off nadir; deg not known; A^2 m^4 of the coils."""
+"""Compared figures of each kind of flight: time (s); angle (deg) off nadir; attitude error (deg); squared
+dipole (A^2 m^4) of the coils.
+"""
 _FLY = {"detumble": detumble.run, "nadir": orbit_pointing.run}
 
 
@@ -67,7 +69,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return each flight's figures in both worlds, and how they compare."""
+    """Return each flight's figures in both worlds, and their comparison."""
     facts: dict[str, Any] = {"lost": sum(result["lost"] for result in results)}
     lines: list[str] = []
     for kind, figures in FIGURES.items():
@@ -81,7 +83,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _compared(results: Sequence[Result], figure: str, lines: list[str]) -> dict[str, Any]:
-    """Return how one figure compares over the flights that both worlds have; add its table to `lines`."""
+    """Return the comparison of one figure over the flights of both worlds; add its table to `lines`."""
     values: dict[str, dict[str, float]] = {}
     for result in results:
         values.setdefault(result["flight"], {})[result["world"]] = result[figure]
