@@ -156,7 +156,7 @@ class Board:
         }
 
     def trace(self) -> tuple[Counter[str], Counter[str]]:
-        """Return the numbers of calls by kind in a start: all, and those before the configuration is opened."""
+        """Return the numbers of calls by kind: all, and those before the configuration."""
         path = self._place / "trace"
         strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)

@@ -20,4 +20,4 @@ def test_a_flight_is_judged_by_when_it_knew_its_attitude_and_how_well(tmp_path: 
 
 
 SEEING = 2
-"""A flight with the Sun and the lit Earth outside the camera's field at the start."""
+"""Number of a flight that starts with the Sun and the lit Earth outside the camera's field."""

@@ -34,7 +34,7 @@ def test_an_unknown_bench_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.parametrize("name", ["plan", "likelihood", "mid_exposure"])
 def test_a_bench_gets_its_own_arguments(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a main with a list of arguments, and of a main that reads the command line."""
+    """Test a main function with a list of arguments, and one that reads the command line."""
     with pytest.raises(SystemExit) as stopped:
         bench.main([name, "--help"])
     assert stopped.value.code == 0
@@ -42,7 +42,7 @@ def test_a_bench_gets_its_own_arguments(name: str, capsys: pytest.CaptureFixture
 
 
 def test_the_bench_of_the_attitudes_asks_the_tracker_before_and_after_the_sky_is_known() -> None:
-    """One frame of long streaks: both attitudes lie within some sigmas of the truth."""
+    """Solve one frame of long streaks: both attitudes are within some sigmas of the truth."""
     rows = attitude_rows(30.0, 1, 5, 8.5, 0.2)
     assert [row["solution"] for row in rows] == list(SOLUTIONS)
     for row in rows:

@@ -111,7 +111,7 @@ def test_a_second_campaign_in_the_same_folder_is_refused(tmp_path: Path) -> None
 
 
 def test_a_damaged_line_is_dropped_and_the_last_line_is_whole(tmp_path: Path) -> None:
-    """A power failure can leave zeros in the middle, and a kill a part of the last line."""
+    """A power failure can leave zeros in the middle of the file, and a kill can truncate the last line."""
     fly(TOY, 0, 3, tmp_path)
     log = tmp_path / "results.jsonl"
     log.write_text(

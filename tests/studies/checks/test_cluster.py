@@ -48,7 +48,7 @@ TOY = Campaign("toy-cluster", "adds draws", cases, draw, summarise, 40)
 
 @contextmanager
 def started(folder: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Start `dask ...` as its documentation says, in a folder elsewhere and without our paths."""
+    """Start `dask ...` as in its documentation, in another folder and without our import paths."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     command = [sys.executable, "-m", "dask", *words]
     with (folder / "dask.log").open("ab") as log:
@@ -62,7 +62,7 @@ def started(folder: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Start a scheduler and two workers; yield the address, and the processes, the scheduler first."""
+    """Start a scheduler and two workers; yield the address and the processes, with the scheduler first."""
     facts = folder / "scheduler.json"
     where = ("--scheduler-file", str(facts))
     worker = ("worker", *where, "--no-nanny", "--nthreads", "1", *HOST)

@@ -18,7 +18,7 @@ from tests.support.ideal_power import clairvoyant_power
 def test_the_clairvoyant_optimum_is_the_one_that_was_computed_elsewhere(
     stiffness: float, milliwatts: float
 ) -> None:
-    """Three threads, by Hermite-Simpson collocation and an interior-point solver: issue 2's definition."""
+    """The values are from a Hermite-Simpson collocation with an interior-point solver (issue 2)."""
     thread = Thread(stiffness=stiffness, damping=2e-6 if stiffness else 0.0)
     world = configuration.replace(demo_world(), thread=thread)
     power = clairvoyant_power(demo_config(700.0), world)
@@ -34,7 +34,7 @@ def test_every_controller_flies_its_own_configuration() -> None:
 
 
 def test_both_threads_are_flown_and_reported_apart() -> None:
-    """Two made-up flights on the stiff thread; only the stiffness of its world differs from ours."""
+    """Summarise two invented flights; their world differs from the demonstration's only in stiffness."""
     cases = controllers.CONTROLLERS_CAMPAIGN.cases(2, 1)
     stiff = [case for case in cases if case.parameters["thread"] == controllers.THICK]
     assert len(stiff) == 2 * len(controllers.STIFF)
@@ -72,7 +72,7 @@ def test_worlds_differ_and_stay_within_their_bounds() -> None:
 
 @pytest.mark.slow
 def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
-    """Seed 1, world 1, under this loop."""
+    """Fly world 1 of seed 1 under this project's loop."""
     result = robust_controllers.run(Case("this loop/1", (1, 1), {"controller": "this loop"}))
     assert not result["lost"]
     assert result["settling_s"] < 12.0

@@ -28,7 +28,7 @@ def test_along_a_field_that_stands_no_time_suffices() -> None:
 
 
 def test_what_lies_along_a_field_that_turns_waits_for_the_turn() -> None:
-    """Torques across the field must cancel: a direction half of the turn ahead asks for more than h's own."""
+    """Torques across the field cancel, so a direction half of the rotation ahead has the larger bound."""
     speed = 2.2e-3
     turning = STRENGTH * np.stack([np.sin(speed * MIDDLES), 0.0 * MIDDLES, np.cos(speed * MIDDLES)], axis=1)
     own = np.arccos(1.0 - 1e-4 * speed / (REACH * STRENGTH)) / speed
@@ -46,7 +46,7 @@ def test_a_torque_of_other_causes_shortens_the_bound() -> None:
 
 
 def test_no_control_of_full_strength_beats_the_bound() -> None:
-    """Dipoles along -B x (h + a constant vector) include the greedy one and some that wait for the field."""
+    """Dipoles along -B x (h + constant vector) include the greedy law and laws that wait for the field."""
     speed, rng = 2.2e-3, np.random.default_rng(7)
     turning = STRENGTH * np.stack([np.sin(speed * MIDDLES), 0.0 * MIDDLES, np.cos(speed * MIDDLES)], axis=1)
     for _ in range(40):

@@ -39,7 +39,7 @@ ALL = frozenset({"sun", "nadir", "field"})
 
 
 class Sky:
-    """A body that turns at a constant rate under a Sun, an Earth and a field that stand still."""
+    """A body that rotates at a constant rate under a fixed Sun, Earth and field."""
 
     def __init__(self, seed: int = 1) -> None:
         self._rng = np.random.default_rng(seed)
@@ -52,7 +52,7 @@ class Sky:
     def show(
         self, estimator: AttitudeDetermination, seconds: float, sensors: frozenset[str], gyro: bool = True
     ) -> None:
-        """Give the filter what these sensors see."""
+        """Give the filter the measurements of the named sensors."""
         now_ns = round(seconds * SECOND)
         turn = attitude_matrix(self.attitude(seconds))
         if gyro:
@@ -76,20 +76,20 @@ class Sky:
         sensors: frozenset[str],
         gyro: bool = True,
     ) -> Report:
-        """Show the sensors twice a second, and return the report at the end."""
+        """Give measurements twice a second, and return the report at the end."""
         for half in range(round(2 * begin), round(2 * end)):
             self.show(estimator, 0.5 * half, sensors, gyro)
         return estimator.report(round((end - 0.5) * SECOND))
 
     def errors(self, report: Report) -> FloatArray:
-        """Return the attitude's error over its sigma, (3,)."""
+        """Return the attitude error over its sigma (3,)."""
         assert report.estimate is not None
         truth = self.attitude(report.time_ns / SECOND)
         return rotation_vector(multiply(truth, conjugate(report.estimate.quaternion))) / report.sigma
 
 
 def begun(sensors: frozenset[str] = ALL, seconds: float = 60.0) -> tuple[Sky, AttitudeDetermination]:
-    """Return a sky and what has watched it for a while."""
+    """Return a sky, and a filter that has received its measurements for some time."""
     sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
     sky.fly(estimator, 0.0, seconds, sensors)
     return sky, estimator
@@ -97,12 +97,12 @@ def begun(sensors: frozenset[str] = ALL, seconds: float = 60.0) -> tuple[Sky, At
 
 @pytest.mark.parametrize("pair", [{"sun", "nadir"}, {"sun", "field"}, {"nadir", "field"}])
 def test_any_two_of_three_begin_honestly(pair: set[str]) -> None:
-    """NEES of the first attitude and of that 15 s later, 24 seeds: in the 99.9 % band of 3 x 24."""
+    """Check the NEES of the first attitude and of that 15 s later over 24 seeds (99.9 % band)."""
     for seconds in (1.5, 15.0):
         total = 0.0
         for seed in range(24):
             sky, estimator = Sky(seed), AttitudeDetermination(SETTINGS)
-            # Every satellite has a hard iron and a bias of its own.
+            # Each seed has another hard iron bias and gyro bias.
             rng = np.random.default_rng(1000 + seed)
             sky.hard_iron = SETTINGS.field_bias_start * rng.standard_normal(3)
             sky.bias = SETTINGS.bias_start * rng.standard_normal(3)
@@ -116,7 +116,7 @@ def test_any_two_of_three_begin_honestly(pair: set[str]) -> None:
 
 
 def test_directions_that_contradict_each_other_begin_nothing() -> None:
-    """A wrong direction of the Sun: its angle to nadir is off by 3 deg, with sigmas of 0.02 deg."""
+    """The angle between Sun and nadir is wrong by 3 deg, with sigmas of 0.02 deg."""
     sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
     estimator.rate(0, RATE)
     turn = attitude_matrix(sky.attitude(0.0))
@@ -146,7 +146,7 @@ def test_without_what_is_lost_it_goes_on_and_says_how_well(left: set[str], statu
     if status is Status.COASTING:
         assert np.all(report.sigma > 5.0 * before.sigma)
     elif status is Status.AIDED and "sun" in left:
-        # Across the Sun it stays what it was, about it it drifts.
+        # Across the Sun the attitude stays known; about the Sun it drifts.
         assert report.estimate is not None
         about = attitude_matrix(report.estimate.quaternion) @ SUN
         spread = report.estimate.covariance[ATTITUDE, ATTITUDE]
@@ -188,7 +188,7 @@ def test_a_worthless_estimate_is_discarded_and_determination_restarts() -> None:
 
 
 def test_sensors_that_all_show_another_attitude_are_believed_in_the_end() -> None:
-    """The filter, not the sky, is wrong: a body that was turned by hand while nothing looked."""
+    """The body was rotated while no sensor was in use, so the filter's attitude is wrong."""
     sky, estimator = begun(seconds=30.0)
     turned = from_rotation_vector(np.array([0.0, 0.5, 0.0]))
     for half in range(60, 240):

@@ -22,7 +22,7 @@ _FRAMES = 6
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Return a frame to judge answers about; its rate is what counts."""
+    """Return a frame whose rate is the truth for invented answers."""
     return slew(np.random.default_rng(_SEED), 1.0, 0.1, 0.2, limit=4.0)
 
 
@@ -41,7 +41,7 @@ def test_the_first_call_of_a_process_loads_code_and_is_not_timed() -> None:
 
 
 def _answer(scene: Scene, error: float, sigma: float) -> MotionResult:
-    """Return an answer whose rate is `error` too large, and claimed to `sigma`, both in parts of the rate."""
+    """Return an answer with a relative rate error of `error` and a claimed relative sigma of `sigma`."""
     size = float(np.linalg.norm(scene.rate))
     covariance = (sigma * size) ** 2 * np.eye(3)
     return MotionResult(
@@ -100,13 +100,13 @@ def test_every_frame_has_five_usable_stars_and_is_the_same_again() -> None:
 
 @pytest.fixture(scope="module")
 def results() -> list[Result]:
-    """Return a slice of the campaign, as the command runs it."""
+    """Return a slice of the campaign, run as by the command."""
     return fly_here(failures.FAILURES, _FRAMES, _SEED)
 
 
 @pytest.mark.slow
 def test_a_slice_has_no_wrong_answer_no_refusal_and_honest_covariances(results: list[Result]) -> None:
-    """NEES of 3 a frame: the sum is a chi-square, below its 99.99 % limit."""
+    """The sum of the NEES (3 per frame) is below the 99.99 % quantile of its chi-square."""
     assert [result["verdict"] for result in results] == ["right"] * _FRAMES
     assert sum(result["nees"] for result in results) < 50.0
     assert not any(result["warnings"] for result in results)
@@ -126,7 +126,7 @@ def test_the_summary_counts_draws_and_names_the_frames_to_look_at(
 
 @pytest.mark.slow
 def test_a_fit_whose_ends_lie_in_the_dark_is_corrected() -> None:
-    """The first guess from four merged streaks is 3 % too long; uncorrected, the NEES is 549."""
+    """The first guess from four merged streaks is 3 % too long. Without a correction the NEES is 549."""
     found = failures.run(failures.cases(140, 61122)[139])
     assert found["verdict"] == "right"
     assert found["nees"] < 16.0

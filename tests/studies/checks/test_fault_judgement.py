@@ -1,4 +1,4 @@
-"""Tests of which faults count as exercised."""
+"""Tests that determine which faults count as exercised."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _TIMING = np.dtype([("time_ns", "<i8"), ("name", "S12"), ("execution", "<f8"), (
 def test_a_worker_meets_a_fault_only_with_a_job_that_was_begun_under_it(
     at: float, end: float, met: bool
 ) -> None:
-    """One plan, begun at 5.025 s, reported after the modelled 0.05 s, however long it really took."""
+    """One plan begins at 5.025 s and is reported after the modelled 0.05 s, whatever its real duration."""
     jobs = np.array([(5_075_000_000, b"planner", 0.0112, b"done")], dtype=_TIMING)
     flown, kind = {"job_timing": jobs}, CATALOGUE["planner: exception"]
     assert fault_judgement._is_worker_busy(flown, kind, at, end) == met  # type: ignore[arg-type]
@@ -36,7 +36,7 @@ def test_a_worker_meets_a_fault_only_with_a_job_that_was_begun_under_it(
 
 @pytest.mark.parametrize(("current", "met"), [(0.008, False), (0.024, False), (0.03, True)])
 def test_a_monitor_that_doubles_little_reports_nothing_wrong(current: float, met: bool) -> None:
-    """Twice 8 mA is within the error of a reading of 8 mA, so no monitor can judge."""
+    """Twice 8 mA is within the error of a reading of 8 mA, so no monitor can distinguish them."""
     control = np.zeros(400, dtype=[("time_ns", "<i8"), ("current_written", "<f8", 3)])
     control["time_ns"] = np.arange(400) * 25_000_000
     control["current_written"][:, 0] = -current

@@ -19,12 +19,12 @@ from tests.support.flights import config_for, demo_world, event_names, fly
 
 AT = 5.0
 BRIEF = 14.0
-"""s, of a flight with one fault: enough for it to be found, to end, and to be recovered from."""
+"""Duration (s) of a flight with one fault: long enough to find the fault, end it, and recover."""
 
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let flights of the campaign end sooner."""
+    """Shorten the flights of the campaign."""
     for module in (faults, fault_judgement):
         monkeypatch.setattr(module, "DURATION", BRIEF)
 
@@ -80,14 +80,17 @@ def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch
 
 
 class Doctored(dict[str, Any]):
-    """Packets that can be written to, in a run's place."""
+    """Writable packets that replace those of a run."""
 
     logs: Any
 
 
 @pytest.mark.usefixtures("brief")
 def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any) -> None:
-    """The log of a flight whose unit falls silent, as if the loop had gone on: both figures ring."""
+    """The log of a flight with a silent unit is changed as if the loop had continued.
+
+    Both figures must show it.
+    """
     entry = FaultEntry(fault="imu: silent", at=AT, span=3.0)
     section = configuration.replace(demo_world(), seed=3, faults=(entry,))
     run = fly(config_for("testbed-demo", camera=False, duration=BRIEF), tmp_path, section=section)
@@ -119,7 +122,10 @@ def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
 @pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("mode", [mode for mode in faults.MODES if mode not in {"detumble", "slew"}])
 def test_the_twin_without_a_fault_reports_none_of_their_events(mode: str, tmp_path: Any) -> None:
-    """The same seed and mode as the flights with faults above; the two other modes are below."""
+    """Fly the seeds and modes of the faulty flights above without a fault.
+
+    Another test has the other two modes.
+    """
     section = configuration.replace(demo_world(), seed=3)
     run = fly(config_for(mode, camera=False, duration=BRIEF), tmp_path, section=section)
     assert not set(event_names(run)) & frozenset().union(*fault_table.OWN.values(), {"stream-poor"})

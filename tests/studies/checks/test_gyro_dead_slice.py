@@ -12,7 +12,7 @@ from tests.studies.campaigns.gyro_dead import GYRO_DEAD, run
 def test_a_tumbling_satellite_without_a_gyro_knows_attitude_and_rate_within_its_claims(
     tmp_path: Path,
 ) -> None:
-    """Within seconds of the first star attitude, attitude and rate are known."""
+    """Attitude and rate are known within seconds of the first star attitude."""
     case = next(case for case in GYRO_DEAD.cases(1, 3) if case.key == "orbit/0")
     result = run(replace(case, parameters={**case.parameters, "duration": 26.0}))
     assert result["at"] == 0.0

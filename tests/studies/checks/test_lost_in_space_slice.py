@@ -20,7 +20,7 @@ LISTS = 6
 
 @pytest.fixture(scope="module")
 def results() -> list[Result]:
-    """Nominal lists."""
+    """Return the results of nominal lists."""
     cases = [
         Case(f"nominal/0/{run}", (20_261_121, 0, run), {"axis": "nominal", "value": 0.0})
         for run in range(LISTS)
@@ -50,7 +50,7 @@ def test_no_two_cases_share_a_key_or_a_seed() -> None:
 
 
 def test_an_answer_off_by_more_than_the_noise_allows_is_wrong() -> None:
-    """The truth itself is right; the same attitude turned by half a degree is wrong; no answer is refused."""
+    """The true attitude is right, and the same attitude rotated by half a degree is wrong."""
     sky = lost_in_space.known_sky(15.0)
     drawn = draw(ListKind(field_deg=15.0, known_deg=0.0), sky.index.stars, np.random.default_rng(7))
     field = drawn.field()

@@ -35,7 +35,7 @@ def _moments(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def test_a_star_at_rest_has_its_place_its_light_and_the_point_spreads_moments() -> None:
-    """Of an ellipse turned by 0.6 rad, and the pixel's and a cell's square beside it."""
+    """The point spread is a rotated ellipse, convolved with the squares of a pixel and of a cell."""
     star = _PINHOLE.unit_vectors(np.array([[40.3, 44.6]]))[0]
     image = _rendered(Optics((gaussian(1.0, 1.3, 0.6),)), star)
     assert image.sum() == pytest.approx(1000.0, rel=1e-4)
@@ -103,7 +103,7 @@ def test_an_axis_5_px_off_is_within_what_is_claimed_unless_the_lens_is_called_ex
 
 @pytest.mark.slow
 def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rate() -> None:
-    """1 % at the corner, where a correction after the fit left up to 1.5 % of the rate."""
+    """The distortion is 1 % at the corner. A correction after the fit leaves up to 1.5 % of the rate."""
     for run in range(3):
         case = next(c for c in mismatch.mismatch_cases(run + 1, _SEED) if c.key == f"distortion 1 % 30 {run}")
         result = mismatch.run_mismatch(case)
@@ -114,7 +114,7 @@ def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rat
 
 @pytest.mark.slow
 def test_an_elongated_point_spread_that_nobody_described_is_refused_on_short_streaks() -> None:
-    """A body that shakes along one axis, faster than is seen, draws the same streaks, and ends elsewhere."""
+    """A body that vibrates fast along one axis draws the same streaks with other end points."""
     result = mismatch.run_mismatch(_case("ellipse 1:2 turned", 0))
     assert result["nees"] is None
 

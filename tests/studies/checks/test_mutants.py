@@ -89,7 +89,7 @@ def changes(source: str) -> set[str]:
     ],
 )
 def test_one_line_is_changed(source: str, expected: set[str]) -> None:
-    """Each kind of change."""
+    """Check each kind of change."""
     assert changes(source) == expected
 
 
@@ -117,7 +117,10 @@ def test_a_change_without_an_effect_is_not_a_mutant(source: str) -> None:
 def test_killed_survived_and_equivalent(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each result, the file of results, and an unchanged checkout; a test that always fails kills nothing."""
+    """Check each verdict, the file of results, and the unchanged checkout.
+
+    A test that always fails kills no mutant.
+    """
     known = tmp_path / "known.yaml"
     known.write_text(
         "- {line: return number + 7, mutant: return None, reason: nobody reads it}\n", encoding="utf-8"
@@ -138,7 +141,7 @@ def test_killed_survived_and_equivalent(
 
 
 def test_a_hang_is_killed(repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mutant whose loop never ends counts as found by the time limit."""
+    """The time limit kills a mutant whose loop never ends."""
     monkeypatch.setattr(mutants, "LIMIT_S", 3.0)
     found = mutants_of(PRODUCT, "knightcube/product.py")
     [endless] = [mutant for mutant in found if mutant.text == "(number >= 0)"]
@@ -147,7 +150,7 @@ def test_a_hang_is_killed(repository: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_draw_depends_on_the_seed_only() -> None:
-    """Lines are drawn once each, and again by the same seed."""
+    """No line is drawn twice, and the same seed draws the same lines."""
     only = ["knightcube/astro", "hal/drivers"]
     drawn = draw(ROOT, 100, 5, only)
     assert drawn == draw(ROOT, 100, 5, only) != draw(ROOT, 100, 6, only)
@@ -156,26 +159,26 @@ def test_draw_depends_on_the_seed_only() -> None:
 
 
 def test_wrong_path_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    """One line that names the path."""
+    """The error is one line that names the path."""
     assert main(["--only", "knightcube/none.py"]) == 2
     assert capsys.readouterr().err.startswith("mutants: --only knightcube/none.py:")
 
 
 def test_mirrored_tests_come_first() -> None:
-    """The mirrored file, then those that import the module, then the folder."""
+    """The mirrored file comes first, then the files that import the module, then the rest of the folder."""
     tests = mirrored_tests(ROOT, "knightcube/astro/quaternion.py")
     assert tests[0] == "tests/knightcube/astro/test_quaternion.py"
     assert all(name.startswith("tests/knightcube/astro/") for name in tests)
 
 
 def test_equivalent_mutants_have_reasons() -> None:
-    """Each entry of the committed list."""
+    """Check each entry of the committed list."""
     entries = yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8"))
     assert all(len(entry["reason"].split()) >= 4 for entry in entries)
 
 
 def test_slice_of_product_code(tmp_path: Path) -> None:
-    """Two mutants of the repository itself that return nothing are killed by any test of their functions."""
+    """Any test of the functions kills two mutants of the repository that return None."""
     drawn = draw(ROOT, 400, 1, ["knightcube/astro/quaternion.py"])
     found = [one for one in drawn if one.text == "return None"][:2]
     assert len(found) == 2

@@ -19,7 +19,7 @@ def slice_() -> list[Result]:
 
 @pytest.mark.slow
 def test_a_slice_of_the_campaign_has_no_wrong_answer_and_honest_covariances(slice_: list[Result]) -> None:
-    """NEES of 2 a frame: eight make a chi-square of 16, below 40 in 99.92 % of all slices."""
+    """The sum of eight NEES is a chi-square of 16 degrees of freedom, below 40 in 99.92 % of all slices."""
     assert {r["verdict"] for r in slice_} <= {"right", "refused", "ambiguous", "no-horizon"}
     answers = [r for r in slice_ if r["nees"] is not None]
     assert len(answers) >= 7

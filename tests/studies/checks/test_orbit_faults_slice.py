@@ -27,7 +27,7 @@ from tests.studies.campaigns.orbit_fault_flights import (
 from tests.support.flights import fly
 
 BRIEF, LAST = 34.0, 6.0
-"""s, of a flight, and at its end in which the body must do again what it is for."""
+"""Durations (s) of a flight, and of its end in which the body must fulfil the purpose of its mode again."""
 AT, SPAN = 12.0, 10.0
 
 
@@ -54,7 +54,7 @@ def test_a_receiver_that_repeats_its_fix_is_reported_and_the_body_points_on(tmp_
 
 
 class Doctored(dict[str, Any]):
-    """Packets that can be written to, in a run's place."""
+    """Writable packets that replace those of a run."""
 
     logs: Any
 
@@ -106,7 +106,7 @@ def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
 def refly(
     monkeypatch: pytest.MonkeyPatch, seed: int, number: int, fault: str, mode: str, seconds: float
 ) -> dict[str, Any]:
-    """Fly a flight of the campaign again, for so long, whatever faults the catalogue has gained since."""
+    """Repeat a flight of the campaign with a named fault, whatever the order of the catalogue."""
     monkeypatch.undo()
     for module in (orbit_faults, orbit_fault_flights, judgement):
         monkeypatch.setattr(module, "DURATION", seconds)
@@ -118,7 +118,7 @@ def refly(
 def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Number 97 of seed 3: they taught a bias of 0.5 deg/s, from which each attitude began again in vain."""
+    """Flight 97 of seed 3: false pictures caused a bias of 0.5 deg/s; then every new attitude failed."""
     found = refly(monkeypatch, 3, 97, "wide: wrong", "acquire", 48.0)
     assert found["event"] == "wide-false"
     assert found["works"]
@@ -128,9 +128,9 @@ def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
 def test_braking_goes_on_with_a_unit_that_restarted_at_another_phase(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Number 0 of seed 4: its samples came a millisecond before the commands.
+    """Flight 0 of seed 4: the samples of the unit came a millisecond before the commands.
 
-    The brake took none of them, and braked half a minute by what it predicted, 2.5 deg/s off.
+    The detumbler rejected all of them, and used its prediction for half a minute, which was 2.5 deg/s off.
     """
     found = refly(monkeypatch, 4, 0, "imu: off", "detumble", 56.0)
     assert found["works"]

@@ -19,7 +19,7 @@ SEED = 20_261_121
 
 @pytest.fixture(scope="module")
 def seen() -> list[Result]:
-    """Two revolutions, and UW's headings at three heights of the Sun."""
+    """Return two revolutions, and the table of headings of UW at three elevations of the Sun."""
     cases = [
         case for case in coverage.cases(2, SEED) if case.parameters.get("beta", 15.0) in (0.0, 15.0, 60.0)
     ]
@@ -27,7 +27,10 @@ def seen() -> list[Result]:
 
 
 def test_vt_has_the_horizon_in_all_three_cameras_to_14_deg_of_tilt() -> None:
-    """4.1 says 15; by its own 67 deg field and a limb 19.3 deg down the edge is at 33.5 - 19.3 = 14.2."""
+    """Section 4.1 states 15 deg.
+
+    Its field of 67 deg and a limb at 19.3 deg down give 33.5 - 19.3 = 14.2 deg.
+    """
     dip = np.degrees(np.arccos(6378.1366 / (6378.1366 + 380.0)))
     assert np.degrees(coverage.all_three_up_to()) == pytest.approx(33.5 - dip, abs=0.2)
 
@@ -37,10 +40,10 @@ def test_the_shares_are_the_paper_s(seen: list[Result]) -> None:
     for share in shares:
         assert share["vt/level"]["horizon"][3] == 1.0
         assert share["uw/level"]["horizon"][4] == 0.0
-        # 4.1: within 15 deg the horizon is in all three cameras, except in the last degree.
+        # 4.1: within 15 deg of tilt the horizon is in all three cameras, except in the last degree.
         assert share["vt/within 15 deg"]["horizon"][3] > 0.97
         assert sum(share["vt/within 15 deg"]["horizon"][:2]) == 0.0
-        # 4.3: tipped back and forth by 90 deg, at least two cameras at all times.
+        # 4.3: pitched back and forth by 90 deg, at least two cameras have the horizon at all times.
         assert sum(share["usu/tipped 90 deg"]["horizon"][:2]) == 0.0
         assert sum(share["vt/tipped 90 deg"]["horizon"][:2]) > 0.1
         assert share["vt/level"]["sun"] == 0.0
@@ -48,14 +51,17 @@ def test_the_shares_are_the_paper_s(seen: list[Result]) -> None:
 
 
 def test_uw_sees_the_sun_for_74_percent_of_sunlight_in_the_right_heading(seen: list[Result]) -> None:
-    """4.2 names neither heading nor date: two cameras to the Sun's side, and the Sun low over the orbit."""
+    """Section 4.2 states no heading and no date.
+
+    Two cameras on the Sun's side and a low Sun give its figure.
+    """
     tables = {result["beta"]: result["shares"] for result in seen if result["kind"] == "heading"}
     assert tables[15.0][coverage.BEST]["cone"] == pytest.approx(0.74, abs=0.03)
     assert tables[0.0][coverage.BEST]["square"] == pytest.approx(0.74, abs=0.03)
     for table in tables.values():
         for found in table.values():
             assert found["square"] >= found["cone"]
-    # With one camera straight at it the Sun is never out of view when it stands over the orbit's side.
+    # If one camera points at the Sun, the Sun is always in view at a high elevation above the orbital plane.
     assert tables[60.0]["one to the Sun's side"]["cone"] == 1.0
 
 
@@ -68,7 +74,7 @@ def test_the_summary_names_the_headings_that_give_the_paper_s_figure(
 
 
 def test_the_limb_by_day_is_the_half_that_the_sun_shines_on() -> None:
-    """The Sun ahead and level: the forward half of the limb is by day, the other by night."""
+    """With a level Sun straight ahead, the forward half of the limb is sunlit, and the other half is dark."""
     position = revolution(orbit_world.FIRST_DATE, 0.0, 6000.0).positions[:1]
     edge = limb(position)
     day = limb_in_daylight(position, edge, np.array([[1.0, 0.0, 0.0]]))
@@ -76,7 +82,7 @@ def test_the_limb_by_day_is_the_half_that_the_sun_shines_on() -> None:
 
 
 def test_the_true_body_sways_as_it_is_said_to() -> None:
-    """Five hours of it: 3 deg rms an axis within a third, and rates that are its attitudes' own."""
+    """Over five hours the motion is 3 deg rms per axis within a third, and the rates match the attitudes."""
     rng = np.random.default_rng(SEED)
     frame = np.broadcast_to(np.eye(3), (36_000, 3, 3))
     attitudes = orbit_world._sway(frame, rng)
@@ -92,10 +98,10 @@ def piece(variant: str, run: int, **parameters: float) -> Result:
 
 @pytest.mark.slow
 def test_into_the_eclipse_the_filter_errs_by_no_more_than_it_says() -> None:
-    """Two orbits, 15 minutes about sunset: NEES in its 99.9 % band, both lights within their limits."""
+    """Two orbits for 15 minutes around sunset have a NEES in its 99.9 % band and errors within limits."""
     results = [piece("all sensors", run) for run in range(2)]
     facts = orbit_attitude.variant_facts(results)
-    # Errors last for minutes: taken as those of two independent instants an orbit.
+    # Errors last for minutes, so an orbit counts as two independent instants.
     low, high = band(2 * 6 * 2, 0.999)
     assert low < facts["nees_mean"] < high
     assert facts["both"]["rms"] < 0.05
@@ -109,14 +115,14 @@ def test_into_the_eclipse_the_filter_errs_by_no_more_than_it_says() -> None:
 
 @pytest.mark.slow
 def test_covariances_that_are_claimed_too_small_are_found_out() -> None:
-    """Sun and nadir said to be a quarter as far off as they are."""
+    """The claimed errors of Sun and nadir are a quarter of the true ones."""
     facts = orbit_attitude.variant_facts([piece("all sensors", 0, claimed=1.0 / 16.0)])
     assert facts["nis"]["nadir"] > 2.0
     assert facts["nees_mean"] > band(6 * 2, 0.999)[1]
 
 
 def test_the_true_attitudes_are_those_of_the_readings() -> None:
-    """Without noise a sensor would read what the attitude makes of the truth: the mean of the differences."""
+    """The mean of the readings, expressed in the axes of the attitude, is the truth."""
     rng = np.random.default_rng(SEED)
     sensors = suite("uw")
     truth = orbit_world.world(sensors, rng, 300.0)

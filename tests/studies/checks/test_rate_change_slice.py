@@ -5,13 +5,13 @@ from __future__ import annotations
 from ground.campaigns.runner import Case, fly_here
 from tests.studies.campaigns.rate_change import RATE_CHANGE, run
 
-# A turn that goes back nearly as far as it came: its streaks are fitted well as those of a motion from rest,
-# of quite another rate.
+# A rotation that reverses and returns nearly as far as it came: a motion from rest at quite another rate
+# fits its streaks as well.
 FOLDED = {"theta": 21.97996, "length": 6.63953, "exposure": 0.2, "change": 18.80413}
 
 
 def test_a_rate_that_changes_by_up_to_twice_its_mean_is_found_within_its_covariance() -> None:
-    """Chi-square of 3: 16.3 is exceeded once in a thousand."""
+    """A chi-square of 3 degrees of freedom exceeds 16.3 once in a thousand."""
     results = fly_here(RATE_CHANGE, 4, 20_261_123)
     assert len(results) == 6
     for result in results[:4]:

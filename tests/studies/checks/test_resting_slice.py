@@ -24,14 +24,14 @@ def test_attitudes_of_the_model_s_own_camera_are_known_as_well_as_they_claim(tmp
     json.dumps(facts, allow_nan=False)
     own = facts["all"]
     assert own["attitudes"] == own["frames"] == 12
-    # 99.9 % and more of chi-square(36) / 12 lies within 1.1 and 5.9; claims were six times as wide once.
+    # The 99.9 % interval of chi-square(36) / 12 is within 1.1 and 5.9.
     assert 1.1 < own["nees"] < 5.9
     assert own["worst"] < np.sqrt(bound(1e-4, 3))
     assert own["claim"] < 0.004
 
 
 def test_attitudes_of_unlike_cameras_are_within_their_claims(tmp_path: Path) -> None:
-    """Of a lens that is bent otherwise, and of a rolling shutter, stated and not."""
+    """The cases are another distortion, and a rolling shutter with known and unknown line time."""
     for row, trail in (("distortion 0.2 %", 0.0), ("rolling told", 3.0), ("rolling untold", 1.0)):
         own = RESTING.summarise(_flown(row, trail, 2), tmp_path).facts["all"]
         assert own["attitudes"] == 2

@@ -30,13 +30,13 @@ SEED = 8
 def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -> None:
     scenario, times = flown((SEED, 0), 0)
     assert len(times) == 14
-    # In the twelfth the object goes all but as a star does, to 4 px from the frame's border.
+    # In the twelfth frame the object moves almost like a star, up to 4 px from the border.
     case = Case("0/4.0", (SEED, 0), {"run": 0, "magnitude": 4.0})
     frame = one_frame(scenario, times[11], case, 11)
     assert frame["error_px"] < 0.5
     assert frame["false"] == 0
     assert np.array(frame["strict"]).shape == np.array(THESIS).shape
-    # The thesis prints less than 1 % and 0.4 deg over the ten orbits, by Harris's corners.
+    # The thesis states less than 1 % and 0.4 deg over the ten orbits, with Harris's corners.
     for name in ESTIMATORS:
         assert abs(frame[name][0]) < 0.01
         assert frame[name][1] < 0.8
@@ -44,15 +44,15 @@ def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -
     assert facts["skies"]["whole"]["judge"] == [0, 0, 0]
     assert facts["weakest_at_95"] is None
     ends, _ = star_streaks(scenario, times[11])
-    # The stars go along the rows at 0.05 rad/s: 73 px in half a second at the field's middle.
+    # The stars move along the rows at 0.05 rad/s: 73 px in half a second at the image centre.
     middle = np.abs(ends - 512.0).max(axis=(1, 2)) < 100.0
     assert np.all(np.abs(np.linalg.norm(ends[middle, 1] - ends[middle, 0], axis=1) - 73.0) < 2.0)
 
 
 def test_fewer_stars_are_the_brightest_and_table_4_4_counts_them_apart() -> None:
-    """A first frame of the 7,000 brightest: the object is all that any rule singles out."""
+    """In a first frame with the 7,000 brightest stars, every rule selects the object only."""
     stars = catalogue(faintest(BRIGHTEST))[0]
-    # Magnitudes have two decimals, so that several stars share the last.
+    # Magnitudes have two decimals, so several stars share the last magnitude.
     assert BRIGHTEST <= len(stars.magnitude) < 1.02 * BRIGHTEST
     assert stars.magnitude.max() < 6.5
     tables = [case for case in RSO_ORBITS.cases(1, SEED) if case.parameters["stars"] == BRIGHTEST]

@@ -49,7 +49,7 @@ def imu(time_ns: int) -> dict[str, object]:
 
 
 class Writer:
-    """Writes a synthetic flight log and its table into a folder."""
+    """Writer of a synthetic flight log and its table."""
 
     def __init__(self, folder: Path, table: tuple[Packet, ...]) -> None:
         self.folder, self.table = folder, table
@@ -121,7 +121,7 @@ def answer_folders(folder: Path, old: object, new: object) -> tuple[Path, Path]:
 
 
 def fake_checkout(folder: Path, main: str) -> Path:
-    """Write a checkout of which `python -m flight` is the given code; `arguments` are its words."""
+    """Write a checkout in which `python -m flight` runs the given code, with the words in `arguments`."""
     (folder / "flight").mkdir(parents=True)
     (folder / "flight/__init__.py").touch()
     (folder / "flight/__main__.py").write_text(f"import json, sys\narguments = sys.argv[1:]\n{main}\n")
@@ -345,7 +345,7 @@ def test_an_unknown_revision_is_wrong_use(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_the_packet_table_is_the_checkouts_own_in_the_old_layout_too(tmp_path: Path) -> None:
-    """An editable installation of this project must not stand in for a module that the checkout lacks."""
+    """An editable installation of this project must not replace a module that the checkout lacks."""
     definitions = tmp_path / "flight/telemetry/definitions.py"
     definitions.parent.mkdir(parents=True)
     for folder in (tmp_path / "flight", definitions.parent):
@@ -360,7 +360,7 @@ def test_the_packet_table_is_the_checkouts_own_in_the_old_layout_too(tmp_path: P
 def test_a_short_flight_and_the_plans_of_the_last_commit_repeat_themselves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both sides are check-outs of HEAD, so that changes not yet committed do not matter."""
+    """Both sides are checkouts of HEAD, so uncommitted changes have no effect."""
     try:
         commit = resolve("HEAD")
     except CheckoutError as error:

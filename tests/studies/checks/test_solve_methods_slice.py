@@ -10,7 +10,7 @@ from tests.studies.bench.solve_methods import compare
 
 
 def test_every_solver_and_centroid_solves_a_frame_and_the_optimal_solvers_agree() -> None:
-    """All optimal solvers minimise one loss: they may differ by rounding alone."""
+    """All optimal solvers minimise the same loss, so they differ by rounding only."""
     rows = {(row.centroid, row.attitude): row for row in compare(1, 5)}
     assert len(rows) == len(CENTROIDS) * (len(SOLVERS) + len(("image", "aim")))
     for (centroid, attitude), row in rows.items():

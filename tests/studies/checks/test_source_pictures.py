@@ -21,7 +21,7 @@ from tests.support.scenes import FIELD
 def test_one_command_draws_every_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The campaign's cells are made up and the flight is cut to 12 s; the command makes them in full."""
+    """The campaign's cells are invented, and the flight is shortened to 12 s."""
     figures: dict[str, float | None] = {"magnitude": 0.003, "across_px": None}
     cell: dict[str, Any] = {"theta": 45, "percent": 10}
     cell |= dict.fromkeys(DETECTOR_NAMES, figures)
@@ -40,7 +40,7 @@ def test_one_command_draws_every_figure(
 
 @pytest.mark.slow
 def test_every_indicator_has_the_object_as_its_outlier() -> None:
-    """The thesis prints 3.6, 3.5 and 3.6 sigma from the mean for its object of magnitude 1."""
+    """The thesis states deviations of 3.6, 3.5 and 3.6 sigma for its object of magnitude 1."""
     camera = StarCameraModel(field_of_view=FIELD)
     generator = np.random.default_rng(source_pictures.OBJECT_SEED)
     sky = draw_sky(camera, generator, tracked=False)

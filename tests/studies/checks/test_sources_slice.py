@@ -15,7 +15,7 @@ SEED = 77
 
 
 def test_image_matching_reaches_the_q_method_and_a_wrong_prior_needs_further_steps() -> None:
-    """Three lists a cell: four steps forget a prior of 5 deg, one step does not."""
+    """Three lists per cell: a prior error of 5 deg vanishes after four steps, but not after one."""
     head, *rows = sources.image_matching_errors(3, SEED)
     assert head[-1] == "4 steps"
     assert [row[1] for row in rows] == 2 * ["0.01", "0.1", "1", "5"]
@@ -39,7 +39,7 @@ def test_limits_of_eq_31_identify_the_lists_that_limits_of_angles_identify() -> 
 
 @pytest.mark.slow
 def test_one_frame_gives_rate_and_axis_within_the_theses_figures() -> None:
-    """One frame of each scene, by two estimators: 0.9 % and 0.65 deg in Table 4.1."""
+    """One frame of each scene, with two estimators: Table 4.1 states 0.9 % and 0.65 deg."""
     _, *rows = sources.one_frame_tables(1, SEED)
     assert [row[1] for row in rows] == 2 * ["`harris`", "`likelihood`"]
     for row in rows:

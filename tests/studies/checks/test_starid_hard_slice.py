@@ -1,4 +1,4 @@
-"""A small slice of the bench `starid_hard`: few lists of some rows, with another seed."""
+"""Runs a small slice of the benchmark `starid_hard`: few lists of some rows, with another seed."""
 
 from __future__ import annotations
 
@@ -61,7 +61,10 @@ def test_the_command_prints_a_row_as_json(capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.slow
 def test_a_lens_fitted_wrongly_is_refused_and_a_hidden_half_is_not() -> None:
-    """A list that was answered 175" off, at 5 sigmas; and good ones of which only the left part is seen."""
+    """An answer to one list would be 175 arcsec off, at 5 sigmas.
+
+    In the good lists only the left part is visible.
+    """
     sky = default_index()
     name = "known to 1 deg, distorted 2-8 %"
     row, number = hardships()[name], list(hardships()).index(name)

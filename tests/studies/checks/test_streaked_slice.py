@@ -1,4 +1,4 @@
-"""A small slice of the campaign of streaks: attitudes within their claims, whatever the shutter."""
+"""Runs a small slice of the campaign `streaked`: attitudes within their claims with any shutter."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _flown(row: str, runs: int) -> list[dict[str, object]]:
 
 
 def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path) -> None:
-    """Such attitudes were up to 7 sigma off, and 0.4 px of their claimed 0.05."""
+    """Without an allowance for the shutter the errors are up to 7 sigma, or 0.4 px instead of 0.05 px."""
     own = STREAKED.summarise(_flown("rolling 30 us, unstated", 2), tmp_path).facts["all"]
     assert own["attitudes"] == own["frames"] == 6
     assert own["worst"] < 4.5
@@ -26,7 +26,7 @@ def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path)
 
 
 def test_a_shutter_that_is_described_costs_nothing(tmp_path: Path) -> None:
-    """Of the same frames, the claim where nothing is described is the wider one."""
+    """On the same frames, the claim without a known line time is larger."""
     stated, unstated = (
         STREAKED.summarise(_flown(f"rolling 0 us, {how}", 2), tmp_path).facts["all"]
         for how in ("stated", "unstated")

@@ -1,4 +1,4 @@
-"""A small slice of the campaign `streaks`, with its own seed: five estimators against bound and truth."""
+"""Runs a small slice of the campaign `streaks`: five estimators against bound and truth."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def results() -> list[Result]:
-    """Frames of a turn of 10 % of the field, 45 deg off the boresight."""
+    """Return frames with a rotation of 10 % of the field, 45 deg off the boresight."""
     cases = [Case(f"45/10/{run}", (20_261_121, run), {"theta": 45, "percent": 10}) for run in range(FRAMES)]
     return [streaks.run(case) for case in cases]
 
 
 @pytest.mark.slow
 def test_the_likelihood_estimator_is_at_the_bound_and_knows_it(results: list[Result]) -> None:
-    """Errors over their bounds, rms of magnitude and of vector; NEES of 15 degrees of freedom, 99.9 %."""
+    """Check the ratio of rms errors to the bound, and the NEES of 15 degrees of freedom (99.9 %)."""
     found = [result["likelihood"] for result in results]
     assert all(one["status"] == "rate" for one in found)
     ratios = [
@@ -36,7 +36,7 @@ def test_the_likelihood_estimator_is_at_the_bound_and_knows_it(results: list[Res
 
 @pytest.mark.slow
 def test_the_thesis_detectors_stay_within_table_3_1(results: list[Result]) -> None:
-    """Harris and minimum eigenvalue, mean error of the magnitude at 10 %: 0.69 and 1.20 %."""
+    """Table 3.1 states mean magnitude errors of 0.69 and 1.20 % at 10 % for Harris and minimum eigenvalue."""
     for name, limit in (("harris", 0.0069), ("minimum-eigenvalue", 0.0120)):
         errors = [abs(r[name]["magnitude"]) for r in results if r[name]["status"] == "rate"]
         assert len(errors) >= FRAMES - 1
@@ -52,10 +52,12 @@ def test_the_summary_has_a_row_for_every_cell(results: list[Result]) -> None:
 
 @pytest.mark.slow
 def test_the_thesis_s_own_camera_gives_the_thesis_s_table() -> None:
-    """At 50 % Harris has 0.07 %, minimum eigenvalue 0.19 % in Table 3.1; a mean of two may be twice that.
+    """Table 3.1 states 0.07 % at 50 % for Harris, and 0.19 % for minimum eigenvalue.
 
-    The likelihood estimator, whose model is not this camera, refuses a frame or is better than the
-    thesis's best.
+    The mean of two frames may be twice that.
+
+    The model of the likelihood estimator is not this camera. It must refuse a frame, or be better than the
+    best result of the thesis.
     """
     cases = [Case(f"60/50/{run}", (20_261_123, run), {"theta": 60, "percent": 50}) for run in range(2)]
     seen = [streaks.run_thesis(case) for case in cases]
@@ -67,6 +69,6 @@ def test_the_thesis_s_own_camera_gives_the_thesis_s_table() -> None:
 
 @pytest.mark.slow
 def test_the_biases_of_the_thesis_s_spots_are_those_that_are_measured() -> None:
-    """Other frames than those of the table; 0.02 px is a fifth of the thesis's 0.10 px."""
+    """The frames differ from those of the table; 0.02 px is a fifth of the thesis's 0.10 px."""
     measured = streaks.measured_bias("harris", 4, 20_261_126)
     assert measured == pytest.approx(streaks.THESIS_BIAS["harris"], abs=0.02)

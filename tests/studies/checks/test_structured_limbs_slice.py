@@ -1,4 +1,4 @@
-"""A small slice of the campaign `structured-limbs`, always the same."""
+"""Runs a small slice of the campaign `structured-limbs` at a fixed seed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_limbs_behind_structure_are_found_with_honest_claims(tmp_path: Path) -> 
     answers = [answer for result in results for answer in result["answers"]]
     assert len(answers) == 15
     assert all(answer["status"] == "found" and answer["nees"] < 6.0 for answer in answers)
-    # With a field of view that is 5 % wrong, the plain search would be off by 0.5 to 2 deg.
+    # With a field of view that is wrong by 5 %, the plain search would be 0.5 to 2 deg off.
     assert all(answer["error_deg"] < 0.5 for answer in answers if answer["known"] == "flight")
     facts = STRUCTURED_LIMBS.summarise(results, tmp_path).facts
     json.dumps(facts, allow_nan=False)

@@ -1,4 +1,4 @@
-"""`python -m tests.studies NAME` runs the study of that name, and lists the studies otherwise."""
+"""Tests that `python -m tests.studies NAME` runs a study, and that it lists the studies without a name."""
 
 from __future__ import annotations
 

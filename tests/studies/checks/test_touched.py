@@ -1,4 +1,4 @@
-"""Files that a control cycle, the opening of a flight and a star fix enter: within their limits."""
+"""Tests that a control cycle, the opening of a flight and a star fix enter no more files than permitted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tuning study: its criterion is met by the gains that the campaign flies, and it finds better ones."""
+"""Tests of the tuning study: the gains of the campaign meet its criterion, and it finds better ones."""
 
 from __future__ import annotations
 

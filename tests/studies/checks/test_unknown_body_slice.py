@@ -1,6 +1,6 @@
-"""A slice of the campaign of the unknown body: a KnightCube from a slow tumble to the begin of its slew.
+"""Runs a slice of the campaign `unknown-body`: a KnightCube from a slow tumble to the start of its slew.
 
-The bounds are the requirements, widened as far as few samples of an honest filter scatter.
+The limits are the requirements plus the scatter of a filter with correct covariance over few samples.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ROWS = ("orbit", "orbit-tumble", "orbit_3u", "orbit_3u-tumble")
 
 
 def largest(count: int) -> float:
-    """Return the mean square of `count` normal errors that an honest filter exceeds once in 1,000 flights.
+    """Return the mean square of `count` normal errors that a correct filter exceeds once in 1,000 flights.
 
     The approximation of the chi-square distribution is that of Wilson and Hilferty (1931).
     """

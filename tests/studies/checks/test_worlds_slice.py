@@ -1,4 +1,4 @@
-"""The comparison of worlds: both fly the same cases, and a difference shows."""
+"""Tests of the campaign `worlds`: both worlds fly the same cases, and the summary shows a difference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Yamcs, a ground station of other authors, follows and commands a flight through the protected link.
+"""Tests that Yamcs follows and commands a flight through the protected link.
 
 `python -m tests.studies.interop.yamcs FOLDER` flies the commands that need minutes.
 """
@@ -40,7 +40,7 @@ def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch:
 
 
 def test_stacks_and_displays_name_commands_arguments_and_parameters_of_the_tables() -> None:
-    """Each argument is given, each state is one of its field, and each name is one that Yamcs knows."""
+    """Every required argument is given, every state is one of its field, and Yamcs has every name."""
     fields = {f"/{SPACE}/{name}": field for layout in LAYOUTS.values() for name, field in spread(layout)}
     steps = []
     for name, text in stacks_and_displays().items():
@@ -106,7 +106,7 @@ def test_file_data_fit_into_the_configured_telecommand_frames(
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> None:
-    """A browser sends a page's text/plain to any port of loopback; Yamcs reads it as a command."""
+    """A browser can send a page as text/plain to any loopback port; Yamcs would read it as a command."""
     http = free_port()
     write(tmp_path, f"127.0.0.1:{free_port()}", http)
     with serving(tmp_path, http) as server:
@@ -145,7 +145,7 @@ def test_mission_control_refuses_what_it_cannot_show(
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 @pytest.mark.timeout(300)
 def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path: Path) -> None:
-    """An alarm is raised and acknowledged, stacks run, files go both ways, and a pass is on the timeline."""
+    """Raise and acknowledge an alarm, run stacks, transfer files, and find a pass on the timeline."""
     from tests.support.yamcs_operator import Operator  # noqa: PLC0415 - imports the client for a second
 
     (udp,), http = free_ports([socket.SOCK_DGRAM]), free_port()
@@ -201,7 +201,7 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 @pytest.mark.timeout(300)
 def test_yamcs_archives_and_commands_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every packet and value is ours, every command completed, no warning, no socket beyond loopback."""
+    """The archive has every packet and value, every command completes, and no socket leaves loopback."""
     sound = fly(tmp_path, PLANS["short"])
     said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert sound, said

@@ -1,1 +1,1 @@
-"""The console's page in a real browser, beside a flight that goes on."""
+"""The console's page in a real browser, beside a running flight."""

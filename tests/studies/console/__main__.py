@@ -1,9 +1,9 @@
-"""`python -m tests.studies.console`: fly, look at the page in Chromium, and measure what the page promises.
+"""`python -m tests.studies.console`: opens the console's page in Chromium and measures its requirements.
 
-Live: how far the page is behind the log. A replayed moment shows what was live then. No complaints of the
-browser, no request beyond loopback. Memory and processor time of the server beside a 40 Hz flight. When
-telemetry stops, the light turns red. At each of three sizes and in both themes, the page does not scroll
-sideways and has no violation that axe-core finds.
+The study measures by how much the page lags behind the log, and the memory and processor time of the server
+beside a 40 Hz flight. It checks that a replayed moment shows the same as live, that the browser reports no
+errors and makes no request beyond loopback, and that the light turns red when telemetry stops. At each of
+three sizes and in both themes, the page may not scroll sideways, and axe-core may find no violation.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ CONFIG = Path("config/step_demo.yaml")
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What was measured: lag s, memory MiB, share of a core, s from the last telemetry to the red light.
+    """Measured lag (s), memory (MiB), share of a core, and time (s) from the last telemetry to the red light.
 
-    `weight_kb` is the size of all files of the page. `violations` names what axe-core finds and each size at
-    which the page scrolls sideways. `filed` is what failed as the page put, listed and got a file.
+    `weight_kb` is the size of all files of the page. `violations` names the findings of axe-core and each
+    size at which the page scrolls sideways. `filed` is the error of the page when it put, listed and got a
+    file.
     """
 
     weight_kb: float
@@ -53,13 +54,13 @@ class Figures:
 
 
 ASKED = {"weight_kb": 250.0, "lag_s": 0.5, "memory_mib": 120.0, "processor": 0.15, "red_s": 3.0}
-"""Issue: 250 kB, live within 0.5 s, 120 MB, 15 % of a core, a dead link within 3 s."""
+"""Limits of the issue: 250 kB, live within 0.5 s, 120 MB, 15 % of a core, a dead link shown within 3 s."""
 SIZES = ((1600, 1150), (1024, 768), (390, 844))
-"""Sizes (width, height) of the page that are looked at, px."""
+"""Tested sizes (width, height) of the page, px."""
 
 
 def main() -> int:
-    """Measure, print, and keep pictures where asked to; exit status 1 when a bound was missed."""
+    """Measure, print, and save pictures if requested. Returns 1 if a limit is exceeded."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.console", description=__doc__)
     parser.add_argument("--config", type=Path, default=CONFIG, help=f"to fly (default {CONFIG})")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of flight (default 60)")
@@ -82,9 +83,10 @@ def main() -> int:
 
 
 def missed(figures: Figures, by_link: bool) -> list[str]:
-    """Return the names of the promises that were not kept.
+    """Return the names of the figures that exceed their limits.
 
-    By a link packets of one instant may come in two frames: who looked between them saw the first one's.
+    Over a link, packets of one instant may come in two frames, so a moment between them may show the first
+    only.
     """
     wrong = [name for name, bound in ASKED.items() if not getattr(figures, name) <= bound]
     wrong += [name for name in ("complaints", "strangers", "violations", "filed") if getattr(figures, name)]
@@ -95,7 +97,7 @@ def missed(figures: Figures, by_link: bool) -> list[str]:
 def measure(
     config: Path, seconds: float, pictures: Path | None, looks: Path | None, by_link: bool = False
 ) -> Figures:
-    """Fly for `seconds` s and look at the page meanwhile."""
+    """Fly for `seconds` s and examine the page."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         run, way = Path(place) / "run", _linked if by_link else _flown
         with way(config, run) as (url, server, source), opened(url) as page:
@@ -118,7 +120,7 @@ def measure(
 
 
 def _filed(page: Page, place: Path) -> str:
-    """Put a file on the satellite by the page, list and get it; return what failed, or an empty text."""
+    """Put, list and get a file through the page; return the error, or an empty text."""
     sent, got = place / "tle.txt", place / "got.txt"
     sent.write_bytes(bytes(range(256)) * 40)
     page.page.evaluate("document.getElementById('files').open = true")
@@ -160,7 +162,7 @@ def _looked_at(page: Page, folder: Path | None) -> list[str]:
 
 @contextlib.contextmanager
 def _flown(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
-    """Yield the address and the process of a console that flies by itself, and its flight's."""
+    """Yield the address and the process of a console that starts a flight, and the process of its flight."""
     with _started("console", run, "--fly", config, "--port", "0") as server:
         url = _address(server)
         children = Path(f"/proc/{server.pid}/task/{server.pid}/children").read_text(encoding="ascii").split()
@@ -169,7 +171,7 @@ def _flown(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
 
 @contextlib.contextmanager
 def _linked(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
-    """Yield the address and the process of a console that has nothing but a flight's link, and the link's."""
+    """Yield address and process of a console that has only a flight's link, and the link's process."""
     place, (satellite, ground) = run.parent, make_keys(run.parent / "keys")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -192,7 +194,7 @@ def _linked(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
 
 @contextlib.contextmanager
 def _started(*words: object) -> Iterator[subprocess.Popen[str]]:
-    """Run a command of `flight` until left."""
+    """Run a command of `flight` until the block ends."""
     command = [sys.executable, "-m", "flight", *map(str, words)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -212,7 +214,7 @@ def _address(server: subprocess.Popen[str]) -> str:
 
 
 def _lag(page: Page, tail: LogTail, seconds: float) -> float:
-    """Return the greatest distance of the page behind the log, s, of looks five times a second."""
+    """Return the largest lag (s) of the page behind the log, sampled five times a second."""
     newest, worst, until = 0.0, 0.0, time.monotonic() + seconds
     while time.monotonic() < until:
         packets = tail.new()
@@ -224,7 +226,7 @@ def _lag(page: Page, tail: LogTail, seconds: float) -> float:
 
 
 def _red(page: Page, source: int) -> float:
-    """Stop the process that telemetry comes from; return how long the light takes to turn red, s."""
+    """Stop the process that sends telemetry; return the time (s) until the light turns red."""
     page.page.click("#live")
     page.wait("document.getElementById('light').classList.contains('alive')")
     os.kill(source, signal.SIGSTOP)

@@ -1,1 +1,1 @@
-"""What ground software of other authors reads of a run, against our own reader."""
+"""Comparison of a run as ground software of other authors reads it with our own reader."""

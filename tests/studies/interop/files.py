@@ -1,11 +1,12 @@
-"""Files between Yamcs's CFDP service and the satellite, through link and gateway, at losses.
+"""File transfers between the CFDP service of Yamcs and the satellite, through link and gateway, with losses.
 
-`python -m tests.studies.interop.files FOLDER [--megabytes M] [--loss P ...] [--seed S]` opens link, gateway
-and Yamcs, each a process of its own, with a relay between link and gateway that loses frames of both
-directions. A file is commanded down and another is sent up by Yamcs. One JSON line of each loss: whether both
-came whole by SHA-256 and were closed at both ends, and seconds. With `--endings` transfers are cancelled
-instead, each way and by each side, and one is suspended on board and resumed: one JSON line each. Exit status
-1 where not all is as it must be. Skips loudly without Java or the bundle.
+`python -m tests.studies.interop.files FOLDER [--megabytes M] [--loss P ...] [--seed S]` starts link, gateway
+and Yamcs as separate processes, with a relay between link and gateway that loses frames in both directions.
+One file is commanded down, and Yamcs sends another one up. The study prints one JSON line for each loss
+probability: whether both files arrived complete (SHA-256) and were closed at both ends, and the durations
+(s). With `--endings` each side cancels a transfer in each direction instead, and one transfer is suspended on
+board and resumed; there is one JSON line for each. The exit status is 1 if a transfer does not end as
+required. The study is skipped with a message if Java or the bundle is missing.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _TRANSFERS = f"/filetransfer/{INSTANCE}/{CFDP}/transfers"
 
 
 def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
-    """Transfer a file each way; return what came of it."""
+    """Transfer a file in each direction; return the results."""
     data = np.random.default_rng(seed).bytes(size)
     (place / "runs" / _RUN).mkdir(parents=True)
     (place / "runs" / _RUN / _NAME).write_bytes(data)
@@ -60,7 +61,7 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
 
 
 def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str, Any]]:
-    """Cancel a transfer each way by each side, and suspend one; yield what came of each."""
+    """Cancel a transfer in each direction by each side, and suspend one; yield the result of each."""
     (place / "runs" / _RUN).mkdir(parents=True)
     (place / "runs" / _RUN / _NAME).write_bytes(np.random.default_rng(seed).bytes(size))
     http = free_port()
@@ -89,7 +90,7 @@ def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str
 
 
 def _begun(server: Yamcs, way: str) -> dict[str, Any]:
-    """Begin a transfer; return it once data have come."""
+    """Start a transfer; return it after data have arrived."""
     known = {one["id"] for one in _transfers(server)}
     if way == "up":
         _send_up(server)
@@ -106,7 +107,7 @@ def _begun(server: Yamcs, way: str) -> dict[str, Any]:
 
 
 def _ended(server: Yamcs, place: Path, transfer: str, wanted: str) -> dict[str, Any]:
-    """Wait until a transfer is closed at both ends; return its state and what the satellite has open."""
+    """Wait until both ends close a transfer; return its state and the satellite's open transfers."""
     stored = place / "keys" / "files" / "transfers"
     _until(lambda: _transfer(server, transfer)["state"] in {"COMPLETED", "FAILED"}, _LONGEST_S)
     _until(lambda: not list(stored.glob("*-*.json")), 120.0)
@@ -119,13 +120,13 @@ def _transfer(server: Yamcs, transfer: str) -> dict[str, Any]:
 
 
 def _number(one: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments that name a transfer to the satellite."""
+    """Return the arguments that identify a transfer to the satellite."""
     identifier = one["transactionId"]
     return {"source": identifier["initiatorEntity"], "number": identifier["sequenceNumber"]}
 
 
 def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
-    """Command the file down, again while nothing begins; return whether and when it is there."""
+    """Command the file down, repeatedly until the transfer begins; return whether and when it arrived."""
     begun = time.monotonic()
     while time.monotonic() - begun < _LONGEST_S and not any(map(_is_download, _transfers(server))):
         server.command("send-file", {"entity": "another-ground-station", "name": f"log/{_RUN}/{_NAME}"})
@@ -139,7 +140,7 @@ def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
 
 
 def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
-    """Have Yamcs send a file up; return whether and when it is there."""
+    """Let Yamcs send a file up; return whether and when it arrived."""
     begun = time.monotonic()
     (place / "yamcs" / UP_BUCKET / "release.whl").write_bytes(data)
     _send_up(server)
@@ -167,7 +168,7 @@ def _is_download(one: dict[str, Any]) -> bool:
 
 @contextmanager
 def _opened(place: Path, loss: float, seed: int) -> Iterator[str]:
-    """Open link, relay and gateway; yield the gateway's address."""
+    """Start link, relay and gateway; yield the gateway's address."""
     satellite, ground = make_keys(place / "keys")
     port, gateway = free_udp_port(), f"127.0.0.1:{free_port()}"
     section = {"keys": str(satellite), "udp": f"127.0.0.1:{port}", "rate": _RATE}
@@ -190,7 +191,7 @@ def _until(done: Callable[[], bool], seconds: float) -> None:
 
 
 def main() -> int:
-    """Transfer at each loss, print."""
+    """Transfer files at each loss probability and print the results."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.files", description=__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="for all that is written; new")
     parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of each file")

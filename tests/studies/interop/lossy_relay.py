@@ -1,4 +1,4 @@
-"""A relay of datagrams that loses some of either direction at random, with a fixed seed."""
+"""A relay of datagrams that loses some of them in both directions at random, with a fixed seed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOOK_S = 0.2
 
 @contextmanager
 def lossy_relay(to: str, loss: float, seed: int) -> Iterator[str]:
-    """Relay between whoever sends to the address that is yielded and `to`, HOST:PORT of loopback."""
+    """Relay datagrams between the yielded address and `to` (HOST:PORT of loopback)."""
     host, _, port = to.partition(":")
     near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     for line in (near, far):
@@ -32,7 +32,7 @@ def lossy_relay(to: str, loss: float, seed: int) -> Iterator[str]:
         while not ended.is_set():
             try:
                 data, sender = source.recvfrom(_LONGEST)
-            except OSError:  # nothing came, or the other end is not there yet
+            except OSError:  # no datagram came, or the other end is not open yet
                 continue
             if number == 0:
                 peer[:] = [sender]

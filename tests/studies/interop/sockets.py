@@ -1,4 +1,4 @@
-"""Which sockets a process has whose own or other end is not loopback, from Linux's tables in /proc."""
+"""Sockets of a process that have an address beyond loopback at either end, from Linux's tables in /proc."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _TABLES = ("tcp", "tcp6", "udp", "udp6")
 
 
 def beyond_loopback(pid: int) -> set[str]:
-    """Return the sockets of a process that reach, or can be reached from, beyond loopback."""
+    """Return the sockets of a process that reach beyond loopback or can be reached from there."""
     inodes = _sockets_of(pid)
     found = set()
     for table in _TABLES:
@@ -41,7 +41,7 @@ def _sockets_of(pid: int) -> set[str]:
 
 
 def _address(word: str) -> IPv4Address | IPv6Address:
-    """Return the address of a word of the table: hexadecimal words of 32 bits in the machine's order."""
+    """Return the address of a table entry: hexadecimal words of 32 bits in the machine's byte order."""
     digits = word.partition(":")[0]
     data = b"".join(struct.pack("=I", int(digits[i : i + 8], 16)) for i in range(0, len(digits), 8))
     if len(data) == 4:

@@ -1,13 +1,13 @@
-"""Yamcs archives and commands a flying simulation through the authenticated link.
+"""Yamcs archives and commands a simulated flight through the authenticated link.
 
-`python -m tests.studies.interop.yamcs FOLDER [--orbit]` flies in real time with link, gateway and Yamcs, and
-prints one JSON line for each question: did Yamcs load our XTCE without a warning; was every kind of command
-completed, and a refused one reported; does the archive hold every packet of the flight log, byte for byte;
-are the values that Yamcs makes of them ours; did any process have a socket beyond loopback. Exit status 1
-where one of these is not so. Skips loudly without Java or the bundle.
+`python -m tests.studies.interop.yamcs FOLDER [--orbit]` flies in real time with link, gateway and Yamcs. It
+prints one JSON line for each check: Yamcs loads the XTCE without a warning; every kind of command completes,
+and a refused one is reported; the archive holds every packet of the flight log, byte for byte; Yamcs decodes
+the same values as this project; no process has a socket beyond loopback. The exit status is 1 if a check
+fails. The study is skipped with a message if Java or the bundle is missing.
 
-The testbed flies all commands but `point`, which with `--orbit` a satellite flies; it needs minutes.
-`--short` flies the commands that are completed whatever the flight does meanwhile, as CI does.
+The testbed flies all commands except `point`, which a satellite flies with `--orbit`. It needs minutes.
+`--short`, which CI uses, flies the commands that complete in any state of the flight.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from tests.support.yamcs_server import Yamcs, missing, serving, troubles
 _CONFIGS = Path(__file__).resolve().parents[3] / "config"
 _BROKEN = "coil-broken"
 _DEADLINE_S = 120.0
-"""For what takes a second on a machine that is not busy."""
+"""Timeout (s) of operations that need a second on an idle machine."""
 
 
 def _same_table(name: str) -> dict[str, Any]:
-    """Return the arguments that load the table that a configuration flies anyway."""
+    """Return the arguments that load the table that a configuration already uses."""
     config = load(_CONFIGS / name)
     values = [
         float(getattr(getattr(config, section), key))
@@ -82,7 +82,7 @@ _POINT = ("point", {"goal": "sun", **{f"numbers_{i}": 0 for i in range(1, 5)}, "
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is flown: a configuration, its commands in order, faults, and how long each may take, s."""
+    """A configuration, its commands in order, faults, and the timeout (s) of each command."""
 
     config: str
     commands: list[tuple[str, dict[str, Any]]]
@@ -109,12 +109,12 @@ _REFUSED = ("clear", {"event": "too-hot"})
 _STEADY = LAYOUTS["health"].identifier.to_bytes(2, "big")
 """First bytes of the packet that the flight process writes each second once it steers."""
 _LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION, TRANSFER)}
-"""First bytes of the packets that the link process makes; flight logs do not contain them."""
+"""First bytes of the packets that the link process creates; flight logs do not contain them."""
 _EPOCH = "2026-01-01T00:00:00"
 
 
 def fly(place: Path, plan: Plan) -> bool:
-    """Fly a plan under Yamcs and print what came of it; return whether all is as it must be."""
+    """Fly a plan under Yamcs and print the checks; return whether all pass."""
     text = (_CONFIGS / plan.config).read_text(encoding="utf-8")
     http = free_port()
     with linked_flight(place / plan.config, text, *plan.faults) as flight:
@@ -139,7 +139,7 @@ def fly(place: Path, plan: Plan) -> bool:
 
 
 def _command(server: Yamcs, flight: LinkedFlight, plan: Plan) -> bool:
-    """Issue each kind of command, and one that the flight refuses."""
+    """Issue each kind of command, and one that the flight refuses; return whether all end as expected."""
     _until(lambda: _STEADY in {packet[:2] for packet in _packets(_log(flight.run))}, _DEADLINE_S)
     ends = {}
     for name, arguments in plan.commands:
@@ -156,9 +156,9 @@ def _command(server: Yamcs, flight: LinkedFlight, plan: Plan) -> bool:
 
 
 def _followed(server: Yamcs, name: str, arguments: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """Issue a command, and return its history when it is completed, or when the time is over.
+    """Issue a command; return its history when it has completed or timed out.
 
-    A command of which Yamcs lost a report in its race (`_RACE`) never completes, and is issued again.
+    If Yamcs loses a report in its race (`_RACE`), the command never completes and is issued again.
     """
     races, begun = _races(server), time.monotonic()
     command = server.command(name, arguments)
@@ -177,7 +177,7 @@ def _followed(server: Yamcs, name: str, arguments: dict[str, Any], seconds: floa
 
 
 def _races(server: Yamcs) -> int:
-    """Return how often Yamcs has lost a packet in its race."""
+    """Return how many packets Yamcs has lost in its race."""
     return sum(_RACE in line for line in troubles(server.log.read_text()))
 
 
@@ -189,7 +189,7 @@ def _sockets(server: Yamcs, flight: LinkedFlight) -> bool:
 
 
 def _archive(server: Yamcs, logged: set[bytes]) -> bool:
-    """Compare the bytes of the archive with the packets of the flight log."""
+    """Compare the bytes of the archive with the packets of the flight log; return whether they are equal."""
     archived = list(_packets(server.packets()))
     of_the_link = [packet for packet in archived if packet[:2] in _LINKS_OWN]
     missed = len(logged - set(archived))
@@ -200,7 +200,7 @@ def _archive(server: Yamcs, logged: set[bytes]) -> bool:
 
 
 def _values(server: Yamcs) -> bool:
-    """Compare every value that Yamcs makes of the archived packets with our reader's."""
+    """Compare every value that Yamcs decodes from the archived packets with our reader's."""
     fields = different = absent = 0
     packets = scan(server.packets()).packets
     for name, rows in packets.items():
@@ -220,7 +220,7 @@ def _values(server: Yamcs) -> bool:
 
 
 def _columns(layout: Layout, rows: PacketArray) -> dict[str, list[Any]]:
-    """Return the values of each parameter of a packet's rows, by the names of the XTCE form."""
+    """Return the values of each parameter of a packet's rows, by their XTCE names."""
     found: dict[str, list[Any]] = {}
     names = iter(spread(layout))
     for field in layout.packet.fields:
@@ -237,7 +237,7 @@ def _columns(layout: Layout, rows: PacketArray) -> dict[str, list[Any]]:
 
 
 def raw_of(value: dict[str, Any]) -> Any:
-    """Return the number or text of a value of Yamcs's JSON, in which large numbers and NaN are texts."""
+    """Return the number or text of a value in Yamcs's JSON, which has large numbers and NaN as texts."""
     kind = str(value["type"])
     if kind == "STRING":
         return value.get("stringValue", "")
@@ -246,7 +246,7 @@ def raw_of(value: dict[str, Any]) -> Any:
 
 
 def alike(ours: Any, theirs: Any) -> bool:
-    """Return whether two values are the same; NaN is NaN."""
+    """Return whether two values are the same; two NaN are the same."""
     if isinstance(ours, float) and math.isnan(ours):
         return bool(np.isnan(theirs))
     return bool(ours == theirs)
@@ -261,7 +261,7 @@ def _packets(data: bytes) -> Iterator[bytes]:
 
 
 def _until(done: Callable[[], bool], seconds: float) -> None:
-    """Wait until something is so, at most for a time."""
+    """Wait until a condition holds, with a timeout."""
     until = time.monotonic() + seconds
     while not done() and time.monotonic() < until:
         time.sleep(0.3)
@@ -273,7 +273,7 @@ def _say(what: str, **facts: Any) -> None:
 
 
 def main() -> int:
-    """Fly under Yamcs."""
+    """Fly under Yamcs; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.yamcs", description=__doc__)
     parser.add_argument("place", type=Path, metavar="FOLDER", help="does not exist yet")
     kind = parser.add_mutually_exclusive_group()

@@ -1,1 +1,1 @@
-"""Compares the logs of this checkout with those of another revision, packet by packet."""
+"""Comparison of this checkout's logs with those of another revision, packet by packet."""

@@ -1,7 +1,7 @@
 """Checks that this checkout behaves as REV does: `python -m tests.studies.same_bytes --against REV`.
 
-Flies ten flights and asks for answers in this checkout, with its uncommitted changes, and in a temporary
-checkout of REV, with the same interpreter on the same machine, and compares logs and answers.
+The study flies ten flights and runs commands in this checkout, with its uncommitted changes, and in a
+temporary checkout of REV, with the same interpreter on the same machine. It compares logs and answers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Run = Flight | Answers
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, compare, print; return 0 when all is equal, 1 when not, 2 for wrong use."""
+    """Run, compare, print. Returns 0 if all results are equal, 1 if not, 2 for wrong use."""
     real = photographs()
     sets: dict[str, tuple[Run, ...]] = {"flights": FLIGHTS, "answers": (*GROUPS, real) if real else GROUPS}
     choices = sets | {run.name: (run,) for run in (*sets["flights"], SHORT, *sets["answers"])}
@@ -54,9 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: bool) -> list[Verdict]:
-    """Run what the cache does not hold, two runs at a time, and compare; this side's results go to `keep`.
+    """Run what the cache lacks, two runs at a time, and compare; store the results of this side in `keep`.
 
-    Raises CheckoutError when REV's side fails, ValueError for a wrong table of renamed texts.
+    Raises CheckoutError if REV's side fails, and ValueError for a wrong table of renamed texts.
     """
     texts = Texts.read()
     old = {run: cache_folder(cache, commit, run.name, run.key) for run in (PICTURES, *runs)}
@@ -67,7 +67,7 @@ def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: 
         checkout = Path(temporary) / "checkout"
         if missing:
             check_out(commit, checkout)
-        if PICTURES in missing:  # before anyone is asked about them
+        if PICTURES in missing:  # the other groups need the pictures
             _timed(checkout, PICTURES, old[PICTURES], pictures)
         with ThreadPoolExecutor(AT_ONCE) as pool:
             first = [
@@ -80,7 +80,7 @@ def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: 
 
 
 def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
-    """Run, and print how long it took. Raises CheckoutError when it fails; `out` then does not exist."""
+    """Run, and print the duration. Raises CheckoutError on failure; `out` then does not exist."""
     work = out.with_name(f"{out.name}.{os.getpid()}.part")  # several processes may share the cache
     shutil.rmtree(work, ignore_errors=True)
     work.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
 
 
 def _verdict(run: Run, old: Path, new: Path, job: Future[None], texts: Texts) -> Verdict:
-    """Return the verdict of a run when its job is done; a run that failed in this checkout is different."""
+    """Return the verdict of a run when its job is done. A run that failed in this checkout is different."""
     try:
         job.result()
     except CheckoutError as error:

@@ -1,8 +1,7 @@
 """Records the answers of a checkout's star tracker, streaks, horizon, planners and identification.
 
-They are asked for by commands of `python -m flight`, which stay when modules move, so that any revision can
-be asked. Both revisions are asked about the same pictures: those that the old one rendered, and photographs
-where there are any.
+The questions are commands of `python -m flight`, which any revision has even if modules move. Both revisions
+process the same pictures: those that the old one rendered, and photographs if there are any.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from tests.studies.same_bytes.checkout import repository, run_script
 
 ANSWERS_FILE = "answers.json"
 PHOTOGRAPHS = repository().parent / "shared/data"
-# One process answers all commands of a group, because imports and the sky index take longer than an answer.
+# One process runs all commands of a group, because imports and the sky index take longer than an answer.
 _ASK = """
 import contextlib, io, json, os, runpy, sys
 checkout, *commands = sys.argv[1:]
@@ -49,7 +48,7 @@ class Answers:
 
     @property
     def key(self) -> object:
-        """All that the answers depend on, besides revision and machine."""
+        """Everything on which the answers depend, besides revision and machine."""
         return [_ASK, self.commands]
 
 
@@ -59,7 +58,7 @@ _STREAKS = "rate pictures/streaks.png --fov 15 --exposure 0.4"
 _LIMB = "horizon pictures/limb.png --fov 67"
 _SLEW = "plan --at 2026-03-01T12:00:00 --orbit"
 
-# Renders the pictures that the other groups are asked about; their bytes are compared too.
+# Renders the pictures of the other groups; their bytes are compared too.
 PICTURES = Answers(
     "pictures",
     (
@@ -113,7 +112,7 @@ GROUPS: tuple[Answers, ...] = (
             "solve pictures/turn.png --camera step_demo --exposure 0.3",
         ),
     ),
-    Answers(  # the nadir, with and without the altitude, by each method; a picture without a limb
+    Answers(  # nadir, with and without the altitude, by each method; a picture without a limb
         "horizon",
         (
             f"{_LIMB} --altitude 515",
@@ -124,7 +123,7 @@ GROUPS: tuple[Answers, ...] = (
             "horizon pictures/stars.png --fov 15 --altitude 515",
         ),
     ),
-    Answers(  # one axis: stretched, with rates, by supply energy, with a price of time, out of range
+    Answers(  # one axis: stretched, with rates, minimum supply energy, with a cost of time, out of range
         "plan",
         (
             "plan --from 0.4 --to -0.3",
@@ -135,7 +134,7 @@ GROUPS: tuple[Answers, ...] = (
             "plan --from 2 --to 0",
         ),
     ),
-    Answers(  # three axes: least energy, within cones, least time, the best begin, a time that is too short
+    Answers(  # three axes: minimum energy, within cones, minimum time, best start, a time that is too short
         "slew",
         (
             f"{_SLEW} orbit --from nadir --to sun --within 600",
@@ -145,13 +144,13 @@ GROUPS: tuple[Answers, ...] = (
             f"{_SLEW} orbit --from nadir --to 'inertial 0 0 0 1' --within 20",
         ),
     ),
-    # The constants of a body, from a simulated flight.
+    # Constants of a body, from a simulated flight.
     Answers("identify", ("identify step_demo --duration 60 --run identified",)),
 )
 
 
 def photographs(folder: Path = PHOTOGRAPHS) -> Answers | None:
-    """Return the questions about the real pictures of sky and limb in a folder; None when it has none."""
+    """Return the commands for the real pictures of sky and limb in a folder, or None if it has none."""
     commands = [f"solve photographs/{name}" for name in _pictures(folder, "sky")]
     commands += [
         f"horizon photographs/{name} --fov 12.8 --altitude 515" for name in _pictures(folder, "limb")
@@ -160,15 +159,15 @@ def photographs(folder: Path = PHOTOGRAPHS) -> Answers | None:
 
 
 def _pictures(folder: Path, part: str) -> Iterable[str]:
-    """Return the names of the pictures in a part of a folder."""
+    """Return the names of the pictures in a subfolder."""
     paths = sorted((folder / part).glob("*"))
     return [f"{part}/{path.name}" for path in paths if path.suffix in {".jpg", ".png", ".tiff"}]
 
 
 def ask(checkout: Path, answers: Answers, folder: Path) -> None:
-    """Let a checkout answer in `folder`; leave the answers there, with digests of the PNG files it wrote.
+    """Let a checkout answer in `folder`; store the answers there, with digests of the PNG files it wrote.
 
-    Raises CheckoutError when a command raises.
+    Raises CheckoutError if a command raises.
     """
     commands = [json.dumps(shlex.split(command)) for command in answers.commands]
     raw = json.loads(run_script(checkout, _ASK, str(checkout), *commands, folder=folder))

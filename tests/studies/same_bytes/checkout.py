@@ -1,6 +1,6 @@
 """Runs this project's code of any revision: a checkout of a commit, and Python processes in it.
 
-What a revision did is kept in a cache, because it depends only on the revision, the machine and the
+The results of a revision are cached, because they depend only on the revision, the machine and the
 interpreter with its libraries.
 """
 
@@ -16,8 +16,8 @@ import tarfile
 from importlib import metadata
 from pathlib import Path
 
-_LIMIT = 3600.0  # s of the machine's time for one process
-# A project installed as editable serves the modules that a checkout does not have: its finders are removed.
+_LIMIT = 3600.0  # timeout (s) of one process
+# An editable installation of the project provides modules that a checkout lacks, so its finders are removed.
 _ONLY_HERE = """
 import sys
 sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(finder).lower()]
@@ -25,7 +25,7 @@ sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(fin
 
 
 class CheckoutError(Exception):
-    """A revision that cannot be checked out, or a process in a checkout that did not end well."""
+    """Error for a revision that cannot be checked out, or a process in a checkout that failed."""
 
 
 def repository() -> Path:
@@ -34,7 +34,7 @@ def repository() -> Path:
 
 
 def resolve(revision: str) -> str:
-    """Return the full hash of a commit. Raises CheckoutError when git does not know the revision."""
+    """Return the full hash of a commit. Raises CheckoutError if git does not have the revision."""
     return _git("rev-parse", "--verify", f"{revision}^{{commit}}").strip()
 
 
@@ -48,19 +48,17 @@ def check_out(commit: str, folder: Path) -> None:
 
 
 def run_script(checkout: Path, script: str, *arguments: str, folder: Path | None = None) -> str:
-    """Return what a Python script prints that imports the checkout's modules only; it runs in `folder`.
+    """Return the output of a Python script that imports only the checkout's modules; it runs in `folder`.
 
-    Raises CheckoutError when it ends with another status than 0.
+    Raises CheckoutError if its exit status is not 0.
     """
     return run_python(checkout, "-c", _ONLY_HERE + script, *arguments, folder=folder)
 
 
 def run_python(checkout: Path, *arguments: str, folder: Path | None = None) -> str:
-    """Return what the interpreter prints in `folder` (default: the checkout).
+    """Return the output of the interpreter in `folder` (default: the checkout).
 
-    The checkout's modules come before installed ones.
-
-    Raises CheckoutError when it ends with another status than 0.
+    The checkout's modules come before installed ones. Raises CheckoutError if the exit status is not 0.
     """
     try:
         done = subprocess.run(
@@ -81,13 +79,13 @@ def run_python(checkout: Path, *arguments: str, folder: Path | None = None) -> s
 
 
 def cache_folder(root: Path, commit: str, name: str, key: object) -> Path:
-    """Return where a commit's run is kept: commit, name, and a hash of key, machine and libraries."""
+    """Return the cache folder of a commit's run: commit, name, and a hash of key, machine and libraries."""
     text = json.dumps([key, _machine(), sys.version, _libraries()])
     return root / commit[:12] / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
 def _machine() -> str:
-    """Return the processor's name: linear algebra libraries choose their code by it."""
+    """Return the name of the processor, by which linear algebra libraries choose their code."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,14 +1,14 @@
 """Compares the logs of two revisions' flights packet by packet, and their answers value by value.
 
-Each log is read with the packet table of the software that wrote it.
-Packets whose APID the old table does not have are counted as added and left out; sequence counts are kept per
-APID, so they do not disturb the others. A packet whose definition only had fields appended, with a higher
-version, is compared in the fields that the old one has. All else must be equal byte for byte, in the same
-order. Three labels of the RUN packet are not compared: UTC, the software's version, and the checksum of the
-configuration's text, in which a comment may change.
+Each log is read with the packet table of the software that wrote it. Packets whose APID the old table lacks
+are counted as added and otherwise ignored. Sequence counts are per APID, so these packets do not affect the
+others. If a new packet definition only appends fields and has a higher version, the old fields are compared.
+All other bytes must be equal, in the same order. Three labels of the RUN packet are not compared: UTC, the
+version of the software, and the checksum of the configuration's text, in which a comment may change.
 
-Of the answers these labels and the figures of the machine's time are left out; keys that only the new answer
-has are counted as added. Texts that differ pass when the table of renamed texts makes the new from the old.
+In the answers, these labels and times of the machine are not compared. Keys that only the new answer has are
+counted as added. Texts that differ are accepted if the table of renamed texts converts the old into the new
+text.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.studies.same_bytes.texts import Texts
 
 STEMS = ("flight", "truth")
 LABELS = {"run": ("utc_ns", "software", "config_crc")}
-# Keys of answers that are not compared: the labels, and figures of the machine's time.
+# Keys of answers that are not compared: the labels, and times of the machine.
 UNCOMPARED = frozenset(
     {
         *LABELS["run"],
@@ -42,17 +42,17 @@ UNCOMPARED = frozenset(
 _APID_BITS = 0x7FF
 Table = Mapping[int, Layout]
 _NONE = type("NoSuchValue", (), {"__repr__": lambda _: "missing"})()
-_SHORT = 100  # characters of a value that are shown
+_SHORT = 100  # number of displayed characters of a value
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first place where two logs or answers differ.
+    """First position at which two logs or answers differ.
 
     Attributes:
-        log: flight or truth; answers; run, when a run failed.
-        packet: of a log, its name; of the answers, the command; of a run, its name.
-        time: mission time of the old packet if any, s; None where there is no packet.
+        log: flight or truth; answers; run, if a run failed.
+        packet: name of the packet, of the command, or of the run.
+        time: mission time (s) of the old packet, or None without one.
     """
 
     log: str
@@ -65,13 +65,13 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the comparison of one flight or one group of answers found.
+    """Result of the comparison of one flight or one group of answers.
 
     Attributes:
-        compared: packets, and values of answers, compared.
-        added: packets and keys of answers that only the new side has, by name.
-        extended: packets of which the new definition has more fields.
-        difference: the first difference, None when there is none.
+        compared: number of compared packets and values of answers.
+        added: numbers of packets and keys of answers that only the new side has, by name.
+        extended: packets whose new definition has more fields.
+        difference: the first difference, or None.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Verdict:
 
 
 def compare(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
-    """Compare the logs, if the folders hold a flight, and the answers in two folders."""
+    """Compare the answers in two folders, and the logs if the folders hold a flight."""
     logs = compare_logs(name, old, new, texts) if (old / TABLE_FILE).is_file() else None
     answers = compare_answers(name, old, new, texts) if (old / ANSWERS_FILE).is_file() else None
     if logs is None or answers is None:
@@ -120,7 +120,7 @@ def compare_answers(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
 def _pairs(
     place: tuple[str, ...], a: Any, b: Any, texts: Texts
 ) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
-    """Yield each place of two answers with the old value and the new; _NONE where one has no such place."""
+    """Yield each key path of two answers with the old and new value; _NONE for a missing value."""
     if isinstance(a, dict) and isinstance(b, dict):
         names = {key: key if key in b else texts.renamed(key) for key in a}
         for key, name in names.items():
@@ -139,7 +139,7 @@ def _pairs(
 
 
 def _short(value: Any) -> str:
-    """Return a value as text of one line at most."""
+    """Return a value as text of at most one line."""
     text = repr(value)
     return text if len(text) <= _SHORT else f"{text[:_SHORT]}..."
 
@@ -170,7 +170,7 @@ def compare_logs(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
 
 
 def read_table(folder: Path) -> dict[int, Layout]:
-    """Return the layouts of the packet table kept beside a log, by APID."""
+    """Return the layouts of the packet table beside a log, by APID."""
     raw = json.loads((folder / TABLE_FILE).read_text(encoding="utf-8"))
     packets = [Packet(**{**entry, "fields": tuple(Field(**f) for f in entry["fields"])}) for entry in raw]
     return {layout.packet.apid: layout for layout in compile_layouts(packets).values()}
@@ -196,7 +196,7 @@ def _apid(packet: bytes) -> int:
 
 
 def _same(a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> tuple[bool, bool]:
-    """Return whether two packets are equal except for labels, and whether the new packet just adds fields."""
+    """Return whether two packets are equal except for labels, and whether the new one only adds fields."""
     if a == b:
         return True, False
     first, second = old.get(_apid(a)), new.get(_apid(b))
@@ -209,7 +209,7 @@ def _same(a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> tuple[boo
 
 
 def _renamed(a: bytes, b: bytes, layout: Layout, texts: Texts) -> bytes:
-    """Return the old packet with the texts that differ from the new packet's as the new one words them."""
+    """Return the old packet with its differing texts in the wording of the new packet."""
     raw = bytearray(a)
     for field in layout.packet.fields:
         begin, size = layout.offsets[field.name], layout.dtype[field.name].itemsize
@@ -221,7 +221,7 @@ def _renamed(a: bytes, b: bytes, layout: Layout, texts: Texts) -> bytes:
 
 
 def _extends(first: Layout, second: Layout) -> bool:
-    """Return whether the second definition is the first with fields appended and a higher version."""
+    """Return whether the second definition is the first one with appended fields and a higher version."""
     shared = second.packet.fields[: len(first.packet.fields)]
     more = len(second.packet.fields) > len(shared) == len(first.packet.fields)
     raised = second.packet.version > first.packet.version
@@ -265,7 +265,7 @@ def _explain(stem: str, a: bytes, b: bytes, old: Table, new: Table, texts: Texts
 
 
 def _one_ended(stem: str, a: bytes | None, b: bytes | None, old: Table, new: Table) -> Difference:
-    """Return the difference where one log ends before the other."""
+    """Return the difference between two logs of which one ends first."""
     name, time = (_name(a, old), _time(a)) if a is not None else (_name(b or b"", new), _time(b or b""))
     return Difference(
         stem, name, time, "packet", "end of log" if a is None else name, "end of log" if b is None else name
@@ -282,7 +282,7 @@ def _time(packet: bytes) -> float:
 
 
 def _values(a: Any, b: Any) -> tuple[str, str]:
-    """Return two values of a field as text; of arrays the first element that differs."""
+    """Return two values of a field as text; for arrays, the first elements that differ."""
     if isinstance(a, np.ndarray):
         index = next(i for i in range(len(a)) if a[i].tobytes() != b[i].tobytes())
         return f"[{index}] {a[index].item()!r}", f"[{index}] {b[index].item()!r}"

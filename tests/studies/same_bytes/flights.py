@@ -32,13 +32,13 @@ json.dump([dataclasses.asdict(packet) for packet in table], sys.stdout)
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One flight, and the questions about it.
+    """One flight, and the commands that are run on it.
 
     Attributes:
-        duration: s; the configuration's when None.
-        faults: as `flight run --fault` takes them.
+        duration: duration (s), or None for that of the configuration.
+        faults: arguments of `flight run --fault`.
         changes: YAML that replaces values of the configuration.
-        questions: commands that are asked in the folder of the run.
+        questions: commands that run in the folder of the flight.
     """
 
     name: str
@@ -50,13 +50,13 @@ class Flight:
 
     @property
     def options(self) -> list[str]:
-        """The arguments of `python -m flight run` besides configuration and folder."""
+        """Arguments of `python -m flight run` besides configuration and folder."""
         duration = [] if self.duration is None else ["--duration", f"{self.duration:g}"]
         return [*duration, *(word for fault in self.faults for word in ("--fault", fault))]
 
     @property
     def key(self) -> object:
-        """All that the flight depends on, besides revision and machine."""
+        """Everything on which the flight depends, besides revision and machine."""
         return [_DUMP_TABLE, self.config, self.options, self.changes, Answers(self.name, self.questions).key]
 
 
@@ -91,8 +91,10 @@ FLIGHTS: tuple[Flight, ...] = (
         60,
         ("bus: nack @ 12 for 4", "pwm: brown-out @ 25", "monitor: bits @ 30 for 10", "bus: hang @ 48 for 3"),
     ),
-    # A KnightCube at 0.6 deg/s: rates from streaks, braked, attitude acquired, slews within cones to Sun and
-    # nadir, the Earth in star frames, Sun and limb in the wide cameras. GPS and a camera fail for a time.
+    # The KnightCube starts at 0.6 deg/s: streak rates, detumbling, attitude acquisition, slews that avoid
+    # exclusion cones
+    # to Sun and nadir, Earth in star frames, Sun and limb in the horizon cameras; GPS and a camera fail for a
+    # time.
     Flight(
         "orbit",
         "config/orbit.yaml",
@@ -101,18 +103,18 @@ FLIGHTS: tuple[Flight, ...] = (
         "{targets: [{at: 0.0, point: sun}, {at: 120.0, point: nadir, roll_deg: 0.0}],"
         " simulation: {free_body: {release: {speed: 0.01}}}}",
     ),
-    # A 3U as configured: it tumbles at 10 deg/s; streaks, rate by the magnetometer, Sun and limb.
+    # A 3U as configured: a tumble at 10 deg/s, streaks, rate from the magnetometer, Sun and limb.
     Flight("orbit_3u", "config/orbit_3u.yaml", 60),
-    # A passing object is found among the stars and followed, and its orbit determined.
+    # An object passes among the stars, is detected and followed, and its orbit is determined.
     Flight("orbit_object", "config/orbit_object.yaml", 90, questions=("report . --no-figures", "orbit .")),
 )
 SHORT = Flight("short", _DEMO, 8)  # for tests
 
 
 def fly(checkout: Path, flight: Flight, folder: Path) -> None:
-    """Fly in `checkout`; leave logs, the revision's packet table and answers about the flight in `folder`.
+    """Fly in `checkout`; store logs, the revision's packet table and answers about the flight in `folder`.
 
-    Raises CheckoutError when the flight does not end well.
+    Raises CheckoutError if the flight fails.
     """
     config = checkout / flight.config
     with tempfile.TemporaryDirectory(prefix="same-bytes-") as temporary:
@@ -128,12 +130,12 @@ def fly(checkout: Path, flight: Flight, folder: Path) -> None:
 
 
 def packet_table(checkout: Path) -> str:
-    """Return a checkout's packet definitions as JSON. Raises CheckoutError when it has none."""
+    """Return a checkout's packet definitions as JSON. Raises CheckoutError if it has none."""
     return run_script(checkout, _DUMP_TABLE)
 
 
 def _merged(values: Any, changes: Any) -> Any:
-    """Return nested mappings with the values of others put in; anything else is replaced."""
+    """Return nested mappings in which values of `changes` replace those of `values`."""
     if not (isinstance(values, dict) and isinstance(changes, dict)):
         return changes
     return values | {name: _merged(values.get(name), change) for name, change in changes.items()}

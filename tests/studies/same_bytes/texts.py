@@ -1,4 +1,4 @@
-"""Reads texts of the old revision as this checkout words them, by the table `renamed_texts.yaml`."""
+"""Converts texts of the old revision to the wording of this checkout, by the table `renamed_texts.yaml`."""
 
 from __future__ import annotations
 
@@ -16,19 +16,22 @@ class Texts:
     """The renamed texts."""
 
     def __init__(self, pairs: Iterable[Mapping[str, str]] = ()) -> None:
-        """Take pairs of `old` and `new`. Raises ValueError for a pair with other keys or placeholders."""
+        """Create the table from pairs of `old` and `new`.
+
+        Raises ValueError for a pair with other keys or placeholders.
+        """
         self._pairs = [_compiled(pair) for pair in pairs]
 
     @classmethod
     def read(cls, path: Path = TABLE) -> Texts:
-        """Return the table of a file. Raises ValueError when it is not a list of pairs."""
+        """Return the table of a file. Raises ValueError if it is not a list of pairs."""
         pairs = yaml.safe_load(path.read_text(encoding="utf-8"))
         if not isinstance(pairs, list):
             raise ValueError(f"{path}: not a list of pairs of old and new")
         return cls(pairs)
 
     def renamed(self, text: str) -> str:
-        """Return a text of the old revision as the new one words it."""
+        """Return a text of the old revision in the wording of the new one."""
         for old, new in self._pairs:
             found = old.fullmatch(text)
             if found is not None:
