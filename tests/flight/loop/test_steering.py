@@ -1,4 +1,4 @@
-"""Tests that the coil drive leaves resting coils off, corrects signs and gains, and reports coil tests."""
+"""Tests that steering without a basis sends zero, and that the coil drive corrects currents and reports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flight.loop.coil_currents import CoilFault
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import EventLog, Facts, Services
-from flight.loop.steering import CoilDrive, CoilDriveSettings
+from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.schema.sections import Modes
 from hal.interfaces.devices import NO_AXES, CoilState, ImuReading, TorqueCoils
 from knightcube.astro.arrays import FloatArray
@@ -49,6 +49,35 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
         cast(TorqueCoils, coils), None, cast(CoilMonitor, watch), settings, cast(Services, services)
     )
     return drive, coils, watch
+
+
+@pytest.mark.parametrize("estimate", [None, Mock()], ids=["blind", "measured"])
+@pytest.mark.parametrize("reference", [None, Mock()], ids=["no path", "path"])
+@pytest.mark.parametrize("current", [False, True], ids=["silent", "heard"])
+@pytest.mark.parametrize("has_rate", [False, True], ids=["no gyro", "gyro"])
+def test_each_cycle_without_a_basis_for_control_sends_zero_current(
+    estimate: Any, reference: Any, current: bool, has_rate: bool
+) -> None:
+    drive, coils, _ = _drive([False, False, False])
+    coils.state = lambda: Mock(error="")  # type: ignore[attr-defined]
+    drive._watch.test_wave = lambda _: None  # type: ignore[method-assign]
+    body = Mock()
+    asked, control = np.array([0.02, 0.03, -0.01]), body.control
+    body.estimation.rate_without_gyro.return_value = None
+    control.paths.sample.return_value = reference
+    for law in (control.tracker, control.detumbling, control.sun_acquisition):
+        law.command.return_value.currents = asked
+    steering = Steering(body, drive, Mock())
+    reading = Mock(has_rate=has_rate)
+    for run, has_basis in (
+        (lambda: steering.run(estimate, 0, True), estimate is not None and reference is not None),
+        (lambda: steering.detumble([reading], current, 0), current),
+        (lambda: steering.acquire_sun([reading], current, 0), current and has_rate),
+        (lambda: steering.rest(0), False),
+    ):
+        coils.currents = np.full(3, 0.1)
+        sent = run().currents
+        assert coils.currents.tolist() == sent.tolist() == (asked.tolist() if has_basis else [0.0] * 3)
 
 
 def test_a_resting_coil_carries_nothing_and_the_others_make_the_torque() -> None:
