@@ -96,7 +96,7 @@ class Steered:
         reference: reference motion at the time of the cycle, or None without a path.
         dipole: commanded dipole (3,), A m^2.
         currents: currents (3,), A, sent to the driver, after reallocation and with the coil monitor's probe
-            current. The sent currents are zero if a fault in this cycle switched the coils off.
+            current.
     """
 
     state: SteeringState
@@ -139,6 +139,19 @@ class ReadingAgreement:
 
     holds: bool
     objection: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FixVerdict:
+    """Use of a GPS fix by the body. A fix without use or refusal awaits further fixes.
+
+    Attributes:
+        used: whether the fix updates the orbit.
+        refusal: why the fix is refused; empty if it is not.
+    """
+
+    used: bool = False
+    refusal: str = ""
 
 
 class Filter(Protocol):
@@ -415,9 +428,9 @@ class BodyEstimation(Protocol):
         """
         return None
 
-    def accept_fix(self, reading: GpsReading) -> str | None:
-        """Accept a GPS fix; return why it is refused (empty if used), or None if it waits or has no use."""
-        return None
+    def accept_fix(self, reading: GpsReading) -> FixVerdict:
+        """Accept a GPS fix, and return whether it is used."""
+        return FixVerdict()
 
     def accept_sun(self, reading: StringReading) -> str | None:
         """Accept a solar cell reading; return its fault (empty for none), or None if it was not checked."""

@@ -18,7 +18,7 @@ import numpy as np
 from flight.link import events
 from flight.link.telemetry.definitions import FIX, GPS_LINK, IMU
 from flight.loop import facts
-from flight.loop.body import BodyEstimation
+from flight.loop.body import BodyEstimation, FixVerdict
 from flight.loop.coil_response import CoilCorrection
 from flight.loop.facts import Services
 from hal.interfaces.devices import (
@@ -371,7 +371,7 @@ class Positioning:
     def __init__(
         self,
         receiver: GpsReceiver,
-        accept: Callable[[GpsReading], str | None],
+        accept: Callable[[GpsReading], FixVerdict],
         max_age_ns: int,
         services: Services,
     ) -> None:
@@ -408,17 +408,17 @@ class Positioning:
             if not reading.valid:
                 continue
             self._streams.note("gps", reading.time_ns)
-            refusal = self._accept(reading)
-            used = refusal == ""
-            if used:
+            verdict = self._accept(reading)
+            if verdict.used:
                 self._fixed_ns = reading.time_ns
                 # Before the first fix, the position was computed with the wall clock.
                 self._off_ns = self._clock.correct(reading.utc_ns + GPS_DELAY_NS, reading.time_ns)
                 text = f"the wall clock is {self._off_ns * 1e-9:+.1f} s off the receiver's time"
                 self._facts.update(facts.CLOCK_OFF, abs(self._off_ns) > facts.CLOCK_OFF_NS, now_ns, text)
-            elif refusal:
-                self._events.report(events.GPS_REFUSED, now_ns, f"{refusal}; {reading.satellites} satellites")
-            self._record(reading, used, now_ns)
+            elif verdict.refusal:
+                text = f"{verdict.refusal}; {reading.satellites} satellites"
+                self._events.report(events.GPS_REFUSED, now_ns, text)
+            self._record(reading, verdict.used, now_ns)
         link = self._watch_line(now_ns)
         age_ns = now_ns - self._fixed_ns
         cause = f": {link.condition}" if link.condition else ""

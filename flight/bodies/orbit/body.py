@@ -37,6 +37,7 @@ from flight.loop.body import (
     BodyEstimation,
     BodyKind,
     ControlOutput,
+    FixVerdict,
     FlightBody,
     ReadingAgreement,
     ReadingFeed,
@@ -339,8 +340,8 @@ class SatelliteEstimation(BodyEstimation):
         """Return the satellite's velocity (3,), m/s, relative to the Sun (ICRS), or None without an orbit."""
         return self.environment.velocity(time_ns)
 
-    def accept_fix(self, reading: GpsReading) -> str | None:
-        """Accept a GPS fix; return why it is refused (empty if used), or None if it awaits further fixes."""
+    def accept_fix(self, reading: GpsReading) -> FixVerdict:
+        """Accept a GPS fix, and return whether it is used; field and sunlight may contradict it."""
         field, sigma, sunlit = None, math.inf, False
         measured = self.orbit_filter.field_at_rest
         if measured is not None and abs(reading.time_ns - measured[0]) <= LATEST_WITNESS_NS:
@@ -351,7 +352,7 @@ class SatelliteEstimation(BodyEstimation):
             recent = abs(reading.time_ns - sun.newest.time_ns) <= LATEST_WITNESS_NS
             sunlit = recent and float(np.max(sun.newest.currents / sun.strings.peaks)) >= SUNLIT_SHARE
         used = self.environment.fix(reading, Witness(field, sigma, sunlit))
-        return "" if used else self.environment.refusal or None
+        return FixVerdict(used, self.environment.refusal)
 
     def accept_sun(self, reading: StringReading) -> str | None:
         """Pass a solar cell reading to the filter and to the Sun acquisition of SAFE."""

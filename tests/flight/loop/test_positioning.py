@@ -11,6 +11,7 @@ import pytest
 from flight.link.telemetry.definitions import GPS_LINK
 from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.log import Recorder
+from flight.loop.body import FixVerdict
 from flight.loop.facts import EventLog, Facts, FlightClock, Services, Streams
 from flight.loop.navigation import GPS_DELAY_NS, Positioning
 from hal.interfaces.devices import GpsLink, GpsReading
@@ -64,8 +65,8 @@ class Bench:
         events = EventLog(lambda kind, _1, _2, text: self.texts.setdefault(kind.name, []).append(text), 0)
         self.clock = FlightClock(SimClock(UTC_NS))
         services = Services(self.clock, None, self.recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no jobs
-        self.refusal: str | None = None
-        self.positioning = Positioning(self.receiver, lambda _: self.refusal, 60 * SECOND_NS, services)
+        self.verdict = FixVerdict()
+        self.positioning = Positioning(self.receiver, lambda _: self.verdict, 60 * SECOND_NS, services)
         self.positioning.begin(0)
         self._now_ns = 0
 
@@ -113,7 +114,7 @@ def test_a_fix_that_is_not_valid_is_not_offered_to_the_body() -> None:
     bench = Bench()
     zero = np.zeros(3)
     bench.receiver.readings = [GpsReading(0, 0, 0, zero, zero, 1.0, 1.0, 9, False)]
-    bench.refusal = "offered"
+    bench.verdict = FixVerdict(refusal="offered")
     bench.run(3)
     assert "gps-refused" not in bench.texts
 
@@ -124,7 +125,7 @@ def test_only_a_refused_fix_is_an_event_which_names_the_reason() -> None:
     bench.receiver.readings = [GpsReading(0, 0, UTC_NS, np.zeros(3), velocity, 1.0, 1.0, 9, True)]
     bench.run(3)
     assert "gps-refused" not in bench.texts, "the fix waits for further fixes"
-    bench.refusal = "the fix contradicts the orbit elements"
+    bench.verdict = FixVerdict(refusal="the fix contradicts the orbit elements")
     bench.run(1)
     assert bench.texts["gps-refused"] == ["the fix contradicts the orbit elements; 9 satellites"]
 
@@ -139,7 +140,7 @@ def test_the_receiver_corrects_a_clock_that_is_more_than_a_second_off(off: float
     ]
     bench.run(2)
     assert bench.clock.utc_ns() == UTC_NS, "the body does not use the fix"
-    bench.refusal = ""
+    bench.verdict = FixVerdict(used=True)
     bench.run(2)
     assert bench.clock.utc_ns() == (true_ns if abs(off) > 1.0 else UTC_NS)
     assert ("clock-off" in bench.texts) is (abs(off) > 1.0)
