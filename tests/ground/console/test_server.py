@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from flight.link.modes import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
 from ground.console.commanding import CommandForms
+from ground.console.files import RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console
 from ground.console.surroundings import UNKNOWN, FlightSurroundings
@@ -372,6 +374,27 @@ def test_a_satellite_points_by_named_numbers_and_refuses_what_only_a_testbed_obe
     assert (
         forms.text("use-file", {"name": "received/elements/a", "sum": "ab" * 32}) == "use received/elements/a"
     )
+
+
+def test_files_are_listed_downloaded_and_uploaded_whole(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = RunFiles(folder).listing()["files"][0]["name"]
+    receipt = {"name": "elements/tle.txt", "bytes": 3}
+    put = Mock(return_value=receipt)
+    monkeypatch.setattr(RunFiles, "put", put)
+
+    async def ask(client: TestClient[Any, Any]) -> Answer:
+        query, headers = {"kind": "elements", "name": "tle.txt"}, {"Origin": own(client)}
+        async with client.post("/api/file", params=query, data=b"1 2", headers=headers) as answer:
+            assert await answer.json() == receipt
+        async with client.get("/api/file", params={"name": name}) as answer:
+            assert await answer.read() == (folder / name).read_bytes()
+        async with client.get("/api/files") as answer:
+            return answer.status, await answer.json()
+
+    assert asked(folder, ask) == (200, RunFiles(folder).listing())
+    put.assert_called_once_with("elements", "tle.txt", b"1 2")
 
 
 def test_without_a_way_to_the_flight_nothing_is_sent(folder: Path) -> None:
