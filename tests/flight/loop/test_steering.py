@@ -53,7 +53,7 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
 
 @pytest.mark.parametrize("estimate", [None, Mock()], ids=["blind", "measured"])
 @pytest.mark.parametrize("reference", [None, Mock()], ids=["no path", "path"])
-@pytest.mark.parametrize("current", [False, True], ids=["silent", "heard"])
+@pytest.mark.parametrize("current", [False, True], ids=["no reading", "reading"])
 @pytest.mark.parametrize("has_rate", [False, True], ids=["no gyro", "gyro"])
 def test_each_cycle_without_a_basis_for_control_sends_zero_current(
     estimate: Any, reference: Any, current: bool, has_rate: bool
