@@ -32,16 +32,16 @@ class Listener:
         weakref.finalize(self, self._line.shutdown, socket.SHUT_RDWR)
 
     def will_say(self, *replies: bytes) -> None:
-        """Give these replies from now on, and repeat the last one."""
+        """Set the replies from now on; the last one is repeated."""
         self._reply[:] = replies
 
 
 def _listen(line: socket.socket, reply: list[bytes]) -> None:
-    """Answer until the line is shut."""
+    """Answer until the socket is shut down."""
     while True:
         _, sender = line.recvfrom(LONGEST)
         if not sender:
             line.close()
             return
-        with contextlib.suppress(OSError):  # who asked has gone again
+        with contextlib.suppress(OSError):  # the sender has closed its socket
             line.sendto(reply.pop(0) if len(reply) > 1 else reply[0], sender)

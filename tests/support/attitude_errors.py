@@ -19,10 +19,10 @@ def error_in_pixels(angle: float, resolution: int, field_of_view: float) -> floa
 
 
 def attitude_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
-    """Return the errors (whole, across) of an attitude (4,), rad.
+    """Return the total error and the error across the boresight (rad) of an attitude (4,).
 
     The total error is the rotation angle from truth to estimate. The error across is the angle between the
-    two boresights, without the rotation about the boresight, which is about ten times less accurate in a
+    two boresights. It excludes the rotation about the boresight, which is about ten times less accurate in a
     narrow field.
     """
     difference = multiply(estimate, conjugate(truth))

@@ -1,8 +1,9 @@
 """Calls into the operating system that the thread of the control loop makes in flight.
 
-`python -m tests.support.blocking_calls CONFIG OUT DEVICES` flies on emulated devices in real time and prints,
-as a JSON list, every call of a C function that may block: its caller in the product and its name. Methods
-of non-blocking sockets are left out. The calls of start and end, which may wait, do not count.
+`python -m tests.support.blocking_calls CONFIG OUT DEVICES` flies on emulated devices in real time. It prints,
+as a JSON list, the product function and the name of every call of a C function that may block. Methods of
+non-blocking sockets are left out. The calls at the start and the end of the flight, which may block, do not
+count.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ class BlockingCalls:
         self.found: set[tuple[str, str]] = set()
 
     def start(self) -> None:
-        """Collect from now on."""
+        """Start collecting."""
         sys.setprofile(self._profile)
 
     def stop(self) -> None:
-        """Collect no more."""
+        """Stop collecting."""
         sys.setprofile(None)
 
     def _profile(self, frame: FrameType, event: str, called: Any) -> None:

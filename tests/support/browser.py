@@ -16,9 +16,12 @@ from urllib.parse import urlsplit
 HOST = "127.0.0.1"
 
 
-@dataclass  # without slots: playwright marks the object whose methods it calls
+@dataclass  # without slots, because playwright sets attributes on objects whose methods it calls
 class Page:
-    """An open page. `complaints` of its console; `strangers`: requested addresses beyond loopback."""
+    """An open page.
+
+    `complaints` are console messages; `strangers` are requested addresses beyond loopback.
+    """
 
     page: Any
     complaints: list[str] = field(default_factory=list)
@@ -34,12 +37,15 @@ class Page:
         self.complaints.append(str(error))
 
     def asked(self, request: Any) -> None:
-        """Record a request that leaves the machine."""
+        """Record a request to an address beyond loopback."""
         if urlsplit(request.url).hostname not in (HOST, None):
             self.strangers.append(request.url)
 
     def wait(self, condition: str, patience: float = 30.0) -> None:
-        """Wait until an expression is true; the page's own rules forbid playwright's way, which is `eval`."""
+        """Wait until an expression is true.
+
+        Playwright's own function uses `eval`, which the page's security policy forbids.
+        """
         until = time.monotonic() + patience
         while not self.page.evaluate(condition):
             assert time.monotonic() < until, f"not within {patience:g} s: {condition}"
@@ -51,7 +57,7 @@ class Page:
 
     @property
     def shown(self) -> tuple[float, str]:
-        """The displayed time, s, and the values of all packets at that time."""
+        """Time (s) that the page shows, and the values of all packets at that time."""
         self.page.evaluate("document.getElementById('all').open = true")
         self.page.wait_for_timeout(300)
         both = "[document.body.dataset.time, document.getElementById('packets').textContent]"
@@ -123,7 +129,7 @@ def audit(page: Page) -> list[str]:
 
 @contextlib.contextmanager
 def browsing(*arguments: str) -> Iterator[Any]:
-    """Yield a running browser, as playwright calls it, started with more `arguments`."""
+    """Yield a running Chromium, started by playwright with additional `arguments`."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     with sync_playwright() as play:
@@ -136,7 +142,7 @@ def browsing(*arguments: str) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def another_origin(text: str = "<!doctype html><title>another page</title>") -> Iterator[str]:
-    """Serve a page of another origin on loopback, as a page of the web would be, and yield its address."""
+    """Serve a page of another origin on loopback, and yield its address."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

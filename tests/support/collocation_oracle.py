@@ -1,8 +1,8 @@
-"""An independent optimum of a single-axis slew: direct collocation in theta, and its own interior point.
+"""Independent optimum of a single-axis slew by direct collocation and an interior-point solver.
 
-It is independent of the planner: states are theta and omega, not q2; the discretisation is the trapezoidal
-rule on some hundreds of intervals, not a polynomial; the solver is a primal-dual interior point method on the
-banded optimality system, not SLSQP. Its error is of second order in the step.
+It is independent of the planner. The states are theta and omega, not q2. The discretisation is the
+trapezoidal rule on some hundreds of intervals, not a polynomial. The solver is a primal-dual interior-point
+method on the banded optimality system, not SLSQP. The error is of second order in the step.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from knightcube.astro.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Slew:
-    """A slew between two moving states: rad, rad/s; the plant in SI, its disturbance in rad/s^2."""
+    """A slew between two moving states (rad, rad/s), with the plant in SI and its disturbance in rad/s^2."""
 
     start_angle: float
     start_rate: float
@@ -35,7 +35,7 @@ class Slew:
 
 @dataclass(frozen=True)
 class Optimum:
-    """The least integral of R I^2 in J, and theta in rad and I in A on the grid (m + 1,)."""
+    """Smallest integral of R I^2 (J), with theta (rad) and I (A) on the grid (m + 1,)."""
 
     energy: float
     angle: FloatArray
@@ -43,7 +43,7 @@ class Optimum:
 
 
 def solve(slew: Slew, intervals: int = 400, tolerance: float = 1e-9, iterations: int = 80) -> Optimum | None:
-    """Return the optimum; None if the iteration fails, for example because no trajectory keeps the limit."""
+    """Return the optimum, or None if the iteration fails, as without a trajectory within the limit."""
     point = _InteriorPoint(slew, intervals)
     for _ in range(iterations):
         if point.residual() < tolerance and point.barrier <= 1e-9:
@@ -55,10 +55,10 @@ def solve(slew: Slew, intervals: int = 400, tolerance: float = 1e-9, iterations:
 
 
 class _InteriorPoint:
-    """min sum w u^2, |u| <= 1, subject to trapezoidal defects; u is the current over its limit.
+    """Minimisation of sum w u^2 with |u| <= 1 and trapezoidal defects; u is the current over its limit.
 
-    Unknowns are ordered along the grid - theta, omega, u, then the two multipliers of the interval that
-    follows - which makes the Newton matrix banded with four diagonals on either side.
+    The unknowns are ordered along the grid: theta, omega, u, then the two multipliers of the next interval.
+    This makes the Newton matrix banded with four diagonals on either side.
     """
 
     def __init__(self, slew: Slew, intervals: int) -> None:
@@ -71,7 +71,7 @@ class _InteriorPoint:
         self.weights = np.full(self.n, self.h)
         self.weights[[0, -1]] *= 0.5
         time = np.linspace(0.0, slew.horizon, self.n)
-        # A cubic in theta as the first guess; it holds the boundary states, which no step changes.
+        # The first guess is a cubic in theta that has the boundary states; no step changes them.
         change = np.array(
             [
                 slew.end_angle - slew.start_angle - slew.start_rate * slew.horizon,
@@ -104,9 +104,9 @@ class _InteriorPoint:
         return np.stack([first, second], axis=1)
 
     def _gradient(self) -> FloatArray:
-        """Gradient of the Lagrangian (n, 3) by theta, omega, u, the bounds' multipliers aside."""
+        """Return the Lagrangian's gradient (n, 3) by theta, omega and u, without the bounds' multipliers."""
         cos, sin = np.cos(self.theta), np.sin(self.theta)
-        difference = np.zeros((self.n, 2))  # of the multipliers, from d(x_(k+1) - x_k)
+        difference = np.zeros((self.n, 2))  # difference of the multipliers, from d(x_(k+1) - x_k)
         difference[1:] += self.multipliers
         difference[:-1] -= self.multipliers
         mean = self._neighbour_sum() * (0.5 * self.h)
@@ -122,7 +122,7 @@ class _InteriorPoint:
         return total
 
     def residual(self) -> float:
-        """Return the largest violation of the optimality conditions, complementarity included."""
+        """Return the largest violation of the optimality conditions, including complementarity."""
         gradient = self._gradient()
         gradient[:, 2] += self.upper - self.lower
         gradient[[0, -1], :2] = 0.0
@@ -130,7 +130,7 @@ class _InteriorPoint:
         return float(max(np.abs(gradient).max(), np.abs(self._defects()).max(), np.abs(gaps).max()))
 
     def step(self) -> bool:
-        """Take one Newton step of the perturbed conditions; False if the step fails."""
+        """Take one Newton step of the perturbed conditions; return False if it fails."""
         rhs = np.zeros((self.n, 5))
         rhs[:, :3] = -self._gradient()
         rhs[:, 2] += self.barrier / (1 + self.u) - self.barrier / (1 - self.u)
@@ -156,11 +156,11 @@ class _InteriorPoint:
         return bool(np.abs(self.u).max() < 1.0 - 1e-13 and np.abs(self.theta).max() < 1.6)
 
     def _matrix(self) -> FloatArray:
-        """Return the Newton matrix in solve_banded's diagonal ordered form (9, 5 n)."""
+        """Return the Newton matrix (9, 5 n) in the diagonal ordered form of solve_banded."""
         band = np.zeros((9, self.n, 5))
 
         def put(row: int, column: int, values: FloatArray | float, ahead: int = 0) -> None:
-            """Set entry (row of point k, column of point k + ahead) for all k that have it."""
+            """Set entry (row of point k, column of point k + ahead) for all k that have one."""
             stop = self.n - ahead
             band[4 + row - column - 5 * ahead, ahead : ahead + stop, column] = np.broadcast_to(
                 values, self.n
@@ -179,8 +179,9 @@ class _InteriorPoint:
         by_u = 0.5 * self.h * self.gain * cos
         half, drag = 0.5 * self.h, 0.5 * self.h * self.drag
         last = np.ones(self.n)
-        last[-1] = 0.0  # the last point has no interval after it: its multiplier rows are the unit matrix
-        # Defects of interval k by the states of point k, and by those of point k + 1.
+        # the last point has no interval after it, so its multiplier rows are those of the unit matrix
+        last[-1] = 0.0
+        # Derivatives of the defects of interval k by the states of point k, and by those of point k + 1.
         put(3, 0, -last)
         put(3, 1, -half * last)
         put(4, 0, -by_theta * last)
@@ -193,7 +194,7 @@ class _InteriorPoint:
         put(4, 0, -by_theta[np.r_[1 : self.n, 0]], 1)
         put(4, 1, 1.0 + drag, 1)
         put(4, 2, -by_u[np.r_[1 : self.n, 0]], 1)
-        # The transposes: state rows by the multipliers of the interval after (same point) and before.
+        # Transposes: derivatives of the state rows by the multipliers of the interval after and before.
         first = inner * last
         put(0, 3, -first)
         put(0, 4, -by_theta * first)

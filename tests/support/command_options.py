@@ -1,4 +1,4 @@
-"""The arguments of a command as text, to be compared with the published ones."""
+"""Arguments of a command as text, for the comparison with the published ones."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
 
 
 def sum_of_squares_numpy(values: FloatArray) -> float:
-    """Return the sum of the squares of some values."""
+    """Return the sum of the squares of values."""
     return float(values @ values)
 
 
@@ -24,7 +24,7 @@ def _square(value: float) -> float:
 
 @compiled_form_of(sum_of_squares_numpy)
 def sum_of_squares(values: FloatArray) -> float:
-    """Return the sum of the squares of some values: a minimal function with a numpy and a compiled form."""
+    """Return the sum of the squares of values, as a minimal function with a numpy and a compiled form."""
     total = 0.0
     for value in values:
         total += _square(value)
@@ -34,10 +34,10 @@ def sum_of_squares(values: FloatArray) -> float:
 def assert_forms_agree(
     hot: HotFunction[Any, Any], *args: Any, relative: float = 1e-9, interpreted: bool = True
 ) -> None:
-    """Call all forms of a function with copies of the arguments, and compare results and changed arguments.
+    """Call all forms of a function with copies of the arguments; compare results and changed arguments.
 
-    Arrays must agree to the `relative` tolerance of each value and of the largest one. The loop form is also
-    called without compilation if `interpreted`, because Python checks every index, and machine code none.
+    Arrays must agree to the `relative` tolerance of each value and of the largest one. With `interpreted` the
+    loop form is also called without compilation, because Python checks every index and machine code does not.
     """
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     forms = [hot.numpy_form, hot.compiled_form(), *([hot.loop_form] if interpreted else [])]

@@ -1,8 +1,8 @@
-"""Two true worlds to test the filter's covariance: sim_hal's testbed, and a body free in orbit.
+"""Two true worlds to test the filter's covariance: sim_hal's testbed, and a body that is free in orbit.
 
-Both carry the noise that the filter must live with: coil currents off by a uniform draw each cycle while they
-are driven, a torque that the filter does not know of. The free body is integrated here, by classical
-Runge-Kutta on Euler's equation with matrices, apart from the flight code's formulas.
+Both have unmodelled errors: the coil currents have a uniform random error in each cycle in which the coils
+are driven, and there is an unknown torque. The free body is integrated by classical Runge-Kutta on Euler's
+equation with matrices, independently of the flight code.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ DIPOLE = 80 * 0.0081
 TESTBED_FIELD: FloatArray = np.array([0.0, 0.0, -4.5e-4])
 ORBIT_FIELD = 4.5e-5
 FIELD_TURN = 2.2e-3
-"""Rate (rad/s) of the field along a low polar orbit, which makes two rotations per orbit."""
+"""Rate (rad/s) of the field's direction in a low polar orbit: two rotations per orbit."""
 CURRENT_BOUND = 3.5e-3
 GAIN_SIGMA = 0.1
 """Standard deviation of the coils' torque relative to its nominal value."""
@@ -63,7 +63,7 @@ DRAG = Push(1e-4, 1e-5)
 
 
 class World(Protocol):
-    """Interface of a true world for the campaign."""
+    """Interface of a true world."""
 
     suspended: bool
     attitude: FloatArray
@@ -72,19 +72,19 @@ class World(Protocol):
     parameters: Parameters
 
     def field(self) -> FloatArray:
-        """Return the field of now (3,), T, reference axes."""
+        """Return the present field (3,), T, reference axes."""
 
     def command(self, currents: FloatArray) -> None:
-        """Drive the coils with (3,) A, noise added."""
+        """Drive the coils with currents (3,), A, to which noise is added."""
 
     def advance(self, span_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
 
 
 class SuspendedWorld:
-    """sim_hal's testbed on a thread that is unknown to the filter, with a torque of the air.
+    """sim_hal's testbed on a thread that the filter does not know, with a torque of the air.
 
-    The torque of the air is simulated by the coil current with the same torque.
+    The torque of the air is simulated by the coil current that causes the same torque.
     """
 
     suspended = True
@@ -113,7 +113,7 @@ class SuspendedWorld:
         self._follow()
 
     def field(self) -> FloatArray:
-        """Return the Helmholtz coil's field."""
+        """Return the field of the Helmholtz coils."""
         return TESTBED_FIELD
 
     def command(self, currents: FloatArray) -> None:
@@ -121,7 +121,7 @@ class SuspendedWorld:
         self._currents = _actual(currents, self._rng)
 
     def advance(self, span_ns: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         self.testbed.advance_to(self.testbed.time_ns + span_ns)
         self._draught += DRAUGHT.walk * np.sqrt(span_ns * 1e-9) * self._rng.standard_normal()
         self._follow()
@@ -178,7 +178,7 @@ class FreeWorld:
         self._time += dt
 
     def _flow(self, x: FloatArray, field: FloatArray) -> FloatArray:
-        """Return d(q, w)/dt: q' = Omega(w) q / 2 and Euler's equation, B turned by Rodrigues' formula."""
+        """Return d(q, w)/dt by q' = Omega(w) q / 2 and Euler's equation; Rodrigues' formula rotates B."""
         vector, scalar, rate = x[:3], x[3], x[4:]
         q_dot = 0.5 * np.append(scalar * rate - cross_product(rate, vector), -rate @ vector)
         field_body = (
@@ -193,12 +193,12 @@ class FreeWorld:
 
 
 def _actual(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the coil currents, with a uniform random error if they are driven."""
+    """Return the coil currents, with a uniform random error if the coils are driven."""
     noise = rng.uniform(-CURRENT_BOUND, CURRENT_BOUND, 3)
     return np.asarray(np.where(currents != 0.0, currents + noise, 0.0))
 
 
 def band(degrees: int, share: float = 0.95) -> tuple[float, float]:
-    """Return the quantile `share` of a chi-square over its degrees of freedom."""
+    """Return the limits of the central `share` of a chi-square, divided by its degrees of freedom."""
     tail = 0.5 * (1.0 - share)
     return float(chi2.ppf(tail, degrees)) / degrees, float(chi2.isf(tail, degrees)) / degrees

@@ -1,6 +1,6 @@
-"""Damage to bytes, drawn by hypothesis: for the tests of everything that reads a file or a wire.
+"""Damage to bytes, drawn by hypothesis, for tests of readers of files and of lines.
 
-A test takes `chances` from `given` and hands it on: `@given(chances()) def test(chance): offer(chance, ...)`.
+A test gets `chances` from `given` and passes it on: `@given(chances()) def test(chance): offer(chance, ...)`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def chances() -> st.SearchStrategy[Random]:
 
 
 def damage(chance: Random, data: bytes) -> bytes:
-    """Return bytes damaged in one place: flipped, overwritten, lost, doubled, inserted, zeroed or cut."""
+    """Return bytes with one damage: flipped, overwritten, lost, doubled, inserted, zeroed or cut bytes."""
     if not data:
         return chance.randbytes(chance.randint(1, 8))
     start = chance.randrange(len(data))
@@ -63,13 +63,13 @@ def offer(
     refusals: tuple[type[Exception], ...] = (),
     reseal: Callable[[bytes], bytes] | None = None,
 ) -> None:
-    """Let a reader read an example, damaged or undamaged.
+    """Call a reader with an example, damaged or undamaged.
 
     Args:
-        chance: from `chances`.
+        chance: random generator from `chances`.
         examples: contents that the reader accepts.
         read: function that reads and checks the result; its second argument is true for undamaged data.
-        refusals: the reader's own errors; a whole example must be accepted.
+        refusals: the reader's own errors; an undamaged example must be accepted.
         reseal: function that corrects checksums, so that damaged data pass the checksum test.
     """
     files = dict(chance.choice(examples))
@@ -103,6 +103,6 @@ def fill(folder: Path, files: Files) -> Path:
 
 
 def line_and_crc(data: bytes) -> bytes:
-    """Return the first line of a copy with its checksum made right."""
+    """Return the first line of a copy with a correct checksum."""
     line = data.rpartition(b"\n")[0].partition(b"\n")[0] + b"\n"
     return line + b"%08x\n" % zlib.crc32(line)

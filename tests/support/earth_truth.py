@@ -1,4 +1,4 @@
-"""The true nadir, Sun direction and limb of a scene, and ideal counts, to compare results with."""
+"""True nadir, Sun direction and limb of a scene, and ideal counts."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene
 from sim_hal.earth_camera.scene import towards_sun
 
 APPARENT_LIMB_HEIGHT = Atmosphere().apparent_limb_height
-"""Height (m) above the ellipsoid at which a sunlit limb has half its brightness (default atmosphere)."""
+"""Height (m) above the ellipsoid at which a sunlit limb has half its brightness in the default atmosphere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbTruth:
-    """Points of the limb on the detector, in the order in which they go round the Earth.
+    """Points of the limb on the detector, ordered around the Earth.
 
     Attributes:
         points: pixels (n, 2).
         directions: unit vectors (n, 3) in camera axes.
-        solar_cosines: cosine (n,) of the Sun's distance from the zenith where each line of sight touches:
-            above 0 the ground there has day; the air is lit some degrees further.
+        solar_cosines: cosine (n,) of the Sun's zenith distance at the tangent point of each line of sight. It
+        is positive if the ground there is sunlit; the air is sunlit some degrees further.
     """
 
     points: FloatArray
@@ -37,18 +37,18 @@ def sun_direction(scene: EarthScene) -> FloatArray:
 
 
 def sun_point(scene: EarthScene, model: EarthCameraModel) -> FloatArray:
-    """Return the pixel (2,) of the Sun's centre. It may be off the detector; NaN beyond the lens's field."""
+    """Return the pixel (2,) of the Sun's centre, also off the detector; NaN outside the lens's field."""
     return np.asarray(model.lens.project(sun_direction(scene)[None, :])[0])
 
 
 def limb_directions(
     scene: EarthScene, count: int = 720, height: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors (count, 3), in camera axes, round the limb, and solar cosines (count,) there.
+    """Return unit vectors (count, 3), camera axes, around the limb, and the solar cosines (count,) there.
 
-    The lines from the camera that touch the ellipsoid `height` m above the WGS 84 one: in axes scaled so that
-    it is the unit sphere they touch it in a circle of the plane q p = 1, p the camera's position. Raises
-    ValueError when the camera is not outside.
+    The lines of sight touch the ellipsoid that is `height` m above that of WGS 84. In axes in which this
+    ellipsoid is the unit sphere, the tangent points are a circle in the plane q p = 1, where p is the
+    camera's position. Raises ValueError if the camera is inside the ellipsoid.
     """
     axes = semi_axes(height)
     origin = scene.in_earth(scene.position) / axes
@@ -69,9 +69,9 @@ def limb_directions(
 def limb_truth(
     scene: EarthScene, model: EarthCameraModel, count: int = 3600, height: float | None = None
 ) -> LimbTruth:
-    """Return the points on the detector of `count` points around the limb.
+    """Return those of `count` points around the limb that are on the detector.
 
-    `height` m above the ellipsoid is by default the atmosphere's apparent limb height.
+    `height` (m) above the ellipsoid is by default the atmosphere's apparent limb height.
     """
     if height is None:
         height = scene.atmosphere.apparent_limb_height
@@ -82,7 +82,7 @@ def limb_truth(
 
 
 def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
-    """Return the counts (...) of `radiance` (...), unrounded, of a pixel without noise or blemish."""
+    """Return the unrounded counts (...) of `radiance` (...) of a pixel without noise and defect."""
     light = np.asarray(radiance, dtype=float)
     if model.response == "logarithmic":
         counts = model.pedestal + model.counts_per_decade * np.log10(1.0 + light / model.darkest)
@@ -92,7 +92,7 @@ def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
 
 
 def radiance_of(model: EarthCameraModel, counts: FloatArray) -> FloatArray:
-    """Return the radiance (...) that gives `counts` (...) in a pixel without noise or blemish."""
+    """Return the radiance (...) that causes `counts` (...) in a pixel without noise and defect."""
     above = np.asarray(counts, dtype=float) - model.pedestal
     if model.response == "logarithmic":
         return np.asarray(model.darkest * (10.0 ** (above / model.counts_per_decade) - 1.0))

@@ -1,8 +1,8 @@
-"""Exclusion of a camera's frames: the Sun or the Earth in the field (Sease 2.16-2.19, corrected).
+"""Exclusion of camera frames with the Sun or the Earth in the field (Sease 2.16-2.19, corrected).
 
-The boresight is the camera's +z axis, and the field is a cone around it. With half the field of view (the
-thesis's choice) a corner of the frame may still contain the Sun or the limb; with the pinhole's half diagonal
-it may not. Vectors are in ICRS, positions geocentric in m.
+The boresight is the camera's +z axis, and the field is a cone around it. With half the field of view as half
+angle (the thesis's choice), a corner of the frame may still contain the Sun or the limb. With half the
+diagonal it may not. Vectors are in ICRS, geocentric positions in m.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from knightcube.vision.camera.lens import Pinhole
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:
-    """Return the boresights (m, 3), ICRS, at body `attitudes` (m, 4); `mounting` (4,) body into camera."""
+    """Return the boresights (m, 3), ICRS, of body `attitudes` (m, 4); `mounting` (4,) is body to camera."""
     return np.asarray(quaternion.attitude_matrix(quaternion.multiply(mounting, attitudes))[..., 2, :])
 
 
 def sun_in_field(
     boresight: FloatArray, position: FloatArray, sun: FloatArray, half_angle: float, buffer: float = 0.0
 ) -> BoolArray:
-    """Return for each `boresight` (m, 3) whether the Sun is within `half_angle` + `buffer` rad (2.16, 2.17).
+    """Return whether the Sun is within `half_angle` + `buffer` (rad) of each `boresight` (m, 3) (2.16, 2.17).
 
-    `position` (m, 3) is the camera's, `sun` (m, 3) the Sun's; `buffer` is for stray light past the baffle.
+    `position` (m, 3) is the camera's and `sun` (m, 3) the Sun's. `buffer` accounts for stray light past the
+    baffle.
     """
     to_sun = np.asarray(sun) - position
     return _within(boresight, to_sun, SUN_RADIUS, half_angle + buffer)
@@ -35,14 +36,14 @@ def sun_in_field(
 def earth_in_field(
     boresight: FloatArray, position: FloatArray, half_angle: float, buffer: float = 0.0
 ) -> BoolArray:
-    """Return at which `boresight` (m, 3) the Earth is within `half_angle` + `buffer` rad (2.18, 2.19)."""
+    """Return whether the Earth is within `half_angle` + `buffer` (rad) of the boresights (2.18, 2.19)."""
     return _within(boresight, -np.asarray(position), EARTH_RADIUS, half_angle + buffer)
 
 
 def in_field(
     camera: Pinhole, attitudes: FloatArray, directions: FloatArray, margin: float = 0.0
 ) -> BoolArray:
-    """Return which `directions` (m, 3) ICRS are within `margin` px of the detector at camera `attitudes`."""
+    """Return which `directions` (m, 3), ICRS, are within `margin` px of the detector."""
     seen = (quaternion.attitude_matrix(attitudes) @ directions[..., None])[..., 0]
     return camera.contains(camera.project(seen), margin)
 

@@ -17,12 +17,12 @@ from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalle
 from tests.support.process_watch import MIB, Look
 
 PERIOD_NS = 25_000_000
-"""Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.flight`)."""
+"""Period (ns) of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.flight`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
-"""s of flight: the slope of memory is fitted from the first on, over the second at least.
+"""Start (s of flight) and shortest duration (s) of the fit of the memory slope.
 
-Until then windows of minutes fill, and pages of libraries and of the sky's index are touched the first time.
+Before, windows of minutes fill, and pages of libraries and of the sky index are touched for the first time.
 """
 
 Figures = dict[str, Any]
@@ -39,9 +39,9 @@ ASKED: dict[str, float] = {
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """When the flight was started and when it said READY, monotonic ns; its processor time until then, s.
+    """Times (monotonic ns) of the start of the flight and of READY, and processor time (s) until READY.
 
-    `utc_offset_ns` is UTC less monotonic time.
+    `utc_offset_ns` is UTC minus monotonic time.
     """
 
     exec_ns: int
@@ -52,7 +52,7 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Samples of the flight's processes; memory in bytes, with shared memory divided among its users."""
+    """Samples of the flight's processes. Memory is in bytes; shared memory is divided among its users."""
 
     looks: list[Look]
     shared_with_others: float
@@ -126,7 +126,7 @@ def _scheduling(run: Run) -> str:
 
 
 def _jobs(run: Run, seconds: float) -> dict[str, Any]:
-    """Return by worker how many jobs were done, how many were not, and the part of the time at work."""
+    """Return for each worker the numbers of completed and failed jobs, and its share of time at work."""
     timing = run["job_timing"]
     found = {}
     for name in sorted(set(timing["name"])):
@@ -138,7 +138,7 @@ def _jobs(run: Run, seconds: float) -> dict[str, Any]:
 
 
 def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
-    """Return processor and memory from `warm_s` of monotonic time on, their slope from `settled_s`."""
+    """Return processor and memory from the monotonic time `warm_s`, and slopes from `settled_s`."""
     looks = [look for look in watched.looks if look.time >= warm_s]
     if len(looks) < 2:
         raise RuntimeError(f"only {len(looks)} looks at the processes after the warm-up: fly for longer")
@@ -171,9 +171,9 @@ def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
 
 
 def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
-    """Return the slope per hour and its interval; NaN if the interval is too short.
+    """Return the slope per hour and its interval; NaN if the time is too short.
 
-    Pages come and go by tenths of a MiB: over a minute that alone is tens of MiB/h.
+    The memory fluctuates by tenths of a MiB. Over a minute, this alone is a slope of tens of MiB/h.
     """
     if not seconds or seconds[-1] - seconds[0] < SLOPE_SPAN:
         return np.nan, np.nan, np.nan
@@ -181,10 +181,11 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
 
 
 def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[Any]) -> Figures:
-    """Return for how much of the time the control thread waited, from the first look to the last.
+    """Return the shares of time for which the control thread waited, from the first sample to the last.
 
-    `queued`: ready, but the machine gave it no processor. `blocked`: in a cycle, with neither processor nor
-    queue, as a cycle that waits for a worker or a disk would be; a lower bound, and independent of the load.
+    `queued` is the time in which the thread was ready, but had no processor. `blocked` is the time within a
+    cycle in which the thread was neither running nor ready, for instance because it waited for a worker or a
+    disk. It is a lower limit, and does not depend on the load.
     """
     first, last = looks[0], looks[-1]
     on, queued = np.subtract(last.turns["control"], first.turns["control"])
@@ -195,9 +196,9 @@ def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[An
 
 
 def _share(looks: list[Look], name: str) -> float:
-    """Return the share of a core that a process took; a replaced process counts with its successors."""
+    """Return the share of a core that a process used, together with the processes that replaced it."""
     spent = np.diff([look.processor[name] for look in looks])
-    if len(looks) < 2:  # the process was sampled once and had then ended
+    if len(looks) < 2:  # the process was sampled once and then ended
         return 0.0
     return float(spent[spent > 0.0].sum()) / (looks[-1].time - looks[0].time)
 
@@ -205,8 +206,7 @@ def _share(looks: list[Look], name: str) -> float:
 def misses(figures: Figures) -> list[str]:
     """Return the names of the figures that exceed their limits.
 
-    Of the slope its interval decides: it misses when all of that lies above. The slope of a short flight is
-        unknown and is not judged.
+    The slope exceeds its limit if its whole interval does. The unknown slope of a short flight is not judged.
     """
     found = [name for name, limit in ASKED.items() if not _slope(name) and not figures[name] <= limit]
     steep = figures["memory_slope_interval"][0] > ASKED["memory_slope_mib_per_hour"]
@@ -264,7 +264,7 @@ def table(figures: Figures, name: str) -> str:
 
 
 def _of_slope(figures: Figures) -> list[str]:
-    """Return the lines on the slope of memory: its interval where the flight is long enough."""
+    """Return the lines on the slope of memory, with its interval if the flight is long enough."""
     low, high = figures["memory_slope_interval"]
     if math.isnan(low):
         return [

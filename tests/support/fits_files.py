@@ -1,4 +1,4 @@
-"""FITS images made card by card after the FITS Standard 4.0."""
+"""FITS images that are built card by card, according to the FITS Standard 4.0."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ def _card(keyword: str, value: object) -> bytes:
 
 
 def fits_file(stored: Image, bits: int, **cards: object) -> bytes:
-    """Return a FITS file of `stored` (rows, columns), with `cards` after or instead of the mandatory ones."""
+    """Return a FITS file of `stored` (rows, columns); `cards` add to the mandatory ones or replace them."""
     header: dict[str, object] = {"SIMPLE": "T", "BITPIX": bits, "NAXIS": 2}
     header |= {"NAXIS1": stored.shape[1], "NAXIS2": stored.shape[0]} | cards
     text = b"".join(_card(keyword, value) for keyword, value in header.items() if value is not None)

@@ -26,12 +26,12 @@ TEXT = CONFIG.read_text(encoding="utf-8")
 DURATION = 26.0
 """Duration (s) of a flight with one fault."""
 FRAME_PERIOD, FRAME_EXPOSURE, FRAME_LATE = 2.0, 0.2, 1.0
-"""Times (s) of the camera in flights with a fault; results later than `FRAME_LATE` are late."""
+"""Period, exposure and timeout (s) of the camera in flights with a fault; later results count as late."""
 
 
 @dataclass(frozen=True)
 class Rigged:
-    """A prepared run: `at` schedules an action at a mission time, s."""
+    """A prepared run; `at` schedules an action at a mission time (s)."""
 
     lock: LockStep
     loop: FlightLoop
@@ -39,7 +39,7 @@ class Rigged:
 
     @property
     def testbed(self) -> Testbed:
-        """The world, which is the testbed."""
+        """The simulated world, which is the testbed."""
         world = self.lock.hardware.world
         assert isinstance(world, Testbed)
         return world
@@ -49,7 +49,7 @@ class Rigged:
 
 
 def demo_config(duration: float, camera: bool = True) -> TestbedConfig:
-    """Return the step demonstration, cut to `duration` s."""
+    """Return the step demonstration, shortened to `duration` s."""
     config = _demo()
     steps = tuple(step for step in config.steps if step.at < duration)
     changed = configuration.replace(config, duration=duration, steps=steps)
@@ -58,7 +58,7 @@ def demo_config(duration: float, camera: bool = True) -> TestbedConfig:
 
 @cache
 def _demo() -> TestbedConfig:
-    """Return the whole demonstration, read once for all flights."""
+    """Return the whole demonstration, which is read once for all flights."""
     return as_testbed(configuration.parse(TEXT))
 
 
@@ -90,15 +90,16 @@ def fly(
 ) -> Run:
     """Run a configuration in lock-step, and return its logs; `prepare` may schedule faults.
 
-    `section` describes the world and its seed; by default the demonstration's. `absent` removes
-    devices before they are opened; the run then waits for devices. However the flight ended, the coils are at
-    zero when the devices have been closed.
+    `section` describes the world and its seed; the default is that of the demonstration. `absent` removes
+    devices before they are opened, and the run waits for devices. The coils must be at zero current after the
+    devices are closed, however the flight ended.
     """
     folder.mkdir(parents=True, exist_ok=True)
     section = section or configuration.replace(demo_world(), seed=seed)
     with ExitStack() as stack:
         lock = stack.enter_context(opened_lockstep(config, section, folder))
-        if not any("-high" in entry.fault for entry in section.faults):  # a leg that nothing switches off
+        # no command switches off a leg that is stuck high
+        if not any("-high" in entry.fault for entry in section.faults):
             stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency
         latency = round(planner_s * SECOND_NS), round(section.latency.vision * SECOND_NS)

@@ -38,7 +38,7 @@ def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def free_port() -> int:
-    """Return a port of UDP that is free now."""
+    """Return an unused UDP port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
         line.bind(("127.0.0.1", 0))
         return int(line.getsockname()[1])
@@ -56,7 +56,7 @@ def wait_for(path: Path) -> None:
 def flood(
     port: int, datagrams: Sequence[bytes], a_second: int, ended: threading.Event, sent: list[int]
 ) -> None:
-    """Send `a_second` random datagrams per second until `ended`, and record the number in each burst."""
+    """Send `a_second` random datagrams per second until `ended`, and record the size of each burst."""
     draw = np.random.default_rng(1)
     burst = round(a_second * _BURST_S)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
@@ -70,7 +70,7 @@ def flood(
 
 
 def lateness(run: Path) -> dict[str, Any]:
-    """Return how many cycles a run has after its first seconds, and quantiles of their lateness, ms."""
+    """Return the number of cycles after the first seconds of a run, and quantiles (ms) of their lateness."""
     cycles = read_run(run)["cycle_timing"]
     late = cycles["lateness"][cycles["time_ns"] > _WARM_UP_S * 1e9]
     figures = {name: round(1e3 * float(np.quantile(late, part)), 3) for name, part in QUANTILES.items()}

@@ -1,4 +1,4 @@
-"""Gains of the pointing law along a given motion, without the planner's search for a motion."""
+"""Gains of the pointing law along a given motion, without the search for a motion."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def table_along(
     inertia: FloatArray,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the table that holds a given motion (n + 1,) without other torques than the motion's own.
+    """Return the table that holds a given motion (n + 1,) without torques other than those of the motion.
 
-    `field` (n + 1, 3) T and `position` (n + 1, 3) m, ICRS; `inertia` (3, 3) kg m^2. The gains near the end
-    are computed from a shorter prediction.
+    `field` (n + 1, 3) is in T, `position` (n + 1, 3) in m, both in ICRS; `inertia` (3, 3) is in kg m^2. The
+    gains near the end are computed from a shorter prediction.
     """
     count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
     state, dipole = step_costs(weights, dt)

@@ -14,7 +14,7 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
 
 @dataclass(frozen=True)
 class Grid:
-    """How late the loop was at each slot, s; slot k was due at (first + k) periods of monotonic time."""
+    """Lateness (s) of a loop at each slot; slot k is due at (first + k) periods of monotonic time."""
 
     first: int
     period_ns: int
@@ -26,14 +26,14 @@ class Grid:
         return np.asarray(2.0 * self.lateness >= self.period_ns * 1e-9)
 
     def figures(self) -> dict[str, float]:
-        """Return quantiles of the lateness in s; a lost slot counts until the loop was back."""
+        """Return quantiles (s) of the lateness; a lost slot counts until the loop was back."""
         return {name: float(np.quantile(self.lateness, part)) for name, part in QUANTILES.items()}
 
 
 def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
-    """Return the lateness of `count` slots from `first` on, by the first start after each due time.
+    """Return the lateness of `count` slots from `first`, by the first start after each due time.
 
-    `starts_ns` are monotonic and in order; slots after the last start are infinitely late.
+    `starts_ns` are in monotonic time and sorted. Slots after the last start are infinitely late.
     """
     due_ns = (first + np.arange(count, dtype=np.int64)) * period_ns
     place = np.searchsorted(starts_ns, due_ns)
@@ -46,17 +46,17 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
     """Return the slots that the bare loop lost, including their neighbours.
 
-    Neighbours count because a stall need not begin and end for both loops within the same slot: one of them
-    may still be at work, the other asleep.
+    A stall may begin and end in different slots of the two loops, because one may be at work while the other
+    sleeps.
     """
     return np.asarray(np.convolve(machine.lost, np.ones(3), mode="same") > 0.5)
 
 
 def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
-    """Return which slots lost to the host's other guests the time of a lost slot, and half of their lateness.
+    """Return the slots in which stolen time reached the time of a lost slot and half of the lateness.
 
-    A slot lasts from its predecessor's time to the look after it was served: `stolen_ns`, of all cores since
-    boot, was looked at when `noted_ns`.
+    A slot lasts from the start of its predecessor to the first sample after it was served. `stolen_ns` is the
+    stolen time of all cores since boot, sampled at `noted_ns`.
     """
     due_ns = (loop.first + np.arange(len(loop.lateness))) * loop.period_ns
     late_ns = 1e9 * np.minimum(loop.lateness, 60.0)
@@ -70,11 +70,11 @@ def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool
 def slope_per_hour(
     seconds: npt.ArrayLike, values: npt.ArrayLike, blocks: int = 20
 ) -> tuple[float, float, float]:
-    """Return the slope of a noisy level per hour with its 95 % interval (low, high); NaN when too short.
+    """Return the slope per hour of a noisy level with its 95 % interval (low, high); NaN if too short.
 
-    A process that works takes memory and gives it back: the level of each block of time is its 10 % quantile,
-    which a leak raises as well. Through the blocks goes the median of all pairwise slopes, its interval that
-    of Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
+    A working process allocates and frees memory, so the level of each block of time is its 10 % quantile,
+    which a leak also raises. The slope is the median of all pairwise slopes of the blocks, and its interval
+    that of Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
     """
     from scipy import stats  # noqa: PLC0415 - the bench is not to share the flight's libraries while it flies
 
@@ -89,7 +89,7 @@ def slope_per_hour(
 
 
 def draw(grids: dict[str, Grid], path: Path) -> None:
-    """Draw the histograms of the lateness, both axes logarithmic."""
+    """Draw the histograms of the lateness with two logarithmic axes."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")

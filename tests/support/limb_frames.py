@@ -20,11 +20,11 @@ from sim_hal.earth_camera.scene import Atmosphere
 from tests.sim_hal.earth_camera.scenes import random_direction
 
 KNOWN_LIMB = 1000.0
-"""m: to which the limb's height is believed where the air is known."""
+"""Standard deviation (m) of the limb's height if the atmosphere is known."""
 
 
 SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
-"""m, and times the standard optical depth: drawn where the air is not known."""
+"""Ranges of scale height (m) and of the optical depth relative to the standard, for unknown atmospheres."""
 
 
 SUN_SIGMA, FIELD_SIGMA = np.radians(5.0), np.radians(2.0)
@@ -39,14 +39,14 @@ def camera_model() -> EarthCameraModel:
 
 
 def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSettings:
-    """Return the default settings with the camera's response, for one of `AIRS`."""
+    """Return the default settings with the camera's response, for a kind of atmosphere of `AIRS`."""
     response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
     settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
     return replace(settings, limb_height_sigma=KNOWN_LIMB) if air == "known" else settings
 
 
 def random_air(generator: np.random.Generator) -> Atmosphere:
-    """Return air thinner or thicker than the standard one, its limb some 2 km lower or higher."""
+    """Return an atmosphere other than the standard; its limb is some 2 km lower or higher."""
     standard = Atmosphere()
     return replace(
         standard,
@@ -66,6 +66,6 @@ def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> Horiz
 
 
 def misread(direction: FloatArray, sigma: float, generator: np.random.Generator) -> FloatArray:
-    """Return a direction (3,) measured by a coarse sensor with an error of `sigma` rad per axis."""
+    """Return a direction (3,) as a coarse sensor measures it, with an error of `sigma` (rad) per axis."""
     error = from_rotation_vector(sigma * generator.standard_normal(3))
     return np.asarray(attitude_matrix(error) @ direction)

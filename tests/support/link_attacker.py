@@ -1,4 +1,4 @@
-"""An attacker between ground and satellite who knows every frame and everything except the keys."""
+"""An attacker between ground and satellite who has every frame and all information except the keys."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HEADERS = TELECOMMAND_HEADER.size + 14
 
 
 class LinkAttacker:
-    """Both ends of a link, whose frames are replayed, reordered, mutated, spliced and forged.
+    """Both ends of a link, and an attacker who replays, reorders, mutates, splices and forges frames.
 
     Attributes:
         sent: data that the ground sent, by SPI and counter.
@@ -57,7 +57,7 @@ class LinkAttacker:
     def frame(self, chance: Random) -> tuple[str, bytes]:
         """Return the kind and the bytes of the next frame."""
         if not self._seen or chance.random() < 0.1:
-            self._held.clear()  # frames that were held back are old now
+            self._held.clear()  # the delayed frames are old now
             return "fresh", self._new(chance)
         if chance.random() < 0.05:
             self._held.append(self._new(chance))

@@ -24,7 +24,7 @@ def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
 
 
 def write_linked_config(place: Path, **lines: Any) -> Path:
-    """Make keys under `place`; return the configuration of a board with these lines, beside them."""
+    """Make keys under `place`; return the configuration of a board with these lines, beside the keys."""
     make_keys(place / "keys")
     section = {"keys": str(place / "keys" / "satellite"), **lines}
     commands = json.dumps({"socket": str(place / "commands")})

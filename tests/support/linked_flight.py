@@ -1,4 +1,4 @@
-"""A flight in real time with its link and a gateway, each a process of its own, on loopback."""
+"""A real-time flight with its link and a gateway, as separate processes on loopback."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ground.link.terminal import make_keys
 
 _START_S, _END_S = 120.0, 30.0
 _RATE = 1_000_000
-"""Bytes/s of the link: nothing is thinned, so that the archive must hold every packet of the log."""
+"""Data rate (bytes/s) of the link: no packet is thinned, so the archive must hold every packet of the log."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkedFlight:
-    """Where a flight writes, address and keys of the gateway, the processes by name; `flight` is last."""
+    """Folder of a flight, address and keys of the gateway, and the processes by name, `flight` last."""
 
     run: Path
     gateway: str
@@ -31,12 +31,12 @@ class LinkedFlight:
     _log: Path
 
     def start(self) -> None:
-        """Start the flight itself, and wait for its log."""
+        """Start the flight, and wait for its log."""
         self.processes["flight"] = _started(self._start, self._log)
         _wait((self.run / "flight-0001.ccsds").exists, "the flight", self._log)
 
     def end(self) -> None:
-        """End the flight; link and gateway carry what is left of its log."""
+        """End the flight; link and gateway transmit the rest of its log."""
         end(self.processes["flight"])
 
     def stop(self) -> None:
@@ -46,14 +46,17 @@ class LinkedFlight:
 
 
 def free_port() -> int:
-    """Return a TCP port of loopback that nobody has."""
+    """Return an unused TCP port of loopback."""
     with socket.create_server(("127.0.0.1", 0)) as line:
         return int(line.getsockname()[1])
 
 
 @contextmanager
 def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]:
-    """Open link and gateway of a flight of a configuration's text, which `start` begins; leaving ends all."""
+    """Open link and gateway of a flight with the configuration `text`; `start` starts the flight.
+
+    The end of the block ends all processes.
+    """
     place.mkdir(parents=True)
     make_keys(place / "keys")
     link, gateway = (f"127.0.0.1:{free_port()}" for _ in range(2))
@@ -77,7 +80,7 @@ def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]
 
 @contextmanager
 def service(log: Path, ready: str, *words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `python -m flight WORDS` from the line on that says `ready`, and end it at the end."""
+    """Run `python -m flight WORDS` during the block, which begins when the output contains `ready`."""
     process = _started([sys.executable, "-m", "flight", *map(str, words)], log)
     try:
         _wait(lambda: ready in log.read_text(), str(words[0]), log)

@@ -1,4 +1,4 @@
-"""Passes of an object by a satellite, both on orbits integrated here, and what a camera sees of them."""
+"""Passes of an object by a satellite on integrated orbits, and the sightings of a camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PIXEL = np.radians(20.0) / 1024
 
 @dataclass(frozen=True)
 class Pass:
-    """Positions (n, 3) m of observer and object at times (n,) s; the object's velocities relative to it."""
+    """Positions (n, 3), m, of observer and object at times (n,), s, and the object's relative velocities."""
 
     times: FloatArray
     observer: FloatArray
@@ -24,12 +24,12 @@ class Pass:
 
     @property
     def directions(self) -> FloatArray:
-        """The true lines of sight."""
+        """True lines of sight (n, 3)."""
         return np.asarray(self.relative / np.linalg.norm(self.relative, axis=1, keepdims=True))
 
     @property
     def rates(self) -> FloatArray:
-        """How the true lines of sight change (n, 3), rad/s."""
+        """Rates of change (n, 3), rad/s, of the true lines of sight."""
         u = self.directions
         v = self.relative_velocity
         across = v - np.sum(v * u, axis=1, keepdims=True) * u
@@ -37,7 +37,7 @@ class Pass:
 
 
 def a_pass(rng: np.random.Generator, rate: float, times: FloatArray, before: float) -> Pass:
-    """Return a pass whose line of sight turns by `rate` rad/s at its nearest, `before` s after the start."""
+    """Return a pass with closest approach, at `rate` (rad/s), `before` s after the start."""
     radius = 6.878e6
     place = np.array([radius, 0.0, 0.0])
     velocity = np.array([0.0, np.sqrt(EARTH / radius), 0.0])
@@ -53,7 +53,7 @@ def a_pass(rng: np.random.Generator, rate: float, times: FloatArray, before: flo
 
 
 def _at(state: FloatArray, time: float) -> FloatArray:
-    """Return a state (6,) after `time` s by Runge and Kutta, in steps of 10 s at most."""
+    """Return the state (6,) after `time` s by a Runge-Kutta integration with steps of at most 10 s."""
     steps = max(int(np.ceil(abs(time) / 10.0)), 1)
     h = time / steps
 
@@ -77,7 +77,7 @@ def sightings(
     attitude_sigma: float,
     magnitudes: FloatArray | None = None,
 ) -> FrameSightings:
-    """Return what a frame shows of objects: errors of their places, and one turn common to all."""
+    """Return the sightings of objects in a frame, with independent errors and one common rotation error."""
     turn = rng.normal(scale=attitude_sigma, size=3)
     seen = directions + np.cross(turn, directions) + rng.normal(scale=sigma, size=directions.shape)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)

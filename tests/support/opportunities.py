@@ -1,10 +1,10 @@
-"""When a camera in orbit can observe a resident space object (Sease ch. 4, Table 4.3 and the text after it).
+"""Times at which a camera in orbit can observe a resident space object (Sease ch. 4, Table 4.3).
 
     scenario = table_4_3(epoch=2_461_041.5)
     for opportunity in opportunities(scenario, cadence=60.0, exposure=0.5):
         times, attitudes = exposure_attitudes(scenario, opportunity.start, 0.5)
 
-An object is observable while it is in the field, in sunlight and not behind the Earth, and neither the Sun
+An object is observable if it is in the field, in sunlight and not behind the Earth, and if neither the Sun
 nor the Earth is in the field.
 """
 
@@ -29,22 +29,22 @@ DEVICE = "observation opportunities"
 ORBITS = 10
 
 Attitude = Callable[[FloatArray], FloatArray]
-"""Camera attitudes (m, 4), ICRS into camera, at times (m,) s."""
+"""Function that returns camera attitudes (m, 4), ICRS to camera, at times (m,), s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scenario:
-    """A camera, the objects it may see, and its exclusion angles.
+    """A camera, the objects that it may observe, and its exclusion angles.
 
     Attributes:
-        epoch: the Julian date TT of time 0.
-        duration: s.
-        camera: its orbit.
-        attitude: its attitude at any times.
-        pinhole: its geometry.
-        objects: what there is to see.
-        half_angle: rad, of the cone about the boresight in which Sun and Earth exclude a frame.
-        buffer: rad more, for stray light past the baffle.
+        epoch: Julian date TT of time 0.
+        duration: duration, s.
+        camera: orbit of the camera.
+        attitude: attitude of the camera over time.
+        pinhole: geometry of the camera.
+        objects: orbits of the objects.
+        half_angle: half angle (rad) of the cone about the boresight in which Sun and Earth exclude a frame.
+        buffer: additional angle (rad) for stray light past the baffle.
         shadow: conical or cylindrical.
     """
 
@@ -61,7 +61,7 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A stretch of time, `start` to `end` s, in which object number `index` is observable."""
+    """Interval from `start` to `end` (s) in which object number `index` is observable."""
 
     index: int
     start: float
@@ -70,14 +70,14 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Opportunity:
-    """A frame that shows object number `index`: exposed from `start` s.
+    """Frame that shows object number `index`.
 
     Attributes:
         index: number of the object in the scenario.
-        start: s, of the exposure.
+        start: start of the exposure, s.
         first: pixel (x, y) of the object at the start of the exposure.
         last: pixel (x, y) at its end.
-        distance: m from the camera, in the middle.
+        distance: distance (m) from the camera at mid-exposure.
     """
 
     index: int
@@ -88,7 +88,7 @@ class Opportunity:
 
 
 def constant_slew(rate: FloatArray, initial: FloatArray = quaternion.IDENTITY) -> Attitude:
-    """Return the attitude of a camera that turns from `initial` (4,) at constant `rate` (3,) rad/s."""
+    """Return the attitude of a camera that rotates from `initial` (4,) at a constant `rate` (3,), rad/s."""
 
     def attitude(times: FloatArray) -> FloatArray:
         turn = np.asarray(times, dtype=float)[:, None] * np.asarray(rate, dtype=float)
@@ -103,12 +103,12 @@ def table_4_3(
     pinhole: Pinhole | None = None,
     half_angle: float | None = None,
 ) -> Scenario:
-    """Return the thesis's ten orbits: the camera turns at 0.05 rad/s about its y axis from the identity.
+    """Return the thesis's ten orbits of Table 4.3; the camera rotates at 0.05 rad/s about its y axis.
 
-    Table 4.3. Neither a date nor how often a frame was taken is given: `epoch` (Julian date TT) places the
-    Sun. `pinhole` is by default that of 1024 x 1024 pixels over 20 degrees, `half_angle` its half diagonal;
-    half the field of view is the thesis's (2.17, 2.19). The ten orbits are the camera's, 15.3 h; the text
-    says "approximately 14".
+    The initial attitude is the identity. The thesis states neither a date nor the period of the frames:
+    `epoch` (Julian date TT) determines the position of the Sun. `pinhole` is by default that of 1024 x 1024
+    pixels over 20 degrees, and `half_angle` its half diagonal; the thesis uses half the field of view (2.17,
+    2.19). The ten orbits are those of the camera, 15.3 h; the text states "approximately 14".
     """
     pinhole = pinhole or Pinhole.from_field_of_view(1024, 1024, math.radians(20.0))
     camera = KeplerianElements(semi_major_axis=6748e3, inclination=math.radians(28.5))
@@ -133,18 +133,18 @@ def table_4_3(
 def exposure_attitudes(
     scenario: Scenario, start: float, exposure: float, step: float = 0.01
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times (k,) s and attitudes (k, 4) of an exposure, at most `step` s apart."""
+    """Return times (k,), s, at most `step` s apart, and attitudes (k, 4) of an exposure."""
     times = np.linspace(start, start + exposure, max(2, math.ceil(exposure / step) + 1))
     return times, scenario.attitude(times)
 
 
 def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
-    """Return at which `times` (m,) s object `index` is observable; half the Sun's disc must light it."""
+    """Return whether object `index` is observable at `times` (m,), with half the Sun's disc or more."""
     camera = scenario.camera.positions_at(times)
     position = scenario.objects[index].orbit.positions_at(times)
     attitudes = scenario.attitude(times)
     good = in_field(scenario.pinhole, attitudes, directions(camera, position))
-    # Few times pass; only those are tested further.
+    # Only the few remaining times are tested further.
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
     sun_at = sun_position(scenario.epoch + np.asarray(times)[left] / DAY)
@@ -159,8 +159,8 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
 def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> list[Window]:
     """Return all windows in which an object is observable, in order of time.
 
-    Found on a grid of `step` s, their ends by bisection to `precision` s: a window shorter than `step` may be
-    missed. Raises OutOfRange for a step that is not positive.
+    The search uses a grid of `step` s, and bisects the ends to `precision` s. It may miss a window that is
+    shorter than `step`. Raises OutOfRange for a step that is not positive.
     """
     _check("step", step)
     grid = np.append(np.arange(0.0, scenario.duration, step), scenario.duration)
@@ -178,8 +178,8 @@ def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> 
 def opportunities(scenario: Scenario, cadence: float, exposure: float) -> list[Opportunity]:
     """Return the frames, one every `cadence` s from time 0, that show an object in their whole exposure.
 
-    Tested at nine instants of each exposure of `exposure` s. Raises OutOfRange for a cadence or an exposure
-    that is not positive.
+    Nine instants of each exposure of `exposure` s are tested. Raises OutOfRange if the cadence or the
+    exposure is not positive.
     """
     _check("cadence", cadence)
     _check("exposure", exposure)
@@ -207,7 +207,7 @@ def _opportunity(scenario: Scenario, index: int, start: float, exposure: float) 
 def _bisect(
     scenario: Scenario, index: int, low: FloatArray, high: FloatArray, before: BoolArray, precision: float
 ) -> FloatArray:
-    """Return when being observable, `before` at `low`, changes between `low` and `high` (j,) s."""
+    """Return the times between `low` and `high` (j,), s, at which observability changes from `before`."""
     while low.size and np.max(high - low) > precision:
         middle = 0.5 * (low + high)
         same = observable(scenario, index, middle) == before

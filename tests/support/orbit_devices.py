@@ -1,4 +1,4 @@
-"""A configuration with every device of an orbit, in the world of a free body."""
+"""A configuration with every device of a satellite, in the world of a free body."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DOWN = float(np.sqrt(0.5))
 
 
 def orbit_config(camera: bool = False) -> TestbedConfig:
-    """Return the demonstration's configuration with receiver, six strings and two wide cameras."""
+    """Return the demonstration with receiver, six solar cell strings and two horizon cameras."""
     strings = tuple(
         SolarString(normal=face, address=0x48 + index // 4, channel=index % 4)
         for index, face in enumerate(FACES)
@@ -43,7 +43,7 @@ def orbit_config(camera: bool = False) -> TestbedConfig:
 
 
 def orbit_world(boresight: FloatArray | None = None) -> Simulation:
-    """Return a world in orbit with the ascending node under the Sun; body +z points to `boresight`, ICRS."""
+    """Return an orbit whose ascending node is under the Sun; body +z points to `boresight`, ICRS."""
     attitude = None
     if boresight is not None:
         boresight = boresight / np.linalg.norm(boresight)
@@ -59,7 +59,7 @@ def orbit_world(boresight: FloatArray | None = None) -> Simulation:
 
 
 def at_first() -> OrbitEnvironment:
-    """Return what surrounds the craft at the beginning."""
+    """Return the environment of the craft at the start."""
     section = orbit_world().free_body
     assert section is not None
     return FreeBody(section, lambda: np.zeros(3), seed=3, utc=UTC).surroundings()

@@ -1,7 +1,7 @@
-"""What a satellite in orbit has in view: attitudes about the local vertical, limb and Sun in camera fields.
+"""Attitudes about the local vertical, and limb and Sun in the fields of cameras in orbit.
 
-The Earth is a sphere of its equatorial radius; the paper's orbit is that of a Shuttle deployment at 380 km
-(Meller et al., sections 1 and 4.1), its inclination 51.6 deg [assumed: the Shuttle's to the Station].
+The Earth is a sphere with its equatorial radius. The paper's orbit is that of a Shuttle deployment at 380 km
+(Meller et al., sections 1 and 4.1), with an inclination of 51.6 deg [assumed: the Shuttle's to the Station].
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ SUITES = ("vt", "uw", "usu")
 
 @cache
 def suite(name: str) -> SensorSuite:
-    """Return one of the paper's three."""
+    """Return one of the three sensor suites of the paper."""
     return sensor_suite.load(Path(__file__).parents[2] / "config" / "sensors" / f"{name}.yaml")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """One revolution: times (n,) s, positions and velocities (n, 3), the Julian date UTC at time 0."""
+    """One revolution: times (n,), s, positions and velocities (n, 3), and the Julian date UTC at time 0."""
 
     julian_date: float
     times: FloatArray
@@ -43,7 +43,7 @@ class Pass:
 def revolution(
     julian_date: float, node: float, step: float, begin: float = 0.0, latitude: float = 0.0
 ) -> Pass:
-    """Return one revolution from `begin` s on, every `step` s; `latitude` rad: its argument at 0."""
+    """Return one revolution from `begin` (s), every `step` s; `latitude` (rad) is its argument at time 0."""
     elements = KeplerianElements(
         semi_major_axis=EARTH_RADIUS + ALTITUDE,
         inclination=float(INCLINATION),
@@ -56,7 +56,7 @@ def revolution(
 
 
 def local_frame(positions: FloatArray, velocities: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3), ICRS into forward, right and down."""
+    """Return the matrices (n, 3, 3) from ICRS to forward, right and down."""
     down = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
     right = np.cross(velocities, positions)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
@@ -64,7 +64,7 @@ def local_frame(positions: FloatArray, velocities: FloatArray) -> FloatArray:
 
 
 def limb(positions: FloatArray) -> FloatArray:
-    """Return LIMB_POINTS directions (n, points, 3), forward, right and down: the Earth's edge."""
+    """Return LIMB_POINTS directions (n, points, 3) of the Earth's limb in forward, right and down."""
     edge = np.arcsin(EARTH_RADIUS / np.linalg.norm(positions, axis=-1))[:, None]
     around = np.linspace(0.0, 2.0 * np.pi, LIMB_POINTS, endpoint=False)
     across = np.sin(edge)
@@ -79,7 +79,7 @@ def limb(positions: FloatArray) -> FloatArray:
 
 
 def limb_in_daylight(positions: FloatArray, directions: FloatArray, sun: FloatArray) -> BoolArray:
-    """Return which limb points (n, points) see the Sun; all in forward, right and down, `sun` (n, 3) unit."""
+    """Return which limb points (n, points) are sunlit; all axes are forward, right and down."""
     radius = np.linalg.norm(positions, axis=-1)
     reach = np.sqrt(radius**2 - EARTH_RADIUS**2)
     ground = reach[:, None, None] * directions
@@ -97,6 +97,6 @@ def in_field(camera: WideCamera, directions: FloatArray) -> BoolArray:
 
 
 def in_cone(camera: WideCamera, directions: FloatArray) -> BoolArray:
-    """Return which body directions (..., 3) are within half the field of the boresight: the paper's cones."""
+    """Return which body directions (..., 3) are within half the field of the boresight, as in the paper."""
     cosine = directions @ camera.to_camera[2]
     return np.asarray(cosine > np.cos(np.radians(0.5 * camera.field_of_view_deg)))

@@ -1,11 +1,11 @@
 """The true satellite of the campaign `orbit-attitude`, and its sensors.
 
-One revolution that ends with an eclipse, from a random date and node. The body follows the local vertical,
-two side cameras towards the Sun's side of the orbit; torques that walk at random push it off (3 deg rms)
-and a control law draws it back; the filter knows neither. Sensors are drawn from the suite's noise:
-gyros with a bias that walks, a magnetometer with hard iron in a field that no model has whole (IGRF-14
-where the filter believes WMM2025, a ring current, and the ionosphere as a Gauss-Markov process of first
-order), Sun and nadir when a camera has them in its field.
+The simulation covers one revolution that ends with an eclipse, with a random date and node. The body follows
+the local vertical, with two side cameras towards the Sun's side of the orbit. Torques with a random walk
+disturb it (3 deg rms), and a control law corrects it; the filter knows neither. The sensors have the noise of
+the suite: gyros with a random walk of the bias, a magnetometer with hard iron, and Sun and nadir if a camera
+has them in its field. The true field is IGRF-14 with a ring current and an ionosphere (first-order
+Gauss-Markov); the filter uses WMM2025.
 """
 
 from __future__ import annotations
@@ -37,34 +37,36 @@ from tests.support.orbit_geometry import (
 from tests.support.sensor_suite import SensorSuite
 
 STEP = 0.5
-"""s, of the truth and of the gyros."""
+"""Time step (s) of the truth and of the gyros."""
 FIRST_DATE = 2_461_041.5
 """2026 January 1."""
 AGILITY = 0.005
-"""rad/s, bandwidth of the control law."""
+"""Bandwidth (rad/s) of the control law."""
 SWAY = np.radians(3.0)
-"""rad rms of each axis about the local vertical."""
+"""Motion (rad rms per axis) about the local vertical."""
 PUSH_WALK = SWAY * np.sqrt(16.0 * AGILITY**5 / 3.0)
-"""rad/s^2 per sqrt(s): what makes that sway, of three equal poles."""
+"""Random walk of the angular acceleration (rad/s^2 per sqrt(s)) that causes this motion with three equal
+poles.
+"""
 RING_CURRENT, IONOSPHERE, IONOSPHERE_TIME = 20e-9, 20e-9, 400.0
-"""T of one sigma, T, s."""
+"""Standard deviations of ring current and ionosphere (T), and time constant of the ionosphere (s)."""
 OPTICAL_SIGMA = np.radians(0.02)
-"""rad an axis, of Sun and of nadir."""
+"""Standard deviation (rad per axis) of Sun and nadir."""
 LEAST_LIMB = 30
-"""Of the limb's 720 points, lit and in one camera's field: 15 deg of it."""
+"""Smallest number of limb points, of 720, that must be lit and in one camera's field: 15 deg."""
 _COARSE = 20
-"""Steps between checks of the fields of view: 10 s."""
+"""Number of steps between checks of the fields of view: 10 s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """The truth at n instants, STEP apart, and what there is to be seen.
+    """True states at n instants that are STEP apart, and what the cameras have in view.
 
     Attributes:
-        pass_: where the satellite is.
-        attitudes: (n, 4); `rates` (n, 3) rad/s is the mean over the step before.
-        sun: (n, 3) apparent directions, ICRS; `field` (n, 3) T, ICRS.
-        sunlit: (n,); `sun_in_field`, `nadir_in_field` (n,) say whether a camera could measure them.
+        pass_: orbit of the satellite.
+        attitudes: (n, 4); `rates` (n, 3), rad/s, is the mean over the previous step.
+        sun: apparent directions (n, 3), ICRS; `field` (n, 3) is in T, ICRS.
+        sunlit: (n,); `sun_in_field` and `nadir_in_field` (n,) are whether a camera could measure them.
     """
 
     pass_: Pass
@@ -78,11 +80,11 @@ class World:
 
 
 def world(suite: SensorSuite, rng: np.random.Generator, seconds: float | None = None) -> World:
-    """Return a random world; only `seconds` about its sunset when they are given."""
+    """Return a random world; with `seconds` only this time around its sunset."""
     pass_ = _revolution_to_eclipse(rng, seconds)
     frame = local_frame(pass_.positions, pass_.velocities)
     sun = _sun(pass_)
-    # The first camera across the orbit, away from the Sun: the other two look to its side.
+    # The first camera is across the orbit, away from the Sun, so the other two look to the Sun's side.
     away = -np.sign(np.sum(frame[:, 1] * sun))
     attitudes = multiply(from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi * away])), _sway(frame, rng))
     turns = rotation_vector(multiply(attitudes[1:], conjugate(attitudes[:-1]))) / STEP
@@ -93,7 +95,7 @@ def world(suite: SensorSuite, rng: np.random.Generator, seconds: float | None = 
 
 
 def _revolution_to_eclipse(rng: np.random.Generator, seconds: float | None) -> Pass:
-    """Return the revolution that ends at sunrise, of a random date and node that have an eclipse."""
+    """Return a revolution that ends at sunrise, with a random date and node that have an eclipse."""
     while True:
         date, node = FIRST_DATE + rng.uniform(0.0, 730.0), rng.uniform(0.0, 2.0 * np.pi)
         whole = revolution(date, node, 5.0)
@@ -101,7 +103,7 @@ def _revolution_to_eclipse(rng: np.random.Generator, seconds: float | None) -> P
         rises = np.flatnonzero(lit & ~np.roll(lit, 1))
         if rises.size and np.count_nonzero(~lit) * 5.0 > 1500.0:
             break
-    # From its own sunrise to the next one, and a little less.
+    # It lasts from one sunrise to shortly before the next.
     found = revolution(date, node, STEP, begin=float(whole.times[rises[0]]))
     found = Pass(date, found.times - found.times[0], found.positions, found.velocities)
     dark = np.flatnonzero(~_sunlit(found, _sun(found)))
@@ -124,12 +126,13 @@ def dates(pass_: Pass) -> FloatArray:
 
 
 def _sunlit(pass_: Pass, sun: FloatArray) -> BoolArray:
-    # Seen from the satellite or from the Earth's centre: the shadow does not know the difference.
+    # The directions from the satellite and from the Earth's centre differ too little to matter for the
+    # shadow.
     return np.asarray(sunlit_share(pass_.positions, ASTRONOMICAL_UNIT * sun) > 0.5)
 
 
 def _sun(pass_: Pass) -> FloatArray:
-    """Return the Sun's apparent directions (n, 3), computed every 10 s and drawn straight between."""
+    """Return the Sun's apparent directions (n, 3), interpolated linearly between instants 10 s apart."""
     every = max(1, len(pass_.times) // 600)
     nodes = np.unique(np.append(np.arange(0, len(pass_.times), every), len(pass_.times) - 1))
     known = np.array(
@@ -140,10 +143,10 @@ def _sun(pass_: Pass) -> FloatArray:
 
 
 def _sway(frame: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return attitudes (n, 4) that sway about the local frame (n, 3, 3): white jerk through three poles."""
+    """Return random attitudes (n, 4) about the local frame (n, 3, 3): white jerk through three poles."""
     a = AGILITY
     chain = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-(a**3), -3.0 * a**2, -3.0 * a]])
-    # The stationary covariance of three equal poles under jerk of density q^2.
+    # This is the stationary covariance of three equal poles under jerk of density q^2.
     q2 = PUSH_WALK**2
     p0, p1, p2 = 3.0 * q2 / (16.0 * a**5), q2 / (16.0 * a**3), 3.0 * q2 / (16.0 * a)
     stationary = np.array([[p0, 0.0, -p1], [0.0, p1, 0.0], [-p1, 0.0, p2]])
@@ -160,7 +163,7 @@ def _sway(frame: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _field(pass_: Pass, rng: np.random.Generator) -> FloatArray:
-    """Return the true field (n, 3) T: IGRF, a ring current and the ionosphere."""
+    """Return the true field (n, 3), T: IGRF, a ring current and the ionosphere."""
     when = dates(pass_)
     disturbance = RING_CURRENT * abs(rng.standard_normal())
     keep = np.exp(-STEP / IONOSPHERE_TIME)
@@ -178,7 +181,7 @@ def _field(pass_: Pass, rng: np.random.Generator) -> FloatArray:
 def _in_fields(
     suite: SensorSuite, pass_: Pass, frame: FloatArray, attitudes: FloatArray, sun: FloatArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return whether some camera has the Sun (n,), and enough of the lit limb (n,), in its field."""
+    """Return whether a camera has the Sun (n,), and enough of the lit limb (n,), in its field."""
     turn = attitude_matrix(attitudes)
     sun_body = np.einsum("nij,nj->ni", turn, sun)
     sees_sun = np.zeros(len(sun), bool)
@@ -197,9 +200,10 @@ def _in_fields(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """What the sensors say, at each of the n instants; biases are the truth's.
+    """Sensor readings at each of the n instants, and the true biases.
 
-    `gyro` (n, 3) rad/s is of the step before; `magnetometer` (n, 3) T; `sun`, `nadir` (n, 3) body directions.
+    `gyro` (n, 3), rad/s, is that of the previous step; `magnetometer` (n, 3) is in T; `sun` and `nadir` (n,
+    3) are body directions.
     """
 
     gyro: FloatArray
@@ -211,7 +215,7 @@ class Readings:
 
 
 def readings(suite: SensorSuite, truth: World, rng: np.random.Generator) -> Readings:
-    """Return drawn readings of every instant. The caller asks `truth` when each of them is available."""
+    """Return random readings at every instant; `truth` states when each is available."""
     gyros, magnetometer = suite.gyros, suite.magnetometer
     if gyros is None or magnetometer is None:
         raise ValueError(f"suite {suite.name} lacks gyros or a magnetometer")
@@ -235,7 +239,7 @@ def readings(suite: SensorSuite, truth: World, rng: np.random.Generator) -> Read
 
 
 def _seen(turn: FloatArray, directions: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return directions (n, 3) in body axes, off by OPTICAL_SIGMA an axis."""
+    """Return directions (n, 3) in body axes with errors of OPTICAL_SIGMA per axis."""
     there = np.einsum("nij,nj->ni", turn, directions)
     off = there + OPTICAL_SIGMA * rng.standard_normal(there.shape)
     return np.asarray(off / np.linalg.norm(off, axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""A run made of a few packets, each with the values that a test names and zeros otherwise."""
+"""A run of a few packets, which have the values of a test and zeros otherwise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Rows = Sequence[tuple[float, Mapping[str, Any]]]
 
 
 def packed_run(folder: Path = Path("run"), **packets: Rows) -> Run:
-    """Return a run from rows (mission time in s, values by field) of each packet type."""
+    """Return a run from rows (mission time in s, values by field) for each packet type."""
     packer, raw = Packer(), []
     for name, rows in packets.items():
         packet = LAYOUTS[name].packet

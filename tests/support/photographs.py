@@ -21,7 +21,7 @@ from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky
 PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "sky"
 
 
-# rad, of the prior for tracking: 1.5 px.
+# Standard deviation (rad) of the prior for tracking: 1.5 px.
 _PRIOR_SIGMA = 3e-4
 
 
@@ -39,7 +39,7 @@ ARCSECONDS = math.degrees(1.0) * 3600.0
 
 @dataclass(frozen=True)
 class Photograph:
-    """The result of one photograph; arcsec and ms are NaN where it was not solved."""
+    """Result of one photograph; arcsec and ms are NaN without a solution."""
 
     name: str
     known: bool
@@ -50,7 +50,7 @@ class Photograph:
 
 
 def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a camera of `fov_deg` across and the range of its scale that fields `low` to `high` deg make."""
+    """Return a camera with a field of `fov_deg`, and its range of scale for fields `low` to `high` (deg)."""
     middle = math.tan(0.5 * math.radians(fov_deg))
     rows, columns = pixels.shape
     scale = tuple(math.tan(0.5 * math.radians(angle)) / middle for angle in (low, high))
@@ -58,7 +58,7 @@ def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pi
 
 
 def photograph(folder: Path, name: str, truth: dict[str, float], known: bool) -> Photograph:
-    """Return what the star tracker makes of one photograph."""
+    """Return the star tracker's result for one photograph."""
     pixels = read_image(folder / name)
     fov = truth["fov"]
     low, high = (
@@ -82,7 +82,7 @@ def centre_of(truth: dict[str, float]) -> FloatArray:
 
 
 def direction(right_ascension: float, declination: float) -> FloatArray:
-    """Return the unit vector (3,) of a place of the sky."""
+    """Return the unit vector (3,) of a right ascension and declination."""
     cosine = math.cos(declination)
     return np.array(
         [cosine * math.cos(right_ascension), cosine * math.sin(right_ascension), math.sin(declination)]
@@ -96,13 +96,13 @@ def angle_arcsec(one: FloatArray, other: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Solved:
-    """One simulated frame: errors over the whole attitude and the rate, with their bounds, and times.
+    """Result of one simulated frame: errors of attitude and rate, with their bounds, and times.
 
     Attributes:
-        across: arcsec, of the boresight; NaN when refused.
-        across_bound: arcsec, rms that the bound allows.
+        across: error (arcsec) of the boresight; NaN for a refusal.
+        across_bound: bound (arcsec) of its rms.
         nees: squared error of the attitude over its covariance, per degree of freedom.
-        rate, rate_bound: % of the rate's magnitude; NaN without one.
+        rate, rate_bound: error and bound (%) of the rate's magnitude; NaN without a rate.
     """
 
     across: float
@@ -115,7 +115,7 @@ class Solved:
 
 
 def solved(scene: SkyFrame, length: float) -> Solved:
-    """Return what the star tracker makes of a simulated frame, lost in space and with a prior."""
+    """Return the star tracker's result for a simulated frame, lost in space and with a prior."""
     low, high = NARROW_DEG - _NARROW_KNOWN_DEG, NARROW_DEG + _NARROW_KNOWN_DEG
     camera, scale = believed(scene.pixels, NARROW_DEG, low, high)
     rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings(uncalibrated_lens=False)

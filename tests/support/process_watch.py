@@ -1,8 +1,8 @@
-"""Watches processes from outside through /proc: processor time, and the memory they hold together.
+"""Samples of processes from outside through /proc: processor time, and the memory that they hold together.
 
-The proportional set (PSS) shares each page among the processes that map it, so a sum over processes counts
-none twice (proc_pid_smaps(5)). Processes that are not watched take their share as well: `unshared` is what
-the watched ones would hold if they were alone.
+The proportional set (PSS) divides each page among the processes that map it, so a sum over processes counts
+no page twice (proc_pid_smaps(5)). Processes that are not watched also get their share. `unshared` is the
+memory that the watched processes would hold if they were alone.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One look: monotonic time in s; by name, processor seconds since start and proportional set in bytes.
+    """One sample: monotonic time (s), and processor time (s) and proportional set (bytes) by process name.
 
-    `own` is the part of that memory not mapped from files: other processes that come and go do not change it.
-    `turns` is of each main thread since its start: on a processor, and ready but waiting for one, s.
+    `own` is the part of that memory that is not mapped from files, so other processes do not change it.
+    `turns` has two times (s) of each main thread since its start: running, and ready without a processor.
     """
 
     time: float
@@ -39,10 +39,13 @@ class Look:
 
 
 class ProcessWatch:
-    """Looks at processes by name from a thread of its own, until closed."""
+    """Thread that samples processes by name until it is closed."""
 
     def __init__(self, processes: Callable[[], Mapping[str, int]], period: float) -> None:
-        """Take the function that returns the process identifiers at each look, and the period in s."""
+        """Start sampling.
+
+        `processes` returns the process identifiers at each sample; `period` is in s.
+        """
         self.looks: list[Look] = []
         self._processes = processes
         self._period = period
@@ -51,7 +54,7 @@ class ProcessWatch:
         self._thread.start()
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop sampling."""
         self._stopped.set()
         self._thread.join()
 
@@ -60,11 +63,11 @@ class ProcessWatch:
             try:
                 self.looks.append(look(self._processes()))
             except (OSError, LookupError, ValueError):
-                continue  # one of them has just ended
+                continue  # a process has just ended
 
 
 def look(processes: Mapping[str, int]) -> Look:
-    """Look at processes. Raises OSError, ValueError or LookupError when one is not there."""
+    """Return a sample. Raises OSError, ValueError or LookupError if a process does not exist."""
     sets = {name: _proportional(process) for name, process in processes.items()}
     return Look(
         time.monotonic(),
@@ -77,7 +80,7 @@ def look(processes: Mapping[str, int]) -> Look:
 
 @contextmanager
 def answering(module: str, *words: str) -> Iterator[None]:
-    """Run `python -m MODULE WORDS` from its first line on standard output on; end it with SIGTERM."""
+    """Run `python -m MODULE WORDS` during the block, which begins after its first line of output."""
     root = Path(__file__).parents[2]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     with subprocess.Popen(
@@ -93,7 +96,7 @@ def answering(module: str, *words: str) -> Iterator[None]:
 
 
 def below(parent: int) -> list[int]:
-    """Return the processes below `parent`, at any depth."""
+    """Return the descendants of the process `parent`."""
     found = []
     for task in Path(f"/proc/{parent}/task").glob("*/children"):
         for word in task.read_text().split():
@@ -102,7 +105,7 @@ def below(parent: int) -> list[int]:
 
 
 def command(process: int) -> str:
-    """Return a process's command line; "" for one that has just ended."""
+    """Return a process's command line, or an empty text for a process that has just ended."""
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
     except (FileNotFoundError, ProcessLookupError):
@@ -110,10 +113,10 @@ def command(process: int) -> str:
 
 
 def unshared(processes: Mapping[str, int]) -> float:
-    """Return the bytes that processes would hold together if no other process mapped their files.
+    """Return the memory (bytes) that processes would hold if no other process mapped their files.
 
-    Private memory as it is; of each piece of a file what the process that holds most of it holds, since the
-    same libraries are used alike.
+    The result is their private memory, and for each segment of a file the largest amount that one of them
+    holds, because they use the same libraries alike.
     """
     private = 0.0
     of_files: defaultdict[tuple[str, str], float] = defaultdict(float)
@@ -135,22 +138,22 @@ def unshared(processes: Mapping[str, int]) -> float:
 
 
 def stolen_ns() -> int:
-    """Return the processor time, of all cores since boot, that the machine's host gave to others."""
+    """Return the processor time (ns) of all cores since boot that the host gave to other virtual machines."""
     with open("/proc/stat", "rb", buffering=0) as file:
         return int(file.read(256).split(maxsplit=9)[8]) * (1_000_000_000 // _TICKS)
 
 
 def _processor(process: int) -> float:
-    # The name, in brackets, may hold anything; user and system time are words 14 and 15 of all (proc(5)).
+    # The name in brackets may contain any character; user and system time are words 14 and 15 (proc(5)).
     words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(words[11]) + int(words[12])) / _TICKS
 
 
 def _turns(process: int) -> tuple[float, float]:
-    """Return how long the main thread was on a processor, and waited for one, s; NaN where not counted."""
+    """Return for how long (s) the main thread was running and ready; NaN if the kernel does not count it."""
     try:
         words = Path(f"/proc/{process}/task/{process}/schedstat").read_text().split()
-    except FileNotFoundError:  # a kernel that does not count it
+    except FileNotFoundError:  # the kernel does not count it
         return math.nan, math.nan
     return 1e-9 * int(words[0]), 1e-9 * int(words[1])
 

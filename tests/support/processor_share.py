@@ -1,10 +1,10 @@
 """A share of a core for processes under test: how large it is for a slower processor, and how to enforce it.
 
 The kernel enforces the share (CFS bandwidth of the controller `cpu`, cgroup v1 or v2), on one core, with a
-period of 5 ms. The kernel grants 1 ms at least, so that the period is longer for shares below 20 %. Within
-the share, the control process comes before its workers, as the kernel of a board schedules them: control is
-in a group of its own with a far greater weight. A limiter by SIGSTOP and SIGCONT is not offered, because the
-flight takes a stopped worker for a failed one and replaces it.
+period of 5 ms. The kernel grants at least 1 ms, so the period is longer for shares below 20 %. Within the
+share, the control process has priority over its workers, as on a board: it is in a group of its own with a
+far greater weight. Stopping by SIGSTOP and SIGCONT would not work, because the flight replaces a stopped
+worker.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _SOURCE = Path(__file__).with_name("yardstick.c")
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Speed of a processor on the two kernels of the yardstick, as published.
+    """Published speed of a processor in the two benchmarks.
 
     Attributes:
-        sorts: arrays of 8,111 integers sorted by heap sort per second (NBench's numeric sort).
+        sorts: arrays of 8,111 integers that heap sort sorts per second (NBench's numeric sort).
         mflops: million floating-point operations per second of Linpack in double precision.
-        source: where the figures are published.
+        source: publication of the figures.
     """
 
     name: str
@@ -56,18 +56,18 @@ CORTEX_A53 = Published(
 
 @dataclass(frozen=True, slots=True)
 class Yardstick:
-    """Speed of this core on the two kernels, in the units of `Published`."""
+    """Speed of this core in the two benchmarks, in the units of `Published`."""
 
     sorts: float
     mflops: float
 
     def share(self, slow: Published) -> float:
-        """Return the share of this core that is as fast: the geometric mean of both kernels' ratios."""
+        """Return the share of this core that is as fast as `slow`: the geometric mean of both ratios."""
         return math.sqrt(slow.sorts / self.sorts * slow.mflops / self.mflops)
 
 
 def measure() -> Yardstick:
-    """Compile the yardstick and run it. Raises RuntimeError without a C compiler."""
+    """Compile the benchmarks and run them. Raises RuntimeError without a C compiler."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         raise RuntimeError("no C compiler for the yardstick: install one, or give the share by --share")
@@ -81,9 +81,9 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """What a limited group used: throttled periods of all periods, largest memory (bytes), refusals.
+    """Resources that a limited group used: throttled and all periods, largest memory (bytes), refusals.
 
-    The memory is NaN with a kernel before Linux 5.19, which records no largest use in cgroup v2.
+    The memory is NaN with a kernel before Linux 5.19, whose cgroup v2 does not record the largest use.
     """
 
     periods: int
@@ -93,10 +93,13 @@ class Used:
 
 
 class Limits:
-    """The groups of one run: `control` and `workers` inside the limit, `devices` outside of it."""
+    """Groups of one run: `control` and `workers` inside the limit, `devices` outside it."""
 
     def __init__(self, share: float, memory: int, root: Path = ROOT) -> None:
-        """Make the groups below `root`. Raises OSError with the file that the kernel or the rights refuse."""
+        """Create the groups below `root`.
+
+        Raises OSError with the file that the kernel or the rights refuse.
+        """
         name = f"knightcube-board-{os.getpid()}"
         self._is_v2 = (root / "cgroup.controllers").exists()
         if self._is_v2:
@@ -126,7 +129,7 @@ class Limits:
         for part in ("control", "workers"):
             (self._cpu / part).mkdir()
         weight, most, least = ("cpu.weight", 10000, 1) if self._is_v2 else ("cpu.shares", 262144, 2)
-        # Other work of this machine must not take the share: the groups come before it.
+        # The groups have priority over other work of this machine, which would take part of the share.
         for folder in (self._cpu, self._devices, self._cpu / "control"):
             _write(folder / weight, str(most))
         _write(self._cpu / "workers" / weight, str(least))
@@ -140,7 +143,7 @@ class Limits:
         return f"{enter}\nos.sched_setaffinity(0, {{{core}}})"
 
     def demote(self, process: int) -> None:
-        """Move a worker behind the control process."""
+        """Move a worker to the group with the smaller weight."""
         self._enter(self._cpu / "workers", process)
 
     def release(self, process: int) -> None:
@@ -153,7 +156,7 @@ class Limits:
             _write(folder / "cgroup.procs", str(process))
 
     def used(self) -> Used:
-        """Return what the group used until now."""
+        """Return the resources that the group has used."""
         rows = dict(line.split() for line in (self._cpu / "cpu.stat").read_text().splitlines())
         peak, refused = ("peak", "events") if self._is_v2 else ("max_usage_in_bytes", "failcnt")
         words = (self._memory / f"memory.{refused}").read_text().split()
@@ -185,7 +188,7 @@ def _write(file: Path, text: str) -> None:
 
 @contextmanager
 def limited(share: float, memory: int) -> Iterator[Limits]:
-    """Make the groups, and remove them at the end."""
+    """Create the groups, and remove them at the end of the block."""
     limits = Limits(share, memory)
     try:
         yield limits

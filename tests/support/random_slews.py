@@ -50,7 +50,7 @@ _LONGEST = 3.0
 
 @cache
 def orbit(name: str) -> Ephemeris:
-    """Return the prediction of an orbit for two revolutions."""
+    """Return the prediction of an orbit over two revolutions."""
     height, tilt = ORBITS[name]
     radius, tilt = EARTH_RADIUS + height, np.radians(tilt)
     speed = np.sqrt(GRAVITATIONAL_PARAMETER / radius)
@@ -63,7 +63,7 @@ def _whenever(end: AttitudeEnd) -> EndLaw:
 
 
 def slews(count: int, seed: int, with_cones: bool) -> Iterator[tuple[str, SlewTask]]:
-    """Yield named tasks; with cones, only those that start and end outside."""
+    """Yield named tasks; with cones, only those that start and end outside of them."""
     rng = np.random.default_rng(seed)
     made = 0
     while made < count:
@@ -89,7 +89,7 @@ def slews(count: int, seed: int, with_cones: bool) -> Iterator[tuple[str, SlewTa
 
 
 def clearance(task: SlewTask, plan: SlewPlan) -> float:
-    """Return how far outside the cones the path stays, rad, sampled twice a second by the bench."""
+    """Return the smallest angle (rad) between the path and the cones, sampled twice a second."""
     times = np.linspace(0.0, plan.horizon, 2 * int(plan.horizon) + 2)
     turned = np.array([matrix(q) for q in plan.path.references(times).quaternion])
     nearest = np.inf

@@ -1,10 +1,10 @@
-"""Short simulated flights whose packets are kept in `recorded_flights.json`.
+"""Short simulated flights whose packets are recorded in `recorded_flights.json`.
 
-`python -m tests.support.recorded_flights` writes the record again, after a change of the behaviour that is
-intended. Each number is kept as the count of finite values, and their mean, root
-mean square and last value over the flight; the components of an array are weighted by 1, 2, 3, ... so that
-they cannot be exchanged. Texts are kept only if they are names, because the wording of messages may change.
-Values that depend on the computer are left out.
+`python -m tests.support.recorded_flights` writes the record, after an intended change of the behaviour. For
+each number the record has the count of finite values, and their mean, root mean square and last value over
+the flight. The components of an array are weighted by 1, 2, 3, ..., so that an exchange changes the figures.
+Only texts that are names are recorded, because the wording of messages may change. Values that depend on the
+computer are left out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tests.support.shared_results import made_once
 
 RECORD = Path(__file__).with_suffix(".json")
 TOLERANCE = 1e-5
-"""Relative difference from the record that rounding in another order may cause."""
+"""Largest relative difference from the record, which rounding in another order may cause."""
 NAMES = {
     ("event", "name"),
     ("mode", "trigger"),
@@ -53,7 +53,7 @@ OF_THE_COMPUTER = {
 The number of evaluations in an optimisation depends on the rounding of the processor.
 """
 UNTIMED = {"cycle_timing", "job_timing", "rate_group"}
-"""Packets of real times."""
+"""Packets with elapsed times of the computer."""
 
 Record = dict[str, dict[str, Any]]
 
@@ -119,19 +119,19 @@ def recorded(name: str) -> Record:
 
 
 def faults(*entries: tuple[str, float, float]) -> tuple[FaultEntry, ...]:
-    """Return faults from their text, their beginning and their length in s."""
+    """Return faults from their texts, starts (s) and durations (s)."""
     return tuple(FaultEntry(fault=text, at=at, span=span) for text, at, span in entries)
 
 
 def commanded(config: Any, *steps: dict[str, Any], **modes: Any) -> Any:
-    """Return a configuration with a time line of commands and other settings of the modes."""
+    """Return a configuration with a timeline of commands and other settings of the modes."""
     timeline = tuple(CommandStep(**step) for step in steps)
     section = configuration.replace(config.modes, **modes)
     return configuration.replace(config, modes=section, commands=Commands(timeline=timeline))
 
 
 IMPATIENT = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 1.0, "blind_limit": 1.0}
-"""Settings of the modes (s) by which little time passes until something happens."""
+"""Short timeouts (s) of the modes."""
 
 
 def _orbit_config(duration: float) -> OrbitConfig:
@@ -230,13 +230,13 @@ FLIGHTS: dict[str, Callable[[], tuple[Config, Simulation | None]]] = {
 
 
 def flown(name: str, folder: Path) -> Run:
-    """Fly a flight of the record again."""
+    """Repeat a recorded flight."""
     config, section = FLIGHTS[name]()
     return fly(config, folder, section=section)
 
 
 def unlike_record(name: str, session_folder: Path) -> list[str]:
-    """Return the differences of a flight from its record; the tests of a session fly it once."""
+    """Return the differences of a flight from its record; it is flown once per test session."""
     folder = session_folder / "recorded_flights"
     folder.mkdir(exist_ok=True)
     found = made_once(folder, name, lambda: record_of(flown(name, folder / name)))

@@ -1,11 +1,11 @@
 """Results of estimators and planners, compared with a record of their numbers.
 
-A test module with the records has a function for each case. `check(__file__, name, result)` compares a result
+A test module with records has a function for each case. `check(__file__, name, result)` compares a result
 with the file `recorded_results.json` beside the module. `KNIGHTCUBE_RECORD=1 python -m pytest -n 0 MODULE`
-writes the record again, after a change of the results that is intended.
+writes the record, after an intended change of the results.
 
-Of an array its shape, the number of its finite values, and their mean, root mean square and weighted mean are
-kept; of a text its length is not kept, because wording may change.
+For an array the record has its shape, the number of its finite values, and their mean, root mean square and
+weighted mean. It has no texts, because their wording may change.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ import numpy as np
 from knightcube.compiled import in_use
 
 TOLERANCE = 1e-5
-"""Relative difference from the record that rounding in another order may cause."""
+"""Largest relative difference from the record, which rounding in another order may cause."""
 COMPILED_TOLERANCE = 1e-2
-"""The same with compiled forms, whose rounding decides when an iteration stops. The largest difference of a
-covariance or a faint star is 0.7 % (5 of 68 cases of `tests/knightcube/vision`, 2026-11-27)."""
+"""Same limit with compiled forms, whose rounding decides when an iteration stops.
+
+The largest difference of a covariance or a faint star is 0.7 % (5 of 68 cases of `tests/knightcube/vision`,
+2026-11-27).
+"""
 ANSWERS = ("rate", "quaternion")
 """Names of figures that keep `TOLERANCE` with compiled forms."""
 COMPILED = in_use()
@@ -88,9 +91,9 @@ def _array(value: Any) -> Any:
 
 
 def differences(record: Any, found: Any, tolerance: float, place: str = "", zero: float = 0.0) -> list[str]:
-    """Return the places at which figures differ from their record, one per line.
+    """Return the key paths at which figures differ from their record, one per line.
 
-    Numbers also agree if their difference is at most `zero`, which rounding leaves of an exact zero.
+    Numbers also agree if their difference is at most `zero`, the rounding error of an exact zero.
     """
     if isinstance(record, dict) and isinstance(found, dict):
         lines = [f"{place}.{key}: in one of them only" for key in sorted(record.keys() ^ found.keys())]
@@ -115,10 +118,10 @@ def differences(record: Any, found: Any, tolerance: float, place: str = "", zero
 
 
 def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zero: float = ZERO) -> None:
-    """Fail unless a result has the figures of its record, beside a test module.
+    """Fail unless a result has the figures of its record beside the test module.
 
-    Numbers agree if they differ by the fraction `tolerance`, or by `zero`. With compiled forms, all but the
-    `ANSWERS` have the tolerance `COMPILED_TOLERANCE`.
+    Numbers agree if they differ by at most the fraction `tolerance`, or by `zero`. With compiled forms, all
+    except the `ANSWERS` have the tolerance `COMPILED_TOLERANCE`.
     """
     path = Path(module).with_name("recorded_results.json")
     records: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -132,7 +135,7 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
 
 
 def unlike(record: Any, found: Any, tolerance: float, zero: float, compiled: bool) -> list[str]:
-    """Return the places at which figures by numpy's or by `compiled` forms differ from their record."""
+    """Return the key paths at which the figures of numpy or `compiled` forms differ from their record."""
     lines = differences(record, found, tolerance, zero=zero)
     if not compiled:
         return lines

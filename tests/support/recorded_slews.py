@@ -1,7 +1,7 @@
 """Slews with known optima, and a model of the motion that shares no code with the planner.
 
-The file's problems, field series and optima were made by direct collocation elsewhere; its `model` is the
-equations that `flown` integrates.
+The problems, field series and optima of the file come from an independent direct collocation. `flown`
+integrates the equations of the file's `model`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum
 
 @cache
 def recorded() -> dict[str, Any]:
-    """Return the file; skips the test where the file is missing."""
+    """Return the file; skip the test if the file is missing."""
     if not FILE.exists():
         pytest.skip(f"no optima of slews at {FILE}")
     content: dict[str, Any] = json.loads(FILE.read_text())
@@ -39,13 +39,13 @@ def recorded() -> dict[str, Any]:
 
 
 def problem(name: str) -> dict[str, Any]:
-    """Return the problem of a name."""
+    """Return the named problem."""
     found: dict[str, Any] = next(one for one in recorded()["problems"] if one["name"] == name)
     return found
 
 
 def matrix(q: FloatArray) -> FloatArray:
-    """Return the attitude matrix (3, 3) by Euler's formula, as textbooks print it."""
+    """Return the attitude matrix (3, 3) by Euler's formula of the textbooks."""
     v, s = np.asarray(q[:3]), float(q[3])
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     return np.asarray((s * s - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) - 2.0 * s * cross)
@@ -85,7 +85,7 @@ def task_of(case: dict[str, Any], horizon: float, **options: Any) -> SlewTask:
 
 
 def flown(plan: SlewPlan, task: SlewTask) -> FloatArray:
-    """Return the state (7,) at the end when the plan's dipoles alone turn the body."""
+    """Return the final state (7,) of a body on which only the plan's dipoles act."""
     inertia = task.craft.inertia
     mu = recorded()["mu"]
 
@@ -109,6 +109,6 @@ def flown(plan: SlewPlan, task: SlewTask) -> FloatArray:
 
 
 def off_degrees(q: FloatArray, wanted: FloatArray) -> float:
-    """Return the angle between two attitudes (4,), deg."""
+    """Return the angle (deg) between two attitudes (4,)."""
     turn = matrix(q / np.linalg.norm(q)) @ matrix(wanted).T
     return float(np.degrees(2.0 * np.arcsin(min(1.0, np.linalg.norm(turn - np.eye(3)) / np.sqrt(8.0)))))

@@ -1,7 +1,7 @@
-"""Frames summed instant by instant, each row within its own exposure: independent of the fitted model.
+"""Frames summed instant by instant, each row within its own exposure; independent of the fitted model.
 
-Every instant's point is a Gaussian integrated over each pixel of a patch, and counts on the rows that are
-exposed at that time. Slow and plain, for campaigns; the noise is the simulator's.
+At each instant a star is a Gaussian that is integrated over each pixel of a patch. It counts in the rows that
+are exposed at that time. The method is simple and slow. The noise is the simulator's.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from sim_hal.star_camera import StarCameraModel, image
 from tests.support.scenes import catalogue
 
 Turns = Callable[[FloatArray], FloatArray]
-"""Rotation vectors (m, 3) rad since mid-exposure at times (m,) s from it, camera frame."""
+"""Function that returns rotation vectors (m, 3), rad, since mid-exposure at times (m,), s, camera frame."""
 
 _LIMIT = 7.0
-# px between instants, and from a point to the patch's edge in widths of the point spread.
+# Largest step (px) between instants, and half width of the patch in widths of the point spread.
 _STEP = 0.25
 _REACH = 5.5
 _SAMPLES = 65
@@ -30,7 +30,7 @@ _SAMPLES = 65
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowScene:
-    """A frame, its stars (n, 2) px at mid-exposure, brightest first, electrons (n,), and paths (n,) px."""
+    """A frame, its stars (n, 2), px, at mid-exposure, brightest first, electrons (n,), and paths (n,), px."""
 
     pixels: Image
     stars: FloatArray
@@ -41,7 +41,10 @@ class RowScene:
 def row_scene(
     camera: StarCameraModel, turns: Turns, exposure: float, generator: np.random.Generator
 ) -> RowScene:
-    """Return a random sky under `turns`: row r is exposed from (r - middle) line times - exposure / 2 on."""
+    """Return a random sky under the motion `turns`.
+
+    The exposure of row r starts at (r - middle) line times - exposure / 2.
+    """
     stars, directions = catalogue(_LIMIT)
     middle = normalise(generator.normal(size=4))
     half = 0.5 * (exposure + camera.rows * camera.line_time)
@@ -84,14 +87,14 @@ def _add(
     exposure: float,
     electrons: float,
 ) -> None:
-    """Add to `light` a star of `electrons` that is at `path` (m, 2) px at `times` (m,), evenly spaced."""
+    """Add a star of `electrons` at `path` (m, 2), px, at evenly spaced `times` (m,), to the image `light`."""
     reach = math.ceil(_REACH * camera.psf_sigma) + 1
     kept = camera.pinhole.contains(np.nan_to_num(path, nan=-1e6), float(reach))
     path, step = path[kept], times[1] - times[0]
     corner = np.rint(path).astype(int) - reach
     across, down = (corner[:, k, None] + np.arange(2 * reach + 1) for k in (0, 1))
     x, y = (_shares(pixel, path[:, k], camera.psf_sigma) for k, pixel in ((0, across), (1, down)))
-    # How much of the instant lies within the exposure of each row.
+    # fraction of the instant that lies within the exposure of each row
     begin = (down - 0.5 * (camera.rows - 1)) * camera.line_time - 0.5 * exposure
     first = np.maximum(times[kept, None] - 0.5 * step, begin)
     last = np.minimum(times[kept, None] + 0.5 * step, begin + exposure)
@@ -105,6 +108,6 @@ def _add(
 
 
 def _shares(pixels: IntArray, place: FloatArray, sigma: float) -> FloatArray:
-    """Return the share (m, p) of points at `place` (m,) that falls on `pixels` (m, p)."""
+    """Return the fraction (m, p) of points at `place` (m,) that falls on `pixels` (m, p)."""
     away = (pixels - place[:, None]) / sigma
     return np.asarray(ndtr(away + 0.5 / sigma) - ndtr(away - 0.5 / sigma))

@@ -1,4 +1,4 @@
-"""Frames with their truth for the campaigns: real stars, a random pointing, one constant body rate."""
+"""Frames with their truth for the campaigns: real stars, a random pointing, a constant body rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXPOSURES = (0.2, 1.0)
 MOST_TURN = 0.5
 """Largest rotation of a random slew, as a fraction of the field."""
 BRIGHTEST = 7000
-"""Number of stars with which the tables of the thesis are reached; the thesis states none."""
+"""Number of stars that reproduces the tables of the thesis; the thesis states none."""
 LEAST_USABLE = 5
 """Smallest number of usable stars in a random slew."""
 _MOST_SKIES = 1000
@@ -32,11 +32,12 @@ class Scene:
 
     Attributes:
         pixels: (rows, columns).
-        rate: (3,) rad/s, camera frame; `exposure` s.
-        start, middle, end: (n, 2) px of every catalogue star near the field; NaN behind the camera.
-        electrons: (n,) of the whole exposure; `magnitude` (n,).
-        directions: (n, 3) ICRS.
-        attitudes: (2, 4) at the start and the end, ICRS into camera.
+        rate: (3,), rad/s, camera frame; `exposure` is in s.
+        start, middle, end: positions (n, 2), px, of all catalogue stars near the field; NaN behind the
+        camera.
+        electrons: (n,), over the whole exposure; `magnitude` (n,).
+        directions: (n, 3), ICRS.
+        attitudes: (2, 4) at the start and the end, ICRS to camera.
     """
 
     pixels: Image
@@ -72,7 +73,7 @@ def slew(
     limit: float = 8.5,
     model: StarCameraModel | None = None,
 ) -> Scene:
-    """Return a random sky seen while turning by `fraction` of the field, `theta` rad off the boresight."""
+    """Return a random sky during a rotation of `fraction` of the field, `theta` (rad) off the boresight."""
     camera = model or StarCameraModel(field_of_view=FIELD)
     azimuth = generator.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
@@ -86,10 +87,10 @@ class RandomSlew:
     """A random motion of a campaign; its sky is drawn when it is exposed.
 
     Attributes:
-        seed: of the campaign; `run` numbers the motion.
-        theta: deg, angle between the axis of rotation and the boresight.
+        seed: seed of the campaign; `run` is the number of the motion.
+        theta: angle (deg) between the axis of rotation and the boresight.
         percent: rotation over the exposure, % of the field.
-        exposure: s.
+        exposure: exposure time, s.
     """
 
     seed: int
@@ -100,14 +101,14 @@ class RandomSlew:
 
     @classmethod
     def drawn(cls, seed: int, run: int) -> RandomSlew:
-        """Return motion number `run`; it does not depend on how many are drawn."""
+        """Return motion number `run`, which does not depend on the number of motions."""
         draw = np.random.default_rng((seed, run, 0))
         theta = float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi)))
         percent = float(100.0 * draw.uniform(0.0, MOST_TURN))
         return cls(seed, run, theta, percent, float(draw.choice(EXPOSURES)))
 
     def exposed(self, camera: StarCameraModel) -> tuple[Scene, int]:
-        """Return the frame, and how many skies were drawn until one had enough usable stars."""
+        """Return the frame, and the number of skies drawn until one had enough usable stars."""
         generator = np.random.default_rng((self.seed, self.run, 1))
         theta, fraction = np.deg2rad(self.theta), self.percent / 100.0
         for drawn in range(1, _MOST_SKIES + 1):
@@ -125,7 +126,7 @@ def exposed(
     generator: np.random.Generator,
     limit: float = 8.5,
 ) -> Scene:
-    """Return a frame whose attitude at mid-exposure is `middle` (4,), turning at `rate` (3,) rad/s."""
+    """Return a frame with the attitude `middle` (4,) at mid-exposure and a rate (3,), rad/s."""
     stars, directions = catalogue(limit)
     times = np.linspace(0.0, exposure, SAMPLES)
     turns = from_rotation_vector((times - 0.5 * exposure)[:, None] * rate)
@@ -153,7 +154,7 @@ def exposed(
 
 
 def usable(scene: Scene, camera: StarCameraModel, significance: float = 8.0) -> FloatArray:
-    """Return the indices of the stars wholly in the frame that stand out of the noise along their path."""
+    """Return the indices of the stars that are completely in the frame and significant along their path."""
     pinhole = camera.pinhole
     inside = pinhole.contains(scene.start, -4.0) & pinhole.contains(scene.end, -4.0)
     inside &= pinhole.contains(scene.middle, -4.0)
@@ -165,5 +166,5 @@ def usable(scene: Scene, camera: StarCameraModel, significance: float = 8.0) -> 
 
 
 def noise_floor(camera: StarCameraModel, exposure: float) -> float:
-    """Return the variance of a pixel without star light, e-^2: read, dark, rounding."""
+    """Return the variance (e-^2) of a pixel without star light: read noise, dark current, rounding."""
     return camera.read_noise**2 + camera.dark_current * exposure + camera.gain**2 / 12.0

@@ -1,4 +1,4 @@
-"""Defaults of configuration sections as plain values, to be compared with the published ones."""
+"""Defaults of configuration sections as plain values, for the comparison with the published ones."""
 
 from __future__ import annotations
 

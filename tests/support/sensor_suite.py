@@ -1,7 +1,7 @@
-"""A satellite's attitude sensors and how they are mounted: one YAML file of `config/sensors` a satellite.
+"""Attitude sensors of a satellite and their mounting, from one YAML file of `config/sensors` per satellite.
 
-Body axes (Meller et al., Fig. 2): z down along nadir, x forward along the orbit, y to the right, when the
-satellite flies as it should. SI units unless the name says otherwise.
+Body axes (Meller et al., Fig. 2) in the nominal attitude: z down to nadir, x forward along the orbit, y to
+the right. Units are SI unless the name has another one.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _UNIT_TOLERANCE = 1e-6
 class WideCamera(Section, frozen=True, kw_only=True):
     """A horizon and Sun camera.
 
-    `mounting` takes the body's axes to the camera's (boresight z, columns x, rows y). `field_of_view_deg` is
-    that of the columns and, the pixels being square, of the rows.
+    `mounting` rotates body axes to camera axes (boresight z, columns x, rows y). `field_of_view_deg` is that
+    of the columns and, because pixels are square, also determines that of the rows.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]
@@ -37,12 +37,12 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
     @property
     def to_camera(self) -> FloatArray:
-        """The matrix (3, 3) that takes body vectors to the camera's axes."""
+        """Matrix (3, 3) that rotates body vectors to camera axes."""
         return attitude_matrix(np.array(self.mounting))
 
 
 class SolarString(Section, frozen=True, kw_only=True):
-    """A string of solar cells on one side: its current goes with the cosine of the Sun off its normal."""
+    """A string of solar cells on one side; its current follows the cosine of the Sun's incidence angle."""
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]
     normal: tuple[float, float, float]
@@ -50,10 +50,10 @@ class SolarString(Section, frozen=True, kw_only=True):
 
 
 class Gyros(Section, frozen=True, kw_only=True):
-    """Three rate gyros along the body's axes.
+    """Three rate gyros along the body axes.
 
-    `noise` rad/s per sqrt(Hz), `bias_start` rad/s, `bias_walk` rad/s per sqrt(s), `rate_hz` of the samples,
-    each the mean over its period.
+    `noise` is in rad/s per sqrt(Hz), `bias_start` in rad/s, and `bias_walk` in rad/s per sqrt(s). `rate_hz`
+    is that of the samples, which are means over their period.
     """
 
     noise: Positive
@@ -63,15 +63,15 @@ class Gyros(Section, frozen=True, kw_only=True):
 
     @property
     def sample_sigma(self) -> float:
-        """Of one sample, rad/s."""
+        """Standard deviation (rad/s) of one sample."""
         return self.noise * math.sqrt(self.rate_hz)
 
 
 class Magnetometer(Section, frozen=True, kw_only=True):
-    """A three-axis magnetometer along the body's axes.
+    """A three-axis magnetometer along the body axes.
 
-    `noise` T of a sample, `bias_start` T of the hard iron left after calibration on the ground, `bias_walk` T
-    per sqrt(s) of it and of the field model's error in orbit.
+    `noise` (T) is that of a sample, `bias_start` (T) the hard iron after calibration on the ground.
+    `bias_walk` (T per sqrt(s)) is that of the hard iron and of the field model's error in orbit.
     """
 
     noise: Positive
@@ -81,7 +81,7 @@ class Magnetometer(Section, frozen=True, kw_only=True):
 
 
 class SensorSuite(Section, frozen=True, kw_only=True):
-    """All of them, and the inertia (kg m^2, about the body's axes) of what carries them."""
+    """All sensors, and the inertia (kg m^2, body axes) of the satellite."""
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
     inertia: tuple[Positive, Positive, Positive]

@@ -1,4 +1,4 @@
-"""Results that the tests of a session share, whatever worker process each test runs in."""
+"""Results that the tests of a session share, in whatever worker process each test runs."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 
 def made_once(folder: Path, name: str, make: Callable[[], Any]) -> Any:
-    """Return what `make` returns, as JSON keeps it; only the first caller of a session calls `make`.
+    """Return the result of `make` as JSON represents it; the first caller of a session calls `make`.
 
-    `folder` is below the fixture `session_folder`. A caller in another process waits for the result.
-    If `make` raises an exception, the next caller calls it again.
+    `folder` is below the fixture `session_folder`. A caller in another process waits for the result. If
+    `make` raises an exception, the next caller calls it again.
     """
     kept = folder / f"{name}.json"
     with (folder / f"{name}.lock").open("w") as lock:

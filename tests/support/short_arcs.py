@@ -8,11 +8,11 @@ from scipy.integrate import solve_ivp
 from knightcube.astro.arrays import FloatArray
 
 EARTH, FLATTENING, EQUATOR, LIGHT = 3.986004418e14, 1.0826359e-3, 6_378_136.6, 299_792_458.0
-"""SI: the gravity of the Earth, J2 and its radius; the speed of light."""
+"""SI values: gravitational parameter of the Earth, J2 and its radius, speed of light."""
 
 
 def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
-    """Return a state over `place`, across it, at a speed over the circular one."""
+    """Return a state above `place`, moving perpendicular to it, at `speed` times the circular speed."""
     up = place / np.linalg.norm(place)
     ahead = np.cross(up, rng.normal(size=3))
     ahead /= np.linalg.norm(ahead)
@@ -34,7 +34,7 @@ def passing_object(rng: np.random.Generator, own: FloatArray) -> tuple[FloatArra
 
 
 def flown_states(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
-    """Return states (n, 6) at times of the one at `times[middle]`."""
+    """Return the states (n, 6) at `times`; `state` is that at `times[middle]`."""
     parts = []
     for sense in (times[middle::-1], times[middle:]):
         found = solve_ivp(

@@ -1,8 +1,8 @@
-"""The shortest time of a single-axis slew, by shooting: full current one way, then the other, one switch.
+"""Shortest time of a single-axis slew by shooting: full current in one direction, then in the other.
 
-Independent of planner and collocation: the body is run forward from the start under one limit and backward
-from the end under the other; where the two curves meet in the phase plane is the switch. One switch is
-optimal while the slew takes less than half a period of the thread (more than 20 s here).
+The method is independent of planner and collocation. The body is integrated forward from the start under one
+limit, and backward from the end under the other. The current switches where the two curves meet in the phase
+plane. One switch is optimal if the slew takes less than half a period of the thread (more than 20 s here).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _NEWTON_STEPS = 12
 
 
 def shortest_time(slew: Slew) -> float:
-    """Return the least feasible horizon in s, inf when none up to 48 s is found."""
+    """Return the shortest feasible horizon (s), or inf if there is none up to 48 s."""
     return min(_meeting(slew, 1.0), _meeting(slew, -1.0))
 
 
 def _meeting(slew: Slew, sign: float) -> float:
-    """Return the total time with the first current of this sign."""
+    """Return the total time if the first current has this sign."""
     out = _run(slew, (slew.start_angle, slew.start_rate), sign, _STEP)
     back = _run(slew, (slew.end_angle, slew.end_rate), -sign, -_STEP)
     apart = np.abs(out[:, None, 0] - back[None, :, 0]) + np.abs(out[:, None, 1] - back[None, :, 1])
@@ -38,7 +38,7 @@ def _meeting(slew: Slew, sign: float) -> float:
 
 
 def _refined(slew: Slew, sign: float, times: FloatArray) -> float:
-    """Return the sum of the two times when Newton's iteration from `times` (2,) meets, else inf."""
+    """Return the sum of the two times if Newton's iteration from `times` (2,) converges, otherwise inf."""
     for _ in range(_NEWTON_STEPS):
         if times.min() < -1e-9 or times.max() > _LONGEST:
             return float("inf")
@@ -61,7 +61,7 @@ def _slope(slew: Slew, state: FloatArray, sign: float) -> FloatArray:
 
 
 def _stepped(slew: Slew, state: FloatArray, sign: float, dt: float) -> FloatArray:
-    """Return the state one classical Runge-Kutta step on."""
+    """Return the state after one classical Runge-Kutta step."""
     k1 = _slope(slew, state, sign)
     k2 = _slope(slew, state + 0.5 * dt * k1, sign)
     k3 = _slope(slew, state + 0.5 * dt * k2, sign)
@@ -70,7 +70,7 @@ def _stepped(slew: Slew, state: FloatArray, sign: float, dt: float) -> FloatArra
 
 
 def _run(slew: Slew, state: tuple[float, float], sign: float, dt: float) -> FloatArray:
-    """Return states (m, 2) every `dt` s until the coil loses its authority or the time is up."""
+    """Return states (m, 2) every `dt` s until the coil loses its authority or the time limit is reached."""
     now = np.array(state)
     states = [now]
     for _ in range(round(_LONGEST / abs(dt))):

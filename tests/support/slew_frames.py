@@ -19,15 +19,15 @@ CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_3u.yaml"
 
 
 SPEED = 5e-4
-"""rad/s, at the release."""
+"""Rate (rad/s) at the release."""
 
 
 BEGIN, SLEW, TURN = 60.0, 300.0, np.radians(100.0)
-"""s and s and rad, of the slew."""
+"""Start (s), duration (s) and angle (rad) of the slew."""
 
 
 def flight(body: str, seed: int, about: FloatArray | None = None) -> tuple[OrbitConfig, Simulation]:
-    """Return the configuration and the world of a flight; it slews `about` (3,), body axes, or any axis."""
+    """Return configuration and world of a slew about `about` (3,), body axes, or a random axis."""
     text = CONFIG.read_text(encoding="utf-8")
     config = as_orbit(configuration.parse(text))
     section = configuration.simulation_section(text, CONFIG.name, Simulation)
@@ -70,10 +70,10 @@ def _mounting() -> float:
 def compared(
     run: Run, first: float = BEGIN + 5.0, last: float = BEGIN + SLEW
 ) -> tuple[int, int, int, FloatArray]:
-    """Return how many frames the slew had, with a rate, used; and the rates' NEES of an axis (n,).
+    """Return the counts of frames of the slew, with a rate, and used, and the NEES per axis (n,).
 
-    It is judged from `first` to `last` s, in body axes. The claim of a frame holds in camera axes, and the
-    accuracy of the camera's mounting is added.
+    Only frames from `first` to `last` (s) count. The comparison is in body axes. The covariance of a frame is
+    in camera axes, and the accuracy of the camera's mounting is added.
     """
     frames, truth = run["streak"], run["truth"]
     times, rates = truth["time_ns"] * 1e-9, truth["rate"].astype(float)

@@ -1,9 +1,9 @@
-"""Synthetic star lists: what a perfect detector would hand over of a random part of the sky.
+"""Synthetic star lists: the output of a perfect detector for a random part of the sky.
 
-A camera of 1024 x 1024 pixels looks anywhere with any roll; the guide stars down to the limit of its
-magnitude fall on the detector with Gaussian centroid noise; some are lost; false stars are strewn evenly,
-their brightness drawn from the true ones'. The order is by a magnitude with errors, as a detector would
-have it.
+A camera of 1024 x 1024 pixels has a random pointing and roll. The guide stars down to its limiting magnitude
+fall on the detector with Gaussian centroid noise. Some are missing. False stars are uniform over the frame,
+with the brightness of random true ones. The list is ordered by a magnitude with errors, as a detector
+measures it.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ PIXELS = 1024
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """What a list is like.
+    """Parameters of a list.
 
     Attributes:
-        field_deg: of view, edge to edge.
-        noise_px: of a centroid along either axis.
-        false_stars: number of them.
-        faintest: V of the faintest star that is seen.
-        magnitude_error: of the instrumental magnitudes, one sigma.
-        lost: part of the stars that is missing.
+        field_deg: field of view, edge to edge.
+        noise_px: noise of a centroid along either axis.
+        false_stars: number of false stars.
+        faintest: V of the faintest detected star.
+        magnitude_error: standard deviation of the instrumental magnitudes.
+        lost: fraction of the stars that is missing.
         order: "brightness", or "none" for a shuffled list without magnitudes.
-        known_deg: by which the field of view may differ from the believed one; None: see `searched_deg`.
+        known_deg: largest difference between true and assumed field of view; None: see `searched_deg`.
         distortion_px: radial distortion at the corner.
-        searched_deg: lowest and highest field of view believed possible where `known_deg` is None.
+        searched_deg: lowest and highest assumed field of view if `known_deg` is None.
         bright: whether the false stars are all brighter than the true ones.
-        mirrored: whether the image is left-right mirrored.
+        mirrored: whether the image is mirrored left to right.
     """
 
     field_deg: float = 12.0
@@ -59,12 +59,12 @@ class StarList:
     """One list and its truth.
 
     Attributes:
-        pixels: (n, 2) centroids (x, y).
-        magnitude: (n,) instrumental.
-        star: (n,) true guide stars, -1 for the false.
-        attitude: (4,) true, ICRS to camera.
-        camera: the true one.
-        kind: what it was drawn from.
+        pixels: centroids (n, 2), x and y.
+        magnitude: (n,), instrumental.
+        star: true guide stars (n,), -1 for false stars.
+        attitude: true attitude (4,), ICRS to camera.
+        camera: true camera.
+        kind: parameters of the list.
     """
 
     pixels: FloatArray
@@ -75,7 +75,7 @@ class StarList:
     kind: ListKind
 
     def field(self) -> StarField:
-        """Return the list as the star tracker is given it."""
+        """Return the list in the form that the star tracker takes."""
         believed_deg, scale = believed_field(self.kind)
         camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(believed_deg)))
         half = 0.5 * PIXELS / camera.focal_length
@@ -86,7 +86,7 @@ class StarList:
 
 
 def believed_field(kind: ListKind) -> tuple[float, tuple[float, float]]:
-    """Return the believed field of view in deg and the range of scale that goes with it."""
+    """Return the assumed field of view (deg) and the corresponding range of scale."""
     if kind.known_deg is None:
         low, high = kind.searched_deg
         believed = float(np.rad2deg(2.0 * np.arctan(np.sqrt(_tangent(low) * _tangent(high)))))
@@ -133,7 +133,7 @@ def draw(kind: ListKind, stars: GuideStars, rng: np.random.Generator) -> StarLis
 
 
 def draw_random(kind: ListKind, count: int, rng: np.random.Generator) -> StarList:
-    """Return a list of `count` stars strewn at random: no part of the sky."""
+    """Return a list of `count` stars at random positions, which show no part of the sky."""
     camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(kind.field_deg)))
     pixels = rng.uniform(-0.5, PIXELS - 0.5, (count, 2))
     magnitude = np.sort(kind.faintest - rng.exponential(1.0, count))
@@ -142,7 +142,7 @@ def draw_random(kind: ListKind, count: int, rng: np.random.Generator) -> StarLis
 
 
 def _distort(pixels: FloatArray, camera: Pinhole, corner: float) -> FloatArray:
-    """Return pixels moved outwards with the cube of their distance from the centre, by `corner` px there."""
+    """Return pixels with radial distortion: cubic in the distance, `corner` px at the corner."""
     centre = np.array(camera.centre)
     off = (pixels - centre) / (PIXELS / np.sqrt(2.0))
     return np.asarray(pixels + corner * off * np.sum(off**2, axis=-1, keepdims=True))

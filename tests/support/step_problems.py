@@ -36,7 +36,7 @@ class Problem:
         return plan(self.plant, *states, self.horizon, **options)
 
     def slew(self, horizon: float) -> Slew:
-        """Return the same slew for the oracle, over `horizon` s."""
+        """Return the same slew for the collocation oracle, over `horizon` s."""
         plant = self.plant
         return Slew(
             angle_of(self.start_q2),
@@ -56,7 +56,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class KnownOptimum:
-    """A problem of the data file with its optimum: J, and the shortest feasible horizon in s."""
+    """A problem of the data file with its optimum (J) and its shortest feasible horizon (s)."""
 
     problem: Problem
     energy: float
@@ -71,7 +71,7 @@ STEPS = [
 
 
 def known_optima() -> list[KnownOptimum]:
-    """Return the 20 problems of the data file; skips the test when it is missing."""
+    """Return the 20 problems of the data file; skip the test if it is missing."""
     if not OPTIMUM_FILE.exists():
         pytest.skip(f"{OPTIMUM_FILE.name}: the shared data folder is not beside the repository")
     content = json.loads(OPTIMUM_FILE.read_text())
@@ -102,7 +102,7 @@ def known_optima() -> list[KnownOptimum]:
 
 
 def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0, 20.0)) -> list[Problem]:
-    """Return slews drawn over the testbed's range, a third of them on a thread."""
+    """Return random slews over the testbed's range, a third of them on a thread."""
     rng = np.random.default_rng(seed)
     problems = []
     for _ in range(count):
@@ -124,9 +124,9 @@ def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0,
 def feasible_problems(
     count: int, seed: int, share: tuple[float, float] = (1.1, 2.5)
 ) -> list[tuple[Problem, float]]:
-    """Return slews whose horizon is `share` of the shortest feasible one, and that shortest horizon in s.
+    """Return slews with horizons of `share` times the shortest feasible one, and that shortest horizon (s).
 
-    A third each without and with two threads, a disturbance on half, a moving end on half.
+    A third each has no thread and two kinds of thread; half have a disturbance, and half a moving end.
     """
     rng = np.random.default_rng(seed)
     problems: list[tuple[Problem, float]] = []
@@ -142,7 +142,7 @@ def feasible_problems(
         factor = float(rng.uniform(*share))
         drawn = Problem(plant, start_q2, start_rate, end_q2, end_rate, 1.0)
         shortest = shortest_time(drawn.slew(1.0))
-        if 1.0 < shortest < 20.0:  # a slew of less than a second is none
+        if 1.0 < shortest < 20.0:  # a slew of less than a second is trivial
             problems.append((replace(drawn, horizon=factor * shortest), shortest))
     return problems
 

@@ -1,12 +1,13 @@
-"""The Cramer-Rao bound of streaks: no unbiased estimator has a smaller covariance.
+"""Cramer-Rao bound of streaks: no unbiased estimator has a smaller covariance.
 
-A pixel's electrons are Poisson, the read noise Gaussian; the Fisher information of parameters p is the sum
-over pixels of (dm/dp)(dm/dp)^T / (floor + m), with m the mean light and `floor` the variance of everything
-else (read noise squared, dark, rounding). The light is that of a point moving under a constant rate through
-a Gaussian integrated over each pixel, summed by Gauss-Legendre quadrature in time: exact to rounding, and
-independent of the faster model that the estimator fits. Every star's position, light and background are
-unknown, as is, on request, the common width of the point spread. Light of one star in another's pixels is
-left out, which makes the bound, if anything, optimistic.
+The electrons of a pixel are Poisson distributed, and the read noise is Gaussian. The Fisher information of
+parameters p is the sum over pixels of (dm/dp)(dm/dp)^T / (floor + m), with the mean signal m and the variance
+`floor` of all other noise (read noise squared, dark current, rounding). The signal is that of a point that
+moves under a constant rate, with a Gaussian point spread integrated over each pixel. It is summed by
+Gauss-Legendre quadrature in time, exact to rounding, and independent of the faster model that the estimator
+fits. Position, flux and background of every star are unknown; on request also the common width of the point
+spread. The signal of one star in the pixels of another is left out, which makes the bound too low, if
+anything.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import CameraMotion, paths, sensitivities
 
-# Parameters of one star's information: turn (3), point spread, then position (2), electrons, background.
+# Parameters of a star's information: rotation (3) and point spread; then position (2), electrons, background.
 _SHARED = 4
 _ALONE = 4
 _REACH_SIGMAS = 6.0
@@ -30,11 +31,11 @@ _PIECE = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateBound:
-    """The bound of one frame.
+    """Bound of one frame.
 
     Attributes:
-        covariance: (3, 3) rad^2/s^2, least covariance of the rate, camera frame.
-        positions: (n, 2, 2) px^2, least covariance of each star's pixel at mid-exposure.
+        covariance: smallest covariance (3, 3), rad^2/s^2, of the rate, camera frame.
+        positions: smallest covariance (n, 2, 2), px^2, of each star's position at mid-exposure.
     """
 
     covariance: FloatArray
@@ -51,10 +52,10 @@ def rate_bound(
     floor: float,
     fit_psf: bool = True,
 ) -> RateBound:
-    """Return the bound on the rate (3,) rad/s from stars at pixels `stars` (n, 2) at mid-exposure.
+    """Return the bound on the rate (3,), rad/s, from stars at pixels `stars` (n, 2) at mid-exposure.
 
-    `electrons` (n,) are of the whole exposure, `floor` e-^2 a pixel. Raises numpy.linalg.LinAlgError when
-    the stars do not fix the rate.
+    `electrons` (n,) are those of the whole exposure, and `floor` is in e-^2 per pixel. Raises
+    numpy.linalg.LinAlgError if the stars do not determine the rate.
     """
     motion = CameraMotion.steady(np.asarray(rate) * exposure)
     shared = np.zeros((_SHARED, _SHARED))
@@ -75,10 +76,10 @@ def rate_bound(
 def endpoint_bound(
     length: float, electrons: float, psf_sigma: float, floor: float, angle: float = 0.0, fit_psf: bool = False
 ) -> tuple[float, float]:
-    """Return the bound in px on one end of a lone straight streak, along it and across it.
+    """Return the bounds (px) on one end of an isolated straight streak, along it and across it.
 
-    Both ends, `electrons` and background are unknown; `angle` rad is of the streak to the rows. Averaged over
-    where the ends fall within a pixel.
+    Both ends, `electrons` and background are unknown. `angle` (rad) is that between streak and rows. The
+    bounds are averaged over the positions of the ends within a pixel.
     """
     phases = np.array([[0.0, 0.0], [0.3, 0.7], [0.5, 0.2], [0.8, 0.4]])
     variance = np.zeros(2)
@@ -88,7 +89,7 @@ def endpoint_bound(
         node, weight = _quadrature(length, psf_sigma)
         mean = np.asarray(phase)
         points = mean + length * node[:, None] * direction
-        # d(point)/d(first end, last end), each (x, y).
+        # d(point)/d(first end, last end), each (x, y)
         blend = np.zeros((len(node), 2, 4))
         blend[:, 0, 0] = blend[:, 1, 1] = 0.5 - node
         blend[:, 0, 2] = blend[:, 1, 3] = 0.5 + node
@@ -107,9 +108,9 @@ def endpoint_bound(
 def star_information(
     pinhole: Pinhole, motion: CameraMotion, star: FloatArray, electrons: float, psf_sigma: float, floor: float
 ) -> FloatArray:
-    """Return the Fisher information (8, 8) of turn (3) rad, PSF sigma px, x, y px, electrons, background.
+    """Return the Fisher information (8, 8) of rotation (3) rad, PSF sigma px, x, y px, electrons, background.
 
-    `star` (2,) is the pixel at mid-exposure; light off the detector gives no information.
+    `star` (2,) is the pixel at mid-exposure. Signal off the detector gives no information.
     """
     ends = paths(pinhole, motion, np.tile(star, (9, 1)), np.linspace(-0.5, 0.5, 9))
     length = float(np.sum(np.hypot(*np.diff(ends.position, axis=0).T)))
@@ -120,13 +121,13 @@ def star_information(
     images = _images(points, weight, change, psf_sigma, electrons, (pinhole.rows, pinhole.columns))
     if images.shape[1] == 0:
         return np.zeros((_SHARED + _ALONE, _SHARED + _ALONE))
-    # _images gives: changes (turn 3, x, y), point spread, electrons, background.
+    # Order of the result of _images: rotation (3), x, y, point spread, electrons, background.
     order = [0, 1, 2, 5, 3, 4, 6, 7]
     return _information(images, electrons, floor)[np.ix_(order, order)]
 
 
 def _quadrature(length: float, psf_sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return times (m,) from -1/2 to 1/2 and weights that sum to 1, dense enough for a path of `length`."""
+    """Return times (m,) from -1/2 to 1/2 and normalised weights for a path of `length` px."""
     pieces = max(1, math.ceil(length / (4.0 * psf_sigma)))
     node, weight = np.polynomial.legendre.leggauss(10)
     times = (np.arange(pieces)[:, None] + 0.5 * (node + 1.0)) / pieces - 0.5
@@ -141,10 +142,10 @@ def _images(
     electrons: float,
     shape: tuple[int, int] | None,
 ) -> FloatArray:
-    """Return (k + 3, pixels): d(light)/d(k path parameters, sigma, electrons, background).
+    """Return d(signal)/d(k path parameters, sigma, electrons, background), (k + 3, pixels).
 
-    The last row but one times `electrons` is the light itself. `points` (m, 2) carry `weight` (m,) of it and
-    move by `change` (m, 2, k).
+    The last row but one times `electrons` is the signal itself. The `points` (m, 2) carry fractions `weight`
+    (m,) of it, and move by `change` (m, 2, k).
     """
     reach = math.ceil(_REACH_SIGMAS * sigma) + 1
     low, high = np.floor(points.min(axis=0)).astype(int), np.ceil(points.max(axis=0)).astype(int)
@@ -154,7 +155,7 @@ def _images(
     if np.any(low > high):
         return np.zeros((change.shape[2] + 3, 0))
     rows = np.zeros((change.shape[2] + 3, high[1] - low[1] + 1, high[0] - low[0] + 1))
-    # Piece by piece along the path: a short piece's light is a small patch.
+    # The path is processed in short segments, because the signal of each fits a small patch.
     for start in range(0, len(points), _PIECE):
         piece = slice(start, start + _PIECE)
         near, far = points[piece].min(axis=0), points[piece].max(axis=0)
@@ -178,7 +179,7 @@ def _images(
 
 
 def _near_path(light: FloatArray) -> IntArray:
-    """Return the pixels that hold light worth counting: those of background only are left out."""
+    """Return the pixels with a significant signal."""
     peak = light.max(initial=0.0)
     return np.flatnonzero(light > peak * math.exp(-0.5 * (_REACH_SIGMAS - 1.0) ** 2))
 
@@ -186,7 +187,7 @@ def _near_path(light: FloatArray) -> IntArray:
 def _profile(
     pixels: FloatArray, place: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the share (m, p) of points' light on a line of pixels, and its change by place and sigma."""
+    """Return the fraction (m, p) of points' signal per pixel, and its derivatives by place and sigma."""
     right = (pixels + 0.5 - place[:, None]) / sigma
     left = (pixels - 0.5 - place[:, None]) / sigma
     bell_right = np.exp(-0.5 * right**2) / math.sqrt(2.0 * math.pi)
@@ -201,7 +202,7 @@ def _information(images: FloatArray, electrons: float, floor: float) -> FloatArr
 
 
 def _inverse(information: FloatArray) -> FloatArray:
-    """Return the inverse of an information matrix whose parameters differ in scale by many orders."""
+    """Return the inverse of an information matrix whose parameters have very different scales."""
     scale = np.sqrt(np.diag(information))
     if not np.all(scale > 0.0):
         raise np.linalg.LinAlgError("a parameter has no information")

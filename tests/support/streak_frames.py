@@ -1,7 +1,7 @@
-"""Simulated star frames for the tests of vision: their own authority, independent of the simulator's camera.
+"""Simulated star frames for the tests of vision, independent of the simulator's camera.
 
-Point stars fixed in the sky move as v' = -omega x v, are sampled along the motion at 0.1 px or finer, spread
-by a Gaussian integrated over each pixel (erf), and get photon, dark and read noise.
+Fixed point stars move as v' = -omega x v. They are sampled along the motion at 0.1 px or finer, spread by a
+Gaussian that is integrated over each pixel (erf), and get photon, dark and read noise.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.special import erf
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Pinhole
 
-# Stars on the whole sky brighter than V, Hipparcos.
+# Numbers of stars on the whole sky that are brighter than V (Hipparcos).
 _COUNTS_V = (6.0, 6.5, 7.0, 8.0, 8.5)
 _COUNTS = (4995.0, 8789.0, 15404.0, 41074.0, 61320.0)
 _CHUNK_PX = 10.0
@@ -24,7 +24,7 @@ _STEP_PX = 0.1
 
 @dataclass(frozen=True)
 class Camera:
-    """A star camera: electrons per second at magnitude 0, PSF sigma in px, noise in electrons."""
+    """A star camera: electrons per second at magnitude 0, PSF sigma (px), noise (electrons)."""
 
     pinhole: Pinhole
     zero_magnitude: float = 1.9e10 * np.pi / 4.0 * 0.025**2
@@ -38,20 +38,20 @@ class Camera:
 
 
 def star_camera(size: int = 1024, psf_sigma: float = 1.0) -> Camera:
-    """Return the demonstration's camera, or the middle `size` x `size` px of it: 20 deg are 1024 px."""
+    """Return the demonstration's camera, or its central `size` x `size` px; 20 deg are 1024 px."""
     whole = Pinhole.from_field_of_view(1024, 1024, np.deg2rad(20.0))
     return Camera(Pinhole(size, size, whole.focal_length), psf_sigma=psf_sigma)
 
 
 def rate_at(theta: float, speed: float, roll: float = 0.0) -> FloatArray:
-    """Return a rate (3,) of `speed` rad/s, axis at `theta` rad to the boresight; theta = pi/2 is +y."""
+    """Return a rate (3,) of `speed` rad/s with its axis `theta` (rad) off the boresight; pi/2 is +y."""
     return speed * np.array([np.sin(theta) * np.sin(roll), np.sin(theta) * np.cos(roll), np.cos(theta)])
 
 
 def random_stars(
     rng: np.random.Generator, pinhole: Pinhole, reach: float, faintest: float = 7.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Return directions (n, 3) and magnitudes (n,) to `faintest`, uniform on the field's cap of the sky."""
+    """Return directions (n, 3) and magnitudes (n,) to `faintest`, uniform over the cap of the field."""
     cap = min(pinhole.half_diagonal + reach, np.pi)
     part = 0.5 * (1.0 - np.cos(cap))
     on_sky = 10.0 ** np.interp(faintest, _COUNTS_V, np.log10(_COUNTS))
@@ -59,13 +59,13 @@ def random_stars(
     z = rng.uniform(np.cos(cap), 1.0, n)
     around = rng.uniform(0.0, 2.0 * np.pi, n)
     r = np.sqrt(1.0 - z**2)
-    # log10 of the counts grows by 0.49 a magnitude about V = 6.5: that slope, extended to the bright end.
+    # log10 of the counts grows by 0.49 per magnitude near V = 6.5; this slope is extended to bright stars.
     magnitudes = faintest + np.log10(rng.uniform(0.0, 1.0, n)) / 0.49
     return np.stack([r * np.cos(around), r * np.sin(around), z], axis=-1), magnitudes
 
 
 def rotate(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return where fixed stars (n, 3) go in the axes of a body that turned by `rotation` (3,) rad."""
+    """Return fixed stars (n, 3) in the axes of a body that has rotated by `rotation` (3,), rad."""
     angle = np.linalg.norm(rotation)
     if angle == 0.0:
         return vectors
@@ -78,14 +78,14 @@ def rotate(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def true_endpoints(camera: Camera, directions: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the pixels (n, 2, 2) of first and last instant of stars given at mid-exposure."""
+    """Return the pixels (n, 2, 2) at the first and last instant of stars that are given at mid-exposure."""
     first = camera.pinhole.project(rotate(directions, -0.5 * rotation))
     last = camera.pinhole.project(rotate(directions, 0.5 * rotation))
     return np.stack([first, last], axis=1)
 
 
 def deposit(image: FloatArray, path: FloatArray, electrons: float, sigma: float) -> None:
-    """Add `electrons` evenly over the points (m, 2) of `path`, each through a pixel-integrated Gaussian."""
+    """Add `electrons` uniformly over the points (m, 2) of `path`, each as a pixel-integrated Gaussian."""
     reach = int(np.ceil(6.0 * sigma))
     rows, columns = image.shape
     x0, y0 = np.floor(path.min(axis=0)).astype(int) - reach
@@ -107,10 +107,10 @@ def expose(
     exposure: float,
     growth: float = 0.0,
 ) -> FloatArray:
-    """Return the mean electrons (rows, columns) of stars (n, 3) while the camera turns by `rotation` (3,).
+    """Return the mean electrons (rows, columns) of stars (n, 3) while the camera rotates by `rotation` (3,).
 
-    `growth` is the change of the rate over the exposure as a part of its mean; `directions` belong to the
-    attitude half-way in angle.
+    `growth` is the relative change of the rate over the exposure. `directions` are those at the attitude
+    half-way in angle.
     """
     image = np.zeros((camera.pinhole.rows, camera.pinhole.columns))
     electrons = camera.zero_magnitude * 10.0 ** (-0.4 * magnitudes) * exposure
@@ -119,7 +119,7 @@ def expose(
     seen = camera.pinhole.contains(ends.mean(axis=1), margin=float(np.nanmax(length, initial=0.0)) + 10.0)
     for star in np.flatnonzero(seen):
         chunks = max(1, int(np.ceil(length[star] / _CHUNK_PX)))
-        # Half as many again: an arc is longer than its chord, and the speed varies along it.
+        # The number is half as large again, because an arc is longer than its chord and the speed varies.
         steps = chunks * int(np.ceil((1.5 + growth) * _CHUNK_PX / _STEP_PX)) if length[star] > 0.0 else 1
         time = (np.arange(steps) + 0.5) / steps - 0.5
         fraction = time + 0.5 * growth * (time**2 - 0.25)
@@ -150,7 +150,7 @@ def read_out(
     rng: np.random.Generator,
     dtype: npt.DTypeLike = np.uint16,
 ) -> Image:
-    """Return the frame of counts: photons and dark Poisson, read noise normal, pedestal, clipped, rounded."""
+    """Return the frame of counts, with photon, dark and read noise, pedestal, clipping and rounding."""
     drawn = rng.poisson(electrons + camera.dark * exposure).astype(float)
     drawn = np.minimum(drawn, camera.full_well) + camera.read_noise * rng.standard_normal(electrons.shape)
     top = min(camera.top, int(np.iinfo(dtype).max))
@@ -158,7 +158,7 @@ def read_out(
 
 
 def star_frame(camera: Camera, rate: FloatArray, exposure: float, seed: int, faintest: float = 7.5) -> Image:
-    """Return a random star field as seen at `rate` (3,) rad/s; the same for the same seed."""
+    """Return a frame of a random star field at a rate (3,), rad/s; `seed` determines it."""
     rng = np.random.default_rng(seed)
     rotation = rate * exposure
     directions, magnitudes = random_stars(rng, camera.pinhole, float(np.linalg.norm(rotation)), faintest)

@@ -14,7 +14,7 @@ from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
 from tests.support.earth_truth import sun_direction, sun_point
 
 K1 = -0.1
-"""Of the bench's lenses: it draws the corners in by 30 px."""
+"""Radial distortion of the lenses, which moves the corners inwards by 30 px."""
 
 
 CAMERAS: dict[str, tuple[EarthCameraModel, SunSettings]] = {
@@ -25,12 +25,12 @@ CAMERAS: dict[str, tuple[EarthCameraModel, SunSettings]] = {
         SunSettings(least_radius=np.radians(2.6), greatest_radius=np.radians(3.8)),
     ),
 }
-"""`overexposed` sees sea and haze bright and every cloud saturated."""
+"""Cameras by name; `overexposed` images sea and haze bright and every cloud saturated."""
 
 
 @dataclass
 class Outcome:
-    """A campaign's figures: errors in rad, normalised squares, statuses, CPU seconds of each frame."""
+    """Figures of a campaign: errors (rad), normalised squares, statuses, CPU time (s) of each frame."""
 
     errors: list[float] = field(default_factory=list)
     whole: list[float] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Outcome:
 
 
 def frames_with_sun(name: str, count: int, seed: int) -> Outcome:
-    """Return what `count` frames give whose Sun's centre is anywhere in the frame, Earth where it may be."""
+    """Return the results of `count` frames with the Sun's centre anywhere in the frame and a random Earth."""
     model, settings = CAMERAS[name]
     generator = np.random.default_rng(seed)
     outcome = Outcome()
@@ -62,7 +62,7 @@ def frames_with_sun(name: str, count: int, seed: int) -> Outcome:
 
 
 def frames_without_sun(name: str, count: int, seed: int) -> Outcome:
-    """Return what `count` frames of the sunlit limb give, the Sun 40 px or more outside the frame."""
+    """Return the results of `count` frames of the sunlit limb with the Sun 40 px or more outside."""
     model, settings = CAMERAS[name]
     generator = np.random.default_rng(seed)
 

@@ -1,8 +1,8 @@
-"""Frames of streaks by a renderer of its own: any point spread, any lens, any motion.
+"""Independent renderer of frames of streaks, for any point spread, lens and motion.
 
-The estimator's model and `sim_hal.star_camera` use one Gaussian point spread and analytic streaks. This one
-knows neither: points of light are laid along each star's path on a grid of three by three cells a pixel, the
-grid is convolved with a sampled point spread, and cells are added up to pixels.
+The estimator's model and `sim_hal.star_camera` use one Gaussian point spread and analytic streaks. This
+renderer uses neither. It lays points along each star's path on a grid of three by three cells per pixel,
+convolves the grid with a sampled point spread, and sums the cells of each pixel.
 """
 
 from __future__ import annotations
@@ -20,22 +20,25 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import Pinhole
 
 Cells = npt.NDArray[np.floating[Any]]
-"""Light (rows, columns) on a grid of cells."""
+"""Signal (rows, columns) on a grid of cells."""
 
 CELLS = 3
 """Cells along a pixel's side."""
 
 Spread = Callable[[FloatArray, FloatArray], FloatArray]
-"""Density of a point's light at (dx, dy) px from it; need not be normalised."""
+"""Density of a point's signal at (dx, dy) px from it, which need not be normalised."""
 
 _FINER = 5
 _APART = 0.15
-"""Points on a path are at most so far apart, px."""
+"""Largest distance (px) between points on a path."""
 _STARS_AT_ONCE = 64
 
 
 def gaussian(sigma: float, ratio: float = 1.0, angle: float = 0.0) -> Spread:
-    """Return an ellipse: axes sigma sqrt(ratio) and sigma / sqrt(ratio) px, the long at `angle` rad."""
+    """Return an elliptical Gaussian.
+
+    Its axes are sigma sqrt(ratio), at the angle `angle` (rad), and sigma / sqrt(ratio), px.
+    """
     cosine, sine = np.cos(angle), np.sin(angle)
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
@@ -52,7 +55,7 @@ def moffat(sigma: float, beta: float) -> Spread:
 
 
 def disc(diameter: float) -> Spread:
-    """Return a defocused point: a uniform disc, px, with a blur of 0.4 px."""
+    """Return a defocused point: a uniform disc of `diameter` px with a blur of 0.4 px."""
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
         return np.asarray(1.0 / (1.0 + np.exp((np.hypot(dx, dy) - 0.5 * diameter) / 0.15)))
@@ -61,7 +64,7 @@ def disc(diameter: float) -> Spread:
 
 
 def ring(diameter: float, hole: float) -> Spread:
-    """Return a point defocused by a telescope with a central obstruction: a disc, px, with a hole, px."""
+    """Return a defocused point of a telescope with a central obstruction: a disc (px) with a hole (px)."""
     whole, dark = disc(diameter), disc(hole)
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
@@ -71,7 +74,7 @@ def ring(diameter: float, hole: float) -> Spread:
 
 
 def halo(sigma: float, share: float, width: float) -> Spread:
-    """Return a Gaussian core with `share` of the light in a Gaussian of `width` px."""
+    """Return a Gaussian core plus a Gaussian of `width` px with the fraction `share` of the signal."""
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
         square = dx * dx + dy * dy
@@ -82,7 +85,7 @@ def halo(sigma: float, share: float, width: float) -> Spread:
 
 
 def coma(sigma: float, length: float, angle: float) -> Spread:
-    """Return a point with a tail: fainter and wider Gaussians along `angle` rad, up to `length` px away."""
+    """Return a point with a tail of fainter and wider Gaussians at `angle` (rad), up to `length` px away."""
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
         total = np.zeros(np.broadcast_shapes(dx.shape, dy.shape))
@@ -97,14 +100,14 @@ def coma(sigma: float, length: float, angle: float) -> Spread:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optics:
-    """What lies between the sky and the pixels.
+    """Optics of a camera.
 
     Attributes:
-        spreads: point spreads from the field's middle to its corner; between them light is mixed.
-        radius: px, beyond which a point has no light.
-        distortion: share of the radius by which the corner is moved outwards, with the radius' cube.
-        offset: px, of the optical axis from the detector's middle.
-        scintillation: rms of each star's brightness from stretch to stretch of its path.
+        spreads: point spreads from the centre of the field to its corner, between which the signal is mixed.
+        radius: distance (px) beyond which a point has no signal.
+        distortion: relative outward displacement of the corner, with the cube of the radius.
+        offset: distance (px) of the optical axis from the centre of the detector.
+        scintillation: rms of each star's brightness between segments of its path.
     """
 
     spreads: tuple[Spread, ...] = (gaussian(1.0),)
@@ -116,14 +119,14 @@ class Optics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """Stars: directions (n, 3) and the electrons (n,) that each gives over the exposure."""
+    """Stars: directions (n, 3), and electrons (n,) of each over the exposure."""
 
     directions: FloatArray
     electrons: FloatArray
 
 
 Attitudes = Callable[[FloatArray], FloatArray]
-"""Attitude (m, 4), sky into camera, at times (m,) in exposures from mid-exposure."""
+"""Function that returns attitudes (m, 4), sky to camera, at times (m,) in exposures from mid-exposure."""
 
 
 def light(
@@ -135,9 +138,9 @@ def light(
     delay: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Return the electrons (rows, columns) expected of a sky.
+    """Return the expected electrons (rows, columns) of a sky.
 
-    `length` px bounds the length of paths; `delay` is from row to row, in exposures (a rolling shutter).
+    `length` (px) bounds the length of paths. `delay` is the time between rows in exposures (rolling shutter).
     """
     layers = len(optics.spreads)
     grid: Cells = np.zeros((layers, CELLS * pinhole.rows, CELLS * pinhole.columns), dtype=np.float32)
@@ -153,8 +156,9 @@ def light(
         weight = np.full(place.shape[:2], 1.0) * sky.electrons[some, None] * (2.0 * room / count)
         if delay:
             late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
-            # Of the first and the last point of a path the part that is exposed: else stars of some rows
-            # would all be off by part of the way to the next point.
+            # The first and the last point of a path count by their exposed fraction. Otherwise stars of some
+            # rows
+            # would all be displaced by part of the distance to the next point.
             weight *= np.clip((0.5 - np.abs(late)) * count / (2.0 * room) + 0.5, 0.0, 1.0)
         if optics.scintillation:
             knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)
@@ -181,7 +185,7 @@ def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> Float
 
 
 def _lay(grid: Cells, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -> None:
-    """Add points of light, each shared by the four cells about it and by the layers about its radius."""
+    """Add points of light, each shared by the four nearest cells and by the two layers nearest in radius."""
     cell = CELLS * (place + 0.5) - 0.5
     corner = np.floor(cell).astype(np.int64)
     inside = ((corner >= 0) & (corner < np.array(grid.shape[:0:-1]) - 1)).all(axis=1)

@@ -1,4 +1,4 @@
-"""Lateness, lost slots, memory and waits are judged right from known samples."""
+"""Tests of lateness, lost slots, memory and waits with known samples."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_lost_slot_is_the_machines_only_when_the_bare_loop_lost_it_or_its_neig
     [
         (15, 20, True),
         (15, 10, False),
-        # Lateness of its own is not excused by the small load that is always present.
+        # The small load that is always present does not excuse the loop's own lateness.
         (90, 40, False),
         (90, 50, True),
     ],
@@ -82,7 +82,7 @@ def test_a_slot_is_the_hosts_when_it_took_what_makes_it_lost(
 
 
 def test_a_leak_is_seen_through_the_memory_of_jobs_that_come_and_go() -> None:
-    """Half of the samples hold a job of 50 MiB; the 95 % interval covers the truth for at least 16 seeds."""
+    """Half of the samples include a job of 50 MiB; 16 of the 95 % intervals or more cover the truth."""
     seconds = np.arange(0.0, 600.0, 0.5)
     held = {0.0: 0, 5.0: 0}
     for seed in range(20):
@@ -100,7 +100,7 @@ def test_a_flight_too_short_for_a_slope_has_none() -> None:
 
 
 def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> None:
-    """The nearest of three attempts counts, as shared pages change owners when other processes end."""
+    """The closest of three attempts counts, because shared pages change owners when other processes end."""
     me = {"me": os.getpid()}
     process_watch.unshared(me)  # includes the memory that sampling itself needs
     proportional, private = [], []
@@ -129,7 +129,7 @@ def test_a_slope_is_given_from_minutes_on_and_not_before() -> None:
 
 
 def test_a_cycle_that_waits_is_blocked_and_one_without_a_processor_is_queued() -> None:
-    """Cycles of 20 ms for 4 s, of which 2 ms are work: the rest is a worker's time, or the machine's."""
+    """Cycles of 20 ms for 4 s have 2 ms of work each; the rest is a worker's time, or that of the machine."""
     starts, execution = np.arange(0.0, 4.0, 0.025), np.full(160, 0.02)
 
     def found(on: float, queued: float) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The three satellites' sensors stand as the paper places them, and files that are wrong are refused."""
+"""Tests that the sensors of the three satellites are placed as in the paper; wrong files are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DOWN = np.array([0.0, 0.0, 1.0])
 
 
 def boresights(name: str) -> FloatArray:
-    """Return where the cameras look (n, 3), body axes."""
+    """Return the boresights (n, 3) of the cameras, body axes."""
     return np.array([camera.to_camera[2] for camera in suite(name).cameras])
 
 
@@ -26,7 +26,7 @@ def angles(first: FloatArray, second: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("name", SUITES)
 def test_every_camera_is_the_paper_s_and_its_picture_hangs_right(name: str) -> None:
-    """512 x 512 of 67 deg (sections 1 and 4); rows down towards nadir for every camera that is not above."""
+    """The cameras have 512 x 512 px over 67 deg; rows run to nadir, unless the camera looks up."""
     for camera in suite(name).cameras:
         assert (camera.columns, camera.rows, camera.field_of_view_deg) == (512, 512, 67.0)
         assert np.linalg.det(camera.to_camera) == pytest.approx(1.0)
@@ -36,7 +36,7 @@ def test_every_camera_is_the_paper_s_and_its_picture_hangs_right(name: str) -> N
 
 @pytest.mark.parametrize("name", ["vt", "uw"])
 def test_three_side_cameras_look_level_120_deg_apart(name: str) -> None:
-    """4.1, 4.2: flush with alternating sides; gaps of 53 deg between fields of 67."""
+    """Sections 4.1 and 4.2: the cameras are on alternate sides, with gaps of 53 deg between fields."""
     side = boresights(name)[:3]
     np.testing.assert_allclose(angles(side, side)[np.triu_indices(3, 1)], 120.0)
     np.testing.assert_allclose(side @ DOWN, 0.0, atol=1e-9)
@@ -50,24 +50,24 @@ def test_the_fourth_camera_of_uw_looks_out_of_the_top_and_vt_has_none() -> None:
 
 
 def test_vt_uses_its_cameras_for_the_earth_alone() -> None:
-    """Section 1: VT for Earth sensing alone, UW and USU for both."""
+    """Section 1: VT uses its cameras for the Earth only, UW and USU for both."""
     assert not any(camera.sun for camera in suite("vt").cameras)
     assert all(camera.sun for name in ("uw", "usu") for camera in suite(name).cameras)
 
 
 def test_the_cameras_of_usu_are_tipped_like_the_satellite() -> None:
-    """4.3: one 55 deg from nadir; the others turned by 45 deg either way, in the plane in which it tips."""
+    """Section 4.3: one camera is 55 deg from nadir, the others are 45 deg to either side of it."""
     middle, forward, aft = boresights("usu")
     assert angles(middle, DOWN) == pytest.approx(55.0)
     for other, turned in ((forward, 45.0), (aft, -45.0)):
-        # The part across the axis of the turn, y, has gone round by that angle.
+        # Rotation about y by that angle moves the component across the axis.
         found = np.degrees(np.arctan2(other[0], other[2]) - np.arctan2(middle[0], middle[2]))
         assert found == pytest.approx(turned)
         assert other[1] == pytest.approx(middle[1])
 
 
 def written(tmp_path: Path, old: str, new: str) -> Path:
-    """Write the suite VT with one text replaced; return its file."""
+    """Write the suite VT with one text replaced; return the file."""
     text = Path("config/sensors/vt.yaml").read_text()
     assert old in text
     path = tmp_path / "suite.yaml"

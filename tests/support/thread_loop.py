@@ -1,4 +1,4 @@
-"""A body on the thread, a filter and a controller at 40 Hz: enough of the loop for a controller's tests."""
+"""A body on the thread, a filter and a controller at 40 Hz, as a reduced loop for tests of controllers."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def fly(
     seed: int = 1,
     noise: float = 1.0,
 ) -> FloatArray:
-    """Return rows (t, theta, omega, current) of a flight with the testbed's noises times `noise`.
+    """Return rows (t, theta, omega, current) of a flight with `noise` times the noise of the testbed.
 
-    The filter believes in the plant without thread; the current in force is the command of the cycle before,
-    with the testbed's uncertainty.
+    The filter assumes the plant without thread. The present current is the command of the previous cycle,
+    with the uncertainty of the testbed.
     """
     rng = np.random.default_rng(seed)
     filter_ = SingleAxisFilter(BELIEVED, FilterSettings(2e-3, PERIOD, 5e-4))
@@ -67,11 +67,11 @@ def fly(
 
 
 def held(angle: float) -> Callable[[float], PathSample]:
-    """Want an attitude held."""
+    """Return the path of a constant angle."""
     return lambda _: PathSample(angle, 0.0, 0.0)
 
 
 def largest_error(rows: FloatArray, angle: float, last: float) -> float:
-    """Return the largest |theta - angle| in degrees over the last `last` s."""
+    """Return the largest |theta - angle| (deg) over the last `last` s."""
     tail = rows[rows[:, 0] > rows[-1, 0] - last, 1]
     return math.degrees(float(np.abs(tail - angle).max()))

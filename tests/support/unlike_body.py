@@ -1,4 +1,4 @@
-"""Flights whose true body differs from the configured one, and what their coil monitor said."""
+"""Flights whose true body differs from the configured one, and the judgement of their coil monitor."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
 
 
 def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -> Simulation:
-    """Return a world with other errors of the configuration's description, and perhaps a fault at `at` s."""
+    """Return a world with other errors of its description, and optionally a fault at `at` s."""
     entries = (FaultEntry(fault=fault, at=at),) if fault else ()
     return configuration.replace(world, seed=seed, faults=entries)
 
@@ -40,7 +40,7 @@ def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -
 def with_other_body(
     world: Simulation, moments: Sequence[float], axes_deg: float, seed: int, fault: str = ""
 ) -> Simulation:
-    """Return a world whose body has other principal moments (3,) kg m^2 and axes, and perhaps a fault."""
+    """Return a world whose body has other principal moments (3,), kg m^2, and axes, with any fault."""
     body = world.free_body
     assert body is not None
     craft = body.craft or CraftSection()
@@ -55,9 +55,9 @@ def with_other_body(
 
 
 def coil_judgement(flown: Run, broken: str) -> dict[str, Any]:
-    """Return which axes were judged, and when the `broken` one ("" for none) was named and corrected, s.
+    """Return the judged axes, and the times (s) at which the `broken` axis (or "") was named and corrected.
 
-    `flown_with` is the last factor of the broken coil's dipole, 1 if it was never corrected.
+    `flown_with` is the last factor on the broken coil's dipole, 1 without a correction.
     """
     isolated: dict[str, float] = {}
     named: dict[str, float] = {}

@@ -1,7 +1,7 @@
 """Every field of every packet, read by `space-packet-parser` from our XTCE and by our own reader.
 
-`python -m tests.support.xtce_fields RUN...` prints how many fields of the runs' logs are equal; exit
-status 1 when one differs, when a packet is not read, or when a shifted field is not noticed.
+`python -m tests.support.xtce_fields RUN...` prints the number of equal fields in the logs of the runs. The
+exit status is 1 if a field differs, a packet is not read, or a shifted field is not noticed.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _BY_APID = {layout.packet.apid: layout for layout in LAYOUTS.values()}
 
 
 def definition_of(text: str) -> XtcePacketDefinition:
-    """Return what the other client makes of an XTCE document."""
+    """Return the other client's definition of an XTCE document."""
     return XtcePacketDefinition.from_xtce(io.BytesIO(text.encode()))
 
 
 def compare(data: bytes, text: str) -> dict[str, int]:
-    """Return how many packets and fields of `data` were compared, how many differ, and how many are unread.
+    """Return the numbers of compared packets and fields of `data`, and of different and unread ones.
 
-    Of each packet also its sequence count, mission time and version are compared.
+    Sequence count, mission time and version of each packet are compared too.
     """
     definition = definition_of(text)
     rows = {name: iter(array) for name, array in scan(data).packets.items()}
@@ -57,7 +57,7 @@ def compare(data: bytes, text: str) -> dict[str, int]:
 
 
 def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
-    """Return the values of a packet by the names of the XTCE form, as our reader has them."""
+    """Return the values of a packet in our reader by their XTCE names."""
     sequence = int(layout.sequence_counts(raw)[0])
     values: dict[str, Any] = {
         "time_ns": int(row["time_ns"]),
@@ -79,7 +79,7 @@ def single_bits(field: Field, value: int) -> list[int]:
 
 
 def _alike(read: Any, wanted: Any) -> bool:
-    """Return whether the other client's value is ours; where there are names or scales its raw value is."""
+    """Return whether the other client's value is ours; named or scaled fields are compared as raw values."""
     if read is None:
         return False
     value = read if isinstance(wanted, str) else read.raw_value
@@ -89,7 +89,7 @@ def _alike(read: Any, wanted: Any) -> bool:
 
 
 def shifted(text: str) -> str:
-    """Return an XTCE document in which `imu` begins its second field a byte too late, and its CRC has one."""
+    """Return an XTCE document whose `imu` packet has its second field a byte too late and a CRC of one byte."""
     entry = '<ParameterRefEntry parameterRef="{}" />'
     before, after = text.split(entry.format("imu_device_time_ns"))
     pads = [

@@ -20,7 +20,7 @@ _ENDED = {"SUCCESSFUL", "FAILED", "CANCELLED"}
 
 
 class Operator:
-    """A connection to Yamcs, and what an operator does through it."""
+    """A connection to Yamcs with the actions of an operator."""
 
     def __init__(self, port: int, password: str) -> None:
         """Connect to Yamcs on a port of loopback."""
@@ -51,7 +51,7 @@ class Operator:
         return counts[-1]
 
     def run_stack(self, name: str) -> str:
-        """Run a command stack and return how it ended."""
+        """Run a command stack and return its final state."""
         definition = StackActivity(STACKS, f"{name}.ycs")._to_proto()
         path = f"/activities/{INSTANCE}/activities"
         found = activities_pb2.ActivityInfo()
@@ -78,7 +78,7 @@ class Operator:
         return alarm.severity, alarm.is_acknowledged, alarm.acknowledge_message
 
     def sent(self) -> list[str]:
-        """Return the names of the commands sent so far, the oldest first."""
+        """Return the names of the sent commands, the oldest first."""
         history = self._client.get_archive(INSTANCE).list_command_history()
         return [entry.name.rpartition("/")[2] for entry in history]
 

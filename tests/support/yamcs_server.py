@@ -1,4 +1,4 @@
-"""A Yamcs process, and what a study asks of it by its HTTP interface; both on loopback alone."""
+"""A Yamcs process and its HTTP interface, both on loopback only."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _TROUBLE = ("WARNING", "SEVERE", "Exception")
 
 
 def troubles(log: str) -> list[str]:
-    """Return the lines of a log that warn or worse."""
+    """Return the lines of a log that are warnings or worse."""
     return [line for line in log.splitlines() if any(word in line for word in _TROUBLE)]
 
 
 @contextmanager
 def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
-    """Start Yamcs on a configuration, yield it when it answers, and end it. Its log is `folder/log`."""
+    """Start Yamcs with a configuration, yield it when it answers, and end it. Its log is `folder/log`."""
     log = folder / "log"
     compile_link(folder)
     with log.open("w") as out:
@@ -48,7 +48,7 @@ def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
 
 
 def basic(password: str) -> str:
-    """Return the header by which the user states a password."""
+    """Return the HTTP header with the user's password."""
     return "Basic " + base64.b64encode(f"{USER}:{password}".encode()).decode()
 
 
@@ -69,7 +69,7 @@ class Yamcs:
     credentials: str
 
     def wait(self) -> None:
-        """Wait until the instance runs. Raises RuntimeError with the end of its log where it does not."""
+        """Wait until the instance runs. Raises RuntimeError with the end of its log if it does not."""
         until = time.monotonic() + _START_S
         while time.monotonic() < until and self.process.poll() is None:
             try:
@@ -119,7 +119,7 @@ class Yamcs:
         return self.raw(f"/archive/{INSTANCE}:exportPackets")
 
     def values(self, names: list[str]) -> Iterator[dict[str, Any]]:
-        """Yield name, generation time and raw value of each archived value of some parameters."""
+        """Yield name, generation time and raw value of each archived value of the named parameters."""
         ids = [{"name": f"/{SPACE}/{name}"} for name in names]
         text = self.raw(f"/archive/{INSTANCE}:streamParameterValues", {"ids": ids}).decode()
         decoder, at = json.JSONDecoder(), 0
