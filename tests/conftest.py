@@ -20,15 +20,16 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# As `python -m flight` does: OpenBLAS's waiting threads would take a third of the tests' processor time.
+# `python -m flight` sets the same value: OpenBLAS's waiting threads would take a third of the processor time.
 # No test imports numpy before this file is read, and started programs inherit the setting.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# The tests hold the numpy forms to their requirements, and the compiled forms to the numpy forms: recorded
-# results stay the same bytes, and no started program loads numba.
+# The tests compare the numpy forms with their requirements, and the compiled forms with the numpy forms:
+# recorded results stay the same bytes, and no started program loads numba.
 os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 
-# No test may fail because the machine is busy, or because hypothesis draws a rare example in one run of many.
-# The examples are the same in each run, so that more of them cost time in each run and find nothing new.
+# No test may fail because the machine is busy, or because hypothesis draws a rare example in one of many
+# runs.
+# Each run has the same examples, so more of them would cost time in each run and find nothing.
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("explore", deadline=None, max_examples=100)
 settings.load_profile("repeatable")
@@ -60,10 +61,10 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Import the tests in one worker process after another, and never search them for garbage.
+    """Import the tests in one worker process after another, without garbage collection.
 
-    In a new clone the first worker compiles each module and keeps its bytecode, which the others load. If all
-    imported at the same time, each would compile all modules.
+    In a new clone the first worker compiles each module and stores its bytecode, which the others load.
+    Otherwise each worker would compile all modules.
     """
     gc.disable()
     with Path(__file__).open(encoding="utf-8") as turn:
@@ -74,7 +75,7 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that measures."""
+    """Add the option that measures the times of the tests."""
     parser.addoption("--write-slow-list", action="store_true", help=f"write {LIST.name} from this run")
 
 
@@ -95,7 +96,7 @@ def _seconds(path: Path) -> dict[str, float]:
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Measure a test's processor time and duration, its fixtures and child processes included."""
+    """Measure a test's processor time and duration, including its fixtures and child processes."""
     begun, clock = _processor_s(), time.monotonic()
     yield
     name, spent = _function(item), _processor_s() - begun
@@ -105,7 +106,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write both lists when asked to."""
+    """Write both lists if requested."""
     if session.config.getoption("--write-slow-list"):
         slow = sorted(f"{name} {spent:.1f}" for name, spent in _spent.items() if spent > LIMIT_S)
         LIST.write_text("\n".join(slow) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A clock for tests of parts without a world: it stands still until it is moved."""
+"""A clock for tests of parts without a world, which stands still until it is advanced."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from sim_hal.clock import SimClock
 
 
 class ManualClock(SimClock):
-    """A SimClock that starts at a second and can be moved by a span."""
+    """A SimClock that starts at one second and can be advanced by a span."""
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         super().__init__(start_ns=start_ns)
 
     def advance(self, span_ns: int) -> None:
-        """Let a span pass, running every job that falls due in it."""
+        """Advance the clock, and run every job that falls due."""
         self.sleep_until_ns(self.now_ns() + span_ns)

@@ -1,6 +1,6 @@
-"""Processor time in seconds of an ordinary machine, so that a slow or busy one fails no limit.
+"""Processor time, scaled to a standard machine, so that limits also hold on slow or busy machines.
 
-Each measurement is divided by what short vector additions take on the machine just before and after it.
+Each measurement is divided by the time of short vector additions just before and after it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def warm_call(name: str, call: Callable[[], Result]) -> tuple[Result, float]:
 
 
 def ordinary_seconds(work: Callable[[], object], runs: int = 3) -> float:
-    """Return the least processor time of several runs of `work`, s; on a slower machine, scaled down."""
+    """Return the smallest processor time (s) of several runs of `work`, scaled down on a slower machine."""
     spans = []
     for _ in range(runs):
         before = pace_s()

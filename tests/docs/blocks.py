@@ -1,7 +1,7 @@
-"""The code blocks of the documentation, and their marks.
+"""Code blocks of the documentation, and their marks.
 
-A block of commands (`sh` or `console`) is run by a test, unless the line before it is a comment
-`<!-- run by: PATH -->`, which names the test that runs its commands, or `<!-- not run: REASON -->`.
+A test runs a block of commands (`sh` or `console`), unless the line before it is a comment `<!-- run by: PATH
+-->`, which names the test that runs its commands, or `<!-- not run: REASON -->`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Block:
 
     @property
     def commands(self) -> list[str]:
-        """The commands, without prompts, comments and continuations; [] for a block of another language."""
+        """Commands without prompts, comments and continuations; empty for a block of another language."""
         if self.language not in {"sh", "console"}:
             return []
         lines = self.text.replace("\\\n", " ").splitlines()
@@ -40,7 +40,7 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """Return every page that a person reads as documentation."""
+    """Return every page of the documentation for readers."""
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 

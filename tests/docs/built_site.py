@@ -1,8 +1,8 @@
-"""Checks the built site: `python -m tests.docs.built_site build/site`; exit status 1 for any fault.
+"""Checks the built site: `python -m tests.docs.built_site build/site`; the exit status is 1 for any fault.
 
-The pages must be readable without a network, so no page may load anything from another host. Links to
-follow are allowed. Where Chromium is installed, the search of the site is tried on a page that is opened as a
-file: guides must stand before pages of modules.
+The pages must be readable without a network, so no page may load a file from another host. Links are allowed.
+If Chromium is installed, the search of the site is tested on a page that is opened as a file: guides must
+come before pages of modules.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FIRST_FOUND = {
     "renewal": "fly/renewal.html",
     "day of operations": "fly/day-of-operations.html",
 }
-"""Searched words, and the page that must stand first among the results."""
+"""Searched words, and the page that must be the first result."""
 _LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href", "object": "data"}
 _OTHER_HOST = re.compile(r"^(https?:)?//")
 _STYLE_URL = re.compile(r"(?:url\(|@import)\s*[\"']?((?:https?:)?//[^\"')\s]+)")
@@ -33,7 +33,7 @@ _STILL_OPEN = {"decisions/libraries-tried.html", "search/search_index.json"}
 
 
 class _Loads(HTMLParser):
-    """Collects what a page loads by itself, and its code blocks that a script of another host would draw."""
+    """Parser that collects what a page loads, and its code blocks that a script would have to render."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,7 +73,8 @@ def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> 
         for words, right in first_found.items():
             page.goto((site.resolve() / "index.html").as_uri())
             page.click(".md-search__input")
-            # All words at once: the results of the first letters would still be on the page.
+            # All words are entered at once. Otherwise the results of the first letters would remain on the
+            # page.
             page.fill(".md-search__input", words)
             page.keyboard.press("End")  # the page reads the words when a key is released
             page.wait_for_selector(item, timeout=60_000)

@@ -33,7 +33,7 @@ def shortened(line: str) -> str:
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder that looks like the project's, where commands may write."""
+    """Return a folder with the project's files, in which commands may write."""
     folder = tmp_path_factory.mktemp("home")
     for name in ("config", "deploy", "tests"):
         (folder / name).symlink_to(ROOT / name)
@@ -44,7 +44,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(line: str, folder: Path) -> None:
-    """Run a line: `knightcube` without a shell's characters in this process, every other line in a shell."""
+    """Run a line: `knightcube` without shell characters in this process, every other line in a shell."""
     words = shlex.split(line)
     if words[0] == "knightcube" and not set(line) & set("|>&;$*"):
         here = command(*words[1:], folder=folder)
@@ -67,7 +67,7 @@ def run(line: str, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(RUNNABLE))
 def test_the_command_lines_of_a_page_work(page: str, home: Path) -> None:
-    """Runs them in the order of the page. The fixture has flown the demonstration already."""
+    """Run the command lines in the order of the page. The fixture has flown the demonstration."""
     for block in blocks():
         if block.page == page and not block.mark:
             for line in block.commands:
@@ -96,7 +96,7 @@ def test_commands_in_a_block_without_a_language_are_found() -> None:
 
 
 def test_the_collector_finds_commands_and_their_marks() -> None:
-    """One block is to be run; the other is marked, and indented in a list."""
+    """One block must be run; the other is marked, and indented in a list."""
     text = "```sh\nmake a  # why\n# only a remark\nmake b \\\n  c\n```\n\n1. x\n\n"
     text += "    <!-- not run: no need -->\n    ```console\n    $ make d\n    output\n    ```\n"
     first, second = blocks_of(text)
@@ -105,7 +105,7 @@ def test_the_collector_finds_commands_and_their_marks() -> None:
 
 
 def mentions() -> set[tuple[str, str]]:
-    """Return (module, first argument) of every `python -m ...` on the pages, within text as well."""
+    """Return (module, first argument) of every `python -m ...` on the pages, also within text."""
     found = set()
     for path in pages():
         for module, word in re.findall(r"python -m ([\w.]+)(?: ([\w-]+))?", path.read_text(encoding="utf-8")):

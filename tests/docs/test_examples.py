@@ -63,7 +63,7 @@ def test_an_extension_changes_few_files(name: str, most: int) -> None:
 
 
 def test_the_star_tracker_solves_the_image_of_its_example() -> None:
-    """Alnilam, HIP 26311, V 1.69, stands near the middle of the field that the script draws."""
+    """Alnilam, HIP 26311, V 1.69, is near the centre of the field that the script renders."""
     script = str(EXAMPLES / "star_tracker.py")
     printed = run([script], ROOT).stdout.splitlines()
     assert printed[0] == "right ascension  84.050 deg"
@@ -72,7 +72,7 @@ def test_the_star_tracker_solves_the_image_of_its_example() -> None:
 
 
 def test_own_pictures_of_any_kind_are_solved_or_refused_with_a_reason(tmp_path: Path) -> None:
-    """The same stars in grey, in colour, mirrored and as FITS, a picture without stars, and a text file."""
+    """Test the same stars in four formats, a picture without stars, and a text file."""
     pillow = pytest.importorskip("PIL.Image", reason="needs Pillow, the extra `images`")
     frame = sky_frame(np.random.default_rng(31), 0.0, 0.2)
     bright = (frame.pixels / frame.pixels.max() * 255.0).astype(np.uint8)
@@ -148,7 +148,7 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> None:
-    """Feedback alone leaves the angle by which the thread turns the body: k theta / (J w^2)."""
+    """Feedback alone leaves the angle by which the thread deflects the body: k theta / (J w^2)."""
     printed = run([str(EXAMPLES / "pointing_body.py")], ROOT).stdout
     found = re.search(r"pointing error ([\d.]+) deg", printed)
     assert found is not None
@@ -169,7 +169,7 @@ NUMBER = re.compile(r"[+-]?\d+\.?\d*")
     ],
 )
 def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script: str) -> None:
-    """The words are equal, and the numbers to two units of their last digit: processors round differently."""
+    """The words are equal, and the numbers agree to two units of their last digit (rounding)."""
     printed = printed_by(script).rstrip()
     text = (ROOT / "docs" / "library" / f"{page}.md").read_text(encoding="utf-8")
     shown = text.partition("It prints:\n\n```\n")[2].partition("\n```")[0]
@@ -180,7 +180,7 @@ def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script:
 
 
 def test_the_examples_find_what_they_have_drawn() -> None:
-    """Each script prints its result beside the value that it has put into the image."""
+    """Each script prints its result beside the true value of the image."""
     streaks = printed_by("streak_rate")
     rate, true = (np.array(text.split(), dtype=float) for text in re.findall(r"\[([^\]]+)\]", streaks)[:2])
     sigma = np.array(re.findall(r"1 sigma +\[([^\]]+)\]", streaks)[0].split(), dtype=float)

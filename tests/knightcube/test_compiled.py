@@ -38,7 +38,7 @@ def test_the_variable_selects_the_numpy_form(monkeypatch: pytest.MonkeyPatch) ->
     "numba", ["", "raise ImportError('Numba needs NumPy 2.4 or less')"], ids=["missing", "unfit"]
 )
 def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Path) -> None:
-    """Numba refuses to be imported beside a numpy that is too new for it."""
+    """Numba refuses its import if numpy is too new."""
     (tmp_path / "numba.py").write_text(numba, encoding="utf-8")
     hidden = "" if numba else "sys.modules['numba'] = None\n"
     code = (
@@ -52,7 +52,7 @@ def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Pat
 
 
 def test_compilation_is_announced_and_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
-    """The file is truncated in any way that a full disk or a lost supply may leave."""
+    """The file is truncated, as by a full disk or a power failure."""
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     environment = {
         **os.environ,
@@ -97,7 +97,7 @@ def test_arrays_that_numba_does_not_know_are_left_to_numpy(
 
 @pytest.mark.parametrize("module", ["knightcube", "flight.__main__", "knightcube.vision.star_tracker"])
 def test_an_import_does_not_load_numba(module: str) -> None:
-    """Numba takes a third of a second and 100 MB, which a command that finds no stars should not pay."""
+    """Numba takes a third of a second and 100 MB, which other commands need not spend."""
     code = f"import sys, {module}; sys.exit('numba' in sys.modules)"
     subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, "KNIGHTCUBE_COMPILED": "1"}, timeout=100, check=True

@@ -37,12 +37,12 @@ def path_of_modes(run: Run) -> list[tuple[Mode, str]]:
 
 
 def modes_of(run: Run) -> list[Mode]:
-    """Return the modes entered."""
+    """Return the entered modes."""
     return [mode for mode, _ in path_of_modes(run)]
 
 
 def entered(run: Run, mode: Mode) -> float:
-    """Return the mission time, s, at which a mode was entered last."""
+    """Return the mission time (s) at which a mode was last entered."""
     return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][-1]) * 1e-9
 
 

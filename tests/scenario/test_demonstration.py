@@ -139,7 +139,7 @@ def _assert_streaks_right(run: Run, moving: int) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
-    """Off the grid of frames: at rest for a part of the exposure, then faster and faster."""
+    """The frames are off the usual grid: the body is at rest for a part of the exposure, then accelerates."""
     config = demo_config(44.0)
     steps = tuple(
         configuration.replace(config.steps[0], at=at, q2=q2)
@@ -162,7 +162,7 @@ def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, Any]) -> None:
-    """5 V at the bus and 3.4 V at the coils carry one current; the monitor is read once a second."""
+    """The same current flows at 5 V at the bus and 3.4 V at the coils; the monitor is read once a second."""
     power = summary["power"]
     assert power["bus_average_w"] == pytest.approx(power["supply_average_w"] * 5.0 / 3.4, rel=0.05)
 

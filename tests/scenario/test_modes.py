@@ -170,8 +170,8 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
     config = configuration.replace(config, guidance=configuration.replace(config.guidance, strategy=strategy))
     run = fly(config, tmp_path, prepare, section=released(-0.2, 0.0))
     assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
-    # The demonstration has until its path's end, or as long without one. In a hold nothing is waited for but
-    # that the filter gives its estimate up.
+    # In the demonstration the timeout starts at the end of its path, or after the same time without a path. In
+    # a hold it starts when the filter discards its estimate.
     since = 10.0 if initial == "testbed-demo" else 4.0 + AttitudeFilter.REJECTIONS_TO_RESTART * CYCLE
     assert entered(run, Mode.SAFE) == pytest.approx(since + BRIEF["hold_patience"], abs=0.1)
     assert "hold-impossible" in event_names(run)
@@ -182,7 +182,7 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
 def test_what_the_demonstration_is_on_its_way_to_and_a_target_that_moves_are_not_impossible_to_hold(
     tmp_path: Path,
 ) -> None:
-    """It is 0.8 rad off at first, for longer than a hold's patience; at the end the target is 0.68 rad on."""
+    """The error is 0.8 rad for longer than the timeout of a hold; the last target is 0.68 rad away."""
     config = configuration.replace(commanded(27.0), steps=(Step(at=0.0, q2=-0.2, rate=0.04),))
     run = fly(config, tmp_path)
     assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO]

@@ -29,7 +29,7 @@ SLEWS = 64_535
 """Initial number of commanded slews, at the end of its range."""
 
 _OF_OBJECTS = {"sightings", "track"}
-"""Packets of a flight with objects in its field."""
+"""Packets of a flight with objects in its field of view."""
 
 Driven = dict[tuple[str, str], bool]
 

@@ -1,7 +1,7 @@
 """Tests that a KnightCube finds an object in its frames, follows it, and keeps it while the camera is blind.
 
-`config/orbit_object_1u.yaml`, its frames rendered, through vision, track, planner and coils. The true motion
-of the object is integrated in this module.
+The flight of `config/orbit_object_1u.yaml` has rendered frames, and runs vision, track, planner and coils.
+The true motion of the object is integrated in this module.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def test_the_coils_are_at_zero_while_the_unit_is_silent(flown: Run) -> None:
 
 
 def test_the_coils_pause_while_the_magnetometer_measures(flown: Run) -> None:
-    """The last 0.1 s of each pause of 0.2 s, behind the fall of the current."""
+    """The magnetometer is read in the last 0.1 s of each pause of 0.2 s, after the decay of the current."""
     time = flown["truth"]["time_ns"] * 1e-9
     began = entered_first(flown, Mode.DETUMBLE)
     phase = (time - began) % 4.0

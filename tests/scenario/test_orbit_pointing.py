@@ -17,7 +17,7 @@ from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
 DURATION, SUNWARD = 52.0, 47.0
-"""s: the flight, and when the mode SUN is commanded."""
+"""Times (s): duration of the flight, and command of the mode SUN."""
 SPEED = 0.001
 """Largest rate (rad/s), equal to the orbital rate."""
 WITHIN = 12.0
@@ -26,7 +26,7 @@ WITHIN = 12.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Fly from near rest: the target is the attitude of the release, as an inertial one."""
+    """Return a flight from near rest; its target is the attitude at release, as an inertial target."""
     section = skyward()
     assert section.free_body is not None
     attitude = section.free_body.release.attitude
@@ -65,7 +65,7 @@ def test_it_stays_near_its_target(flown: Run) -> None:
 
 
 def test_the_coils_act_and_pause_for_the_magnetometer(flown: Run) -> None:
-    """A tenth of the time is pause."""
+    """The coils pause for a tenth of the time."""
     truth = flown["truth"]
     time = truth["time_ns"] * 1e-9
     inside = (time > entered(flown, Mode.POINT) + 4.0) & (time < DURATION)

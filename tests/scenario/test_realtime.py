@@ -94,7 +94,7 @@ def test_a_killed_flight_leaves_a_readable_log_and_no_processes(tmp_path: Path) 
 
 
 def _descendants(parent: int) -> list[int]:
-    """Return the processes below `parent`, from the kernel's own lists."""
+    """Return the descendants of the process `parent`, from the kernel's lists."""
     found: list[int] = []
     for task in Path(f"/proc/{parent}/task").glob("*/children"):
         for child in task.read_text().split():

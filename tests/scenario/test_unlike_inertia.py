@@ -37,7 +37,7 @@ def _flown(folder: Path, duration: float, fault: str) -> Run:
 
 
 def test_moments_two_percent_off_isolate_no_healthy_coil(tmp_path: Path) -> None:
-    """Of this flight the believed inertia alone made coils y and z look reversed, at 48 and 88 s."""
+    """With the assumed inertia alone, coils y and z of this flight would seem reversed, at 48 and 88 s."""
     found = coil_judgement(_flown(tmp_path, 95.0, ""), "")
     assert found["healthy_isolated"] == []
     assert found["healthy_suspected"] == found["healthy_corrected"] == []

@@ -13,7 +13,7 @@ from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import CONFIG, event_names, fly
 
 DURATION, SETTLED = 30.0, 15.0
-"""s."""
+"""Duration (s) of the flight, and time (s) from which the attitude must be fine."""
 
 
 @pytest.fixture(scope="module")

@@ -84,7 +84,7 @@ def test_the_strings_are_read_over_the_coils_bus(lock: LockStep) -> None:
         lock.clock.sleep_until_ns(2 * SECOND_NS)
         reading = strings.latest()
         assert reading is not None
-        assert reading.currents.max() > 0.25  # one of six faces stands within 55 deg of the Sun
+        assert reading.currents.max() > 0.25  # one of six faces is within 55 deg of the Sun
         assert strings.error() == ""
 
 

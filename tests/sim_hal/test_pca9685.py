@@ -12,7 +12,7 @@ ADDRESS = 0x41
 
 
 class Bench:
-    """One chip on a bus, fresh from power-on."""
+    """One chip on a bus, in its state after power-on."""
 
     def __init__(self) -> None:
         self.clock = ManualClock()
@@ -35,7 +35,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Bench:
-    """Make a fresh chip."""
+    """Return a new chip."""
     return Bench()
 
 
@@ -106,7 +106,8 @@ def test_all_led_registers_write_all_channels(bench: Bench) -> None:
         (0x1000, 0x0000, 1.0),  # full ON
         (0x1000, 0x1000, 0.0),  # full OFF wins
         (409, 1228, 819 / 4096),  # data sheet example 1: 10 % delay, 20 % duty
-        (3685, 3275, 3686 / 4096),  # example 2: 90 % delay, 90 % duty, across the period's end
+        # data sheet example 2: 90 % delay, 90 % duty, beyond the end of the period
+        (3685, 3275, 3686 / 4096),
         (0, 4095, 4095 / 4096),
         (4095, 0, 1 / 4096),
     ],

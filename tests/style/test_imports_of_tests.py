@@ -1,4 +1,4 @@
-"""Imports among tests: product tests share helper modules, and import neither studies nor other tests."""
+"""Tests of imports among tests: product tests share helpers, and import neither studies nor other tests."""
 
 from __future__ import annotations
 

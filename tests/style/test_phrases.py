@@ -1,4 +1,4 @@
-"""No text of the repository contains a phrase that readers had to decode: see `REFUSED`."""
+"""Tests that no text contains a refused phrase (`REFUSED`), which readers cannot understand easily."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 EXEMPT = ("tests/style/test_phrases.py", "tests/studies/same_bytes/renamed_texts.yaml")
-"""This file, and the texts that former versions wrote."""
+"""This file, and the texts of former versions."""
 
 REFUSED = {
     r"(?<!there )\b(?:is|are|was|were) no\b(?! (?:longer|more|less|fewer|later|earlier)\b)": "is not a ...",
@@ -36,7 +36,7 @@ REFUSED = {
 
 ANY = re.compile("|".join(REFUSED))
 BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"\b") for pattern in REFUSED))
-"""`REFUSED` without what must stand before a phrase: found more often, and six times as fast."""
+"""`REFUSED` without the conditions on preceding text: matches more often, and is six times as fast."""
 GAPS = str.maketrans('#"_', "   ")
 
 TEXT_TOKENS = (tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING))
@@ -83,7 +83,7 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
 
 
 def may_have_any(text: str) -> bool:
-    """Return whether a text has a refused phrase if code counts as text: most files have none."""
+    """Return whether a text may have a refused phrase, with code counted as text; most files have none."""
     flat = " ".join(text.lower().translate(GAPS).split())
     return bool(BEGINS.search(flat) and ANY.search(flat))
 

@@ -157,8 +157,7 @@ def light(
         if delay:
             late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
             # The first and the last point of a path count by their exposed fraction. Otherwise stars of some
-            # rows
-            # would all be displaced by part of the distance to the next point.
+            # rows would all be displaced by part of the distance to the next point.
             weight *= np.clip((0.5 - np.abs(late)) * count / (2.0 * room) + 0.5, 0.0, 1.0)
         if optics.scintillation:
             knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)

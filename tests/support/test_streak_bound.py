@@ -37,8 +37,7 @@ def test_a_star_at_rest_is_bounded_as_a_gaussian_spot_of_photons_is() -> None:
     """With photon noise only and fine pixels, the centre of a spot is known to sigma / sqrt(N)."""
     end = endpoint_bound(200.0, 1e9, 3.0, 1e-6)
     # Across a bright streak with two free ends, the offset of the line is known to sigma / sqrt(N), and an
-    # end
-    # of a straight line with free tilt to twice that.
+    # end of a straight line with free tilt to twice that.
     assert end[1] == pytest.approx(2.0 * np.hypot(3.0, np.sqrt(1.0 / 12.0)) / np.sqrt(1e9), rel=0.02)
 
 

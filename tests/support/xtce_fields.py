@@ -89,7 +89,7 @@ def _alike(read: Any, wanted: Any) -> bool:
 
 
 def shifted(text: str) -> str:
-    """Return an XTCE document whose `imu` packet has its second field a byte too late and a CRC of one byte."""
+    """Return an XTCE document whose `imu` has its second field a byte too late and a CRC of one byte."""
     entry = '<ParameterRefEntry parameterRef="{}" />'
     before, after = text.split(entry.format("imu_device_time_ns"))
     pads = [

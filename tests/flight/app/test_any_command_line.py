@@ -23,7 +23,7 @@ from tests.support.damaged import chances, damage
 from tests.support.flights import TEXT
 
 SERVING = {"console", "files", "gateway", "link", "watch", "camera"}
-"""Commands that serve, or wait for something, until they are ended."""
+"""Commands that serve or wait until they are ended."""
 SLOW = {"index", "identify", "samples", "run"}
 """Commands that compute for seconds or simulate a run."""
 NAMES = sorted({**cli.COMMANDS, **GROUND_COMMANDS}.keys() - SERVING - SLOW)

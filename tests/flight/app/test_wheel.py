@@ -62,7 +62,7 @@ def _installed(home: Path, wheels: list[Path], packages: Path) -> Path:
     python = home / "bin" / "python"
     install = [*PIP, "--python", python, "install", "--no-compile", *ALONE, *wheels]
     subprocess.run(install, check=True, timeout=60)
-    # A .pth in a folder that a .pth adds is not read: an editable installation stays out.
+    # Python ignores .pth files in a folder that a .pth file adds, so an editable installation is not found.
     (site,) = home.glob("lib/python*/site-packages")
     (site / "others.pth").write_text(f"{packages}\n", encoding="utf-8")
     return home

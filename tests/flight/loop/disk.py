@@ -15,7 +15,7 @@ Names = dict[Path, int]
 
 
 class PowerLostError(BaseException):
-    """The machine is off. Simulated power loss. It is not an OSError, so that no software can catch it."""
+    """Simulated power loss. It is not an OSError, so that no software can catch it."""
 
 
 @dataclass

@@ -430,12 +430,12 @@ def wander(rng: np.random.Generator, samples: int) -> FloatArray:
 
 
 def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
-    """2,388 readings as made by the driver, seed 11: none is suspected.
+    """No coil is suspected in 2,388 driver readings (seed 11).
 
-    Each with a gain within 15 %, an error within the thesis's 3.5 mA on every driven coil in every cycle, and
-    the monitor's steps; single conversions miss the chopped current by 18 %. Without a suspicion in N
-    readings, the rate of suspicions is below 3 / N at 95 % confidence. Only suspicions of a single axis
-    become a verdict.
+    The gains are within 15 %. Every driven coil has an error within the thesis's 3.5 mA in every cycle, and
+    the readings have the resolution of the monitor. Single ADC samples differ from the chopped current by 18
+    %. Without a suspicion in N readings, the rate of suspicions is below 3 / N at 95 % confidence. Only
+    suspicions of a single axis become a verdict.
     """
     rng = np.random.default_rng(11)
     suspected = readings = 0

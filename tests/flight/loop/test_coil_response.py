@@ -197,7 +197,7 @@ def test_a_coil_that_makes_no_torque_is_found_at_currents_too_small_for_the_moni
 
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
-    """In the second case, a false gyro or field is more likely."""
+    """In the second case, a wrong gyro or field is the more likely cause."""
     body = Orbiting(np.full(3, gain), speed=0.02)
     body.fly(120.0, weak=True)
     assert body.watch.suspicion == ""

@@ -1,7 +1,4 @@
-"""Rate groups keep to their grid with any clock.
-
-The executive runs groups in order, survives their failures and never bursts.
-"""
+"""Tests that rate groups keep to their grid with any clock, survive failures and never burst."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Tests that the transition table is complete and that each mode, and SAFE from each mode, can be reached.
-
-The transition table is complete, every mode can be reached, and safe from everywhere.
-"""
+"""Tests that the transition table is complete and that each mode, and SAFE from each mode, can be reached."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Tests that a flight process stores whether it ended cleanly or by an exception.
-
-A flight remembers how it ended: cleanly, or with an exception passing through.
-"""
+"""Tests that a flight process stores whether it ended cleanly or by an exception."""
 
 from __future__ import annotations
 

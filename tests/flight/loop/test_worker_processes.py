@@ -56,7 +56,7 @@ def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:
 
 @pytest.fixture(scope="module")
 def processes() -> Iterator[ProcessRunner]:
-    """Return workers for all tests here: each of them leaves every worker idle, or replaced."""
+    """Yield workers for all tests of this module; each test leaves every worker idle or replaced."""
     more = [worker("hang", hang), worker("die", die), worker("function", function)]
     runner = ProcessRunner(SystemClock(), [*WORKERS, *more])
     yield runner

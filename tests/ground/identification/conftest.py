@@ -1,4 +1,4 @@
-"""Flights that several tests look at, flown once."""
+"""Flights that several tests use; each is flown once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Identified = tuple[World, Record, PlantFit]
 
 
 def _identified() -> str:
-    """Return four drawn worlds, flown on the bare testbed and fitted, as text."""
+    """Return four random worlds, flown on the bare testbed and fitted, as text."""
     rng = np.random.default_rng(20)
     worlds = [drawn(rng) for _ in range(4)]
     records = [fly_bare(world, 85.0) for world in worlds]
@@ -30,7 +30,7 @@ def _identified() -> str:
 
 @pytest.fixture(scope="session")
 def identified(session_folder: Path) -> list[Identified]:
-    """Return four drawn worlds with their flights and fits, which one process of the session makes."""
+    """Return four random worlds with their flights and fits, which one process of the session computes."""
     found: list[Identified] = pickle.loads(
         base64.b64decode(made_once(session_folder, "identified", _identified))
     )

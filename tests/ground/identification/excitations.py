@@ -1,4 +1,4 @@
-"""Excitations that several tests of the identification share."""
+"""Excitations for several tests of the identification."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fit finds the simulated truth within its stated uncertainty, and reports when it cannot."""
+"""Tests that the fit finds the simulated truth within its stated uncertainty, or reports that it cannot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NOISE = noise_of(believed())
 
 
 def chi_square(found: list[Identified], off: float = 1.0) -> float:
-    """Return the sum over all worlds for gain, torsion and damping; `off` spoils the true gain."""
+    """Return the sum over all worlds for gain, torsion and damping; `off` changes the true gain."""
     total = 0.0
     for world, _, made in found:
         error = motion_error(replace(world, dipole=world.dipole * off), made.constants)
@@ -40,7 +40,7 @@ def chi_square(found: list[Identified], off: float = 1.0) -> float:
 
 
 def test_the_truth_lies_within_the_stated_uncertainty_in_all_worlds(identified: list[Identified]) -> None:
-    """Chi-square of 4 worlds x 3 constants, 99.8 % band; a gain half a percent off would be noticed."""
+    """Chi-square of 4 worlds x 3 constants in its 99.8 % band, which a gain error of 0.5 % would exceed."""
     low, high = chi2.ppf([0.001, 0.999], 3 * len(identified))
     assert low < chi_square(identified) < high
     assert chi_square(identified, off=1.005) > high
@@ -78,7 +78,7 @@ def test_a_delay_of_the_coils_is_distinguished_from_the_torque() -> None:
 
 
 def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
-    """Ten samples of a body held still, then the release: an impulse that no constant explains."""
+    """The body is held for ten samples and then released, an impulse that no constants explain."""
     record = fly_bare(USUAL, 40.0)
     held = np.arange(len(record.time)) < 10
     noise = record.angle - np.where(held, 0.3, record.angle)
@@ -92,7 +92,7 @@ def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
 
 
 def test_coloured_noise_is_noticed_and_the_uncertainty_grows() -> None:
-    """An attitude error that lasts half a second, as a filter inside the unit makes it."""
+    """The attitude error lasts half a second, like that of a filter inside the unit."""
     record = fly_bare(USUAL, 40.0)
     rng = np.random.default_rng(8)
     drift = 0.3 * lfilter([1.0], [1.0, -0.95], rng.standard_normal(len(record.time)))
@@ -158,7 +158,7 @@ QUIET = MotionNoise(current=1e-9, angle=2e-3, rate=1e-4)
 
 
 def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
-    """Return an exact record of a body under random currents, by scipy's integrator."""
+    """Return the exact record of a body under random currents, integrated by scipy."""
     time = np.asarray(np.arange(round(seconds / 0.025)) * 0.025, dtype=np.float64)
     current = np.repeat(np.random.default_rng(4).uniform(-0.09, 0.09, len(time) // 20 + 1), 20)[: len(time)]
     switch: FloatArray = time + 0.011
@@ -175,7 +175,7 @@ def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
     states = [state]
     for begin, end in itertools.pairwise(time.tolist()):
         for span in ((begin, begin + 0.017), (begin + 0.017, end)):
-            middle = 0.5 * sum(span)  # within a part the current does not change
+            middle = 0.5 * sum(span)  # the current is constant within a segment
             solution = solve_ivp(lambda _, s, m=middle: motion(m, s), span, state, rtol=1e-11, atol=1e-13)
             state = solution.y[:, -1]
         states.append(state)
@@ -185,7 +185,7 @@ def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
 
 
 def test_a_noiseless_motion_is_predicted_to_a_thousandth_of_the_noise() -> None:
-    """Against scipy's integrator at 1e-11; the switches fall between the samples."""
+    """Compare with scipy's integrator at 1e-11; the switching times are between the samples."""
     passed = innovations(noiseless(TRUE), TRUE, QUIET)
     assert np.max(np.abs(passed.error[:, 0])) < 1e-3 * 2e-3
     assert np.max(np.abs(passed.error[:, 1])) < 1e-3 * 1e-4
@@ -193,7 +193,7 @@ def test_a_noiseless_motion_is_predicted_to_a_thousandth_of_the_noise() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_gradient_is_that_of_the_predictions(name: str) -> None:
-    """Central differences of the whole pass, to a thousandth."""
+    """Compare with central differences of the whole prediction, to a thousandth."""
     record = noiseless(TRUE, 6.0)
     size = 1e-5 if name in ("disturbance", "bias") else 1e-4
     there, back = (

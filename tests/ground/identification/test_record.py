@@ -1,4 +1,4 @@
-"""The record of a flight through the whole stack: what it takes from the log, and what it leaves."""
+"""Tests of the identification record of a flight: which data it takes from the log, and which it omits."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_through_drivers_loop_and_log_the_truth_lies_within_the_uncertainty(tmp_
 def altered(
     run: Run, packet: str, keep: npt.NDArray[np.bool_] | slice = slice(None), **columns: npt.NDArray[Any]
 ) -> Run:
-    """Return a run with columns of a packet replaced, and only the rows `keep` of it."""
+    """Return a run with some columns of a packet replaced, and only its rows `keep`."""
     array = run.flight.packets[packet].copy()
     for name, values in columns.items():
         array[name] = values
@@ -93,7 +93,7 @@ def test_without_commands_the_coil_falls_to_zero_as_the_driver_lets_it(short: Ru
 
 
 def test_the_field_is_taken_only_while_the_coils_are_off(short: Run) -> None:
-    """A coil that is on lies beside the magnetometer: 10 % more field then must not be seen."""
+    """A driven coil is beside the magnetometer, so a field that is 10 % stronger must have no effect."""
     control, imu = short["control"], short["imu"]
     quiet = control["current_written"].copy()
     quiet[800:, 0] = 0.0
@@ -137,7 +137,7 @@ def test_values_that_no_flight_writes_are_reported_as_damage(
     values = short[packet][field].copy()
     values[len(values) // 2] = value
     damaged = altered(short, packet, **{field: values})
-    if field == "sample_time_ns":  # of no consequence while the unit's clock runs on
+    if field == "sample_time_ns":  # irrelevant while the unit's clock runs
         damaged = altered(damaged, "imu", device_time_ns=values)
     with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
         recorded(damaged)

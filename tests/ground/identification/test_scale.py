@@ -1,4 +1,4 @@
-"""The scale: what motion cannot show comes from belief and magnetometer, with an uncertainty that is true."""
+"""Tests of the scale: prior and magnetometer determine what motion does not, with a correct uncertainty."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def scaled(found: PlantFit, prior: PlantPrior, field: float | None) -> AbsoluteP
 
 
 def test_over_many_worlds_the_uncertainty_of_all_constants_is_true(identified: list[Identified]) -> None:
-    """Worlds drawn from the belief, their motion known as from a flight: mean chi-square in its band."""
+    """Worlds are drawn from the prior with known motion; the mean chi-square must be in its band."""
     rng = np.random.default_rng(3)
     _, _, made = identified[0]
     squares, keep = [], [0, 1, 2, 4, 5]
@@ -85,7 +85,7 @@ def test_without_a_magnetometer_the_field_is_as_uncertain_as_believed_and_says_s
 
 
 def test_the_share_of_the_prior_is_how_much_the_answer_follows_it(identified: list[Identified]) -> None:
-    """A belief moved by 1 % moves the answer by its share of 1 %."""
+    """A prior that is changed by 1 % changes the result by its share of 1 %."""
     world, _, made = identified[0]
     before = scaled(made, PRIOR, world.field)
     moved = replace(PRIOR, inertia=replace(PRIOR.inertia, value=PRIOR.inertia.value * 1.01))

@@ -1,4 +1,4 @@
-"""Testbeds unlike the believed one, drawn as the configuration says they may be, and flights in them."""
+"""Testbeds that differ from the configured one by the stated accuracies, and flights in them."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from tests.support import flights
 
 PERIOD = 0.025
 ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3
-"""Of uniform noise: on the angle, which is twice q2, on the rate, and on the current in a coil that is on."""
+"""Bounds of the uniform noise of the angle (twice q2), of the rate, and of the current in a driven coil."""
 
 
 @dataclass(frozen=True)
 class World:
-    """The true constants: `dipole` is n A per commanded ampere, `magnetometer` its scale."""
+    """True constants: `dipole` is n A per commanded ampere, `magnetometer` its scale."""
 
     inertia: float
     dipole: float
@@ -48,7 +48,7 @@ class World:
 
     @property
     def constants(self) -> MotionConstants:
-        """The constants per inertia."""
+        """Constants divided by the inertia."""
         return MotionConstants(
             gain=self.dipole * self.field / self.inertia,
             torsion=self.stiffness / self.inertia,
@@ -58,12 +58,12 @@ class World:
 
 
 def believed() -> TestbedConfig:
-    """Return the configuration that is believed in."""
+    """Return the configuration that the flight software assumes."""
     return flights.demo_config(200.0, camera=False)
 
 
 def drawn(rng: np.random.Generator) -> World:
-    """Draw a world: scale as believed with the stated errors, a thread of up to three times the usual."""
+    """Return a random world: a scale with the stated errors, and a thread of up to three times the usual."""
     config = believed()
     plant = config.plant
 
@@ -83,7 +83,7 @@ def drawn(rng: np.random.Generator) -> World:
 
 
 def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
-    """Run the excitation with drivers, loop and log; a wrong coil resistance stands for the wrong dipole."""
+    """Run the excitation with drivers, loop and log; a wrong coil resistance represents the wrong dipole."""
     config = excitation_config(believed(), duration)
     resistance = config.coils.resistance[0] * config.plant.coil_turns * config.plant.coil_area / world.dipole
     section: Simulation = configuration.replace(
@@ -96,13 +96,13 @@ def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
     record = read_record(flights.fly(config, folder, section=section), config.coils.stale_after)
     if record.field is None:
         return record
-    # The emulated magnetometer has no error of scale.
+    # The emulated magnetometer has no scale error, so it is applied here.
     field = replace(record.field, magnitude=record.field.magnitude * world.magnetometer)
     return replace(record, field=field)
 
 
 def usual_excitation() -> ExcitationSettings:
-    """Return the excitation of a configuration that says nothing of it."""
+    """Return the default excitation."""
     move = Identification()
     return ExcitationSettings(move.current_share, move.largest_q2, move.swing)
 
@@ -110,7 +110,7 @@ def usual_excitation() -> ExcitationSettings:
 def fly_bare(
     world: World, duration: float = 100.0, settings: ExcitationSettings | None = None, noise: float = 1.0
 ) -> Record:
-    """Fly the excitation on the bare testbed: no wires, no filter; `noise` scales all of it."""
+    """Run the excitation on the bare testbed without drivers and filter; `noise` scales all noise."""
     rng = np.random.default_rng(world.seed)
     plant = plant_of(believed())
     controller = ExcitationController(plant, PERIOD, settings or usual_excitation())
@@ -148,12 +148,12 @@ def fly_bare(
 
 
 def motion_error(world: World, constants: MotionConstants) -> FloatArray:
-    """Return found less true gain, torsion and damping (3,)."""
+    """Return estimated minus true gain, torsion and damping (3,)."""
     return np.asarray(constants.to_array() - world.constants.to_array())[:3]
 
 
 def scale_error(world: World, plant: AbsolutePlant) -> FloatArray:
-    """Return found less true ln J, ln n A, ln B, ln g, torsion, damping (6,): what `covariance` is of."""
+    """Return estimated minus true ln J, ln n A, ln B, ln g, torsion, damping (6,), as in `covariance`."""
     true = world.constants
     gain = plant.torque_constant.value / plant.inertia.value
     return np.array(

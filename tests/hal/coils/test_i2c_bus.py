@@ -1,4 +1,4 @@
-"""Both buses keep the contract of hal.interfaces.wires.I2cBus; Linux's also opens, bounds and reopens."""
+"""Tests of the contract of hal.interfaces.wires.I2cBus with both buses, and of Linux's timeouts."""
 
 from __future__ import annotations
 

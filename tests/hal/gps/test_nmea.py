@@ -47,7 +47,7 @@ class Line:
         raise AssertionError("the driver only listens")
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing, because no file is open."""
 
 
 def read(*chunks: bytes) -> tuple[list[GpsReading], NmeaReceiver]:

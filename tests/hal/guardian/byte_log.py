@@ -24,7 +24,7 @@ class ByteLog:
             log.write(f"{time.monotonic_ns()} {address} {register} {value}\n")
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing, because no file stays open."""
 
 
 def open_bus(where: str) -> ByteLog:

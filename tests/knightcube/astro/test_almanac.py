@@ -32,7 +32,7 @@ SECOND = "2 25544  51.6400 200.0000 0005000 100.0000 260.0000 15.50000000539990"
 
 
 def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
-    """The Sun of the simulator is good to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
+    """The Sun of the simulator is accurate to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
     for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
         apparent, distance = apparent_sun(date, np.zeros(3), np.zeros(3))
         almanac = sun_position(terrestrial_time(date))

@@ -1,4 +1,4 @@
-"""Quaternion algebra against matrices, finite differences and scipy's Rotation."""
+"""Tests of quaternion algebra against matrices, finite differences and scipy's Rotation."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_attitude_matrix_is_eulers_formula(axis: FloatArray, angle: float) -> No
 
 
 def test_a_turn_about_z_carries_the_frame_with_it() -> None:
-    """After +90 degrees about z the body's x lies along the reference's y, which so reads (1, 0, 0)."""
+    """After +90 degrees about z the body's x axis is the reference's y axis, so y reads (1, 0, 0)."""
     q = quaternion.from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi]))
     assert _close(quaternion.attitude_matrix(q) @ [0.0, 1.0, 0.0], np.array([1.0, 0.0, 0.0]))
 
@@ -148,7 +148,7 @@ def test_derivative_is_the_limit_of_small_turns(q: FloatArray, rate: FloatArray)
 def test_a_fixed_star_moves_with_minus_omega_cross_v(
     q: FloatArray, rate: FloatArray, star: FloatArray
 ) -> None:
-    """The sign of the rate is tested by the derivative alone."""
+    """The derivative alone determines the sign of the rate."""
     h = 1e-6
     ahead = quaternion.normalise(q + h * quaternion.derivative(q, rate))
     behind = quaternion.normalise(q - h * quaternion.derivative(q, rate))

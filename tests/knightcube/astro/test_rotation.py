@@ -1,4 +1,4 @@
-"""The quaternion algebra of tuples of floats is that of arrays."""
+"""Tests that the quaternion algebra of tuples of floats equals that of arrays."""
 
 from __future__ import annotations
 

@@ -24,9 +24,10 @@ _PERIOD = 1.0
 
 
 def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the squared error over its covariance of direction and of rate, two degrees each, a frame.
+    """Return the NEES of direction and of rate (two degrees of freedom each) of each frame.
 
-    `sigma` rad of a sighting, and half of it of the attitude; `known`: the gravity gradient is.
+    `sigma` (rad) is that of a sighting, and half of it that of the attitude. `known`: the gravity gradient is
+    known.
     """
     motion = MotionModel()
     state = None
@@ -54,7 +55,7 @@ def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> t
 
 @pytest.mark.parametrize("known", [False, True])
 def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
-    """Chi-square of the normalised errors of 60 passes, each taken at its end: 120 degrees of freedom."""
+    """The sum of the NEES of 60 passes at their ends is a chi-square with 120 degrees of freedom."""
     rng = np.random.default_rng(16)
     times = np.arange(0.0, 24.0, _PERIOD)
     place, rate = [], []
@@ -63,13 +64,13 @@ def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
         places, rates = _nees(flown, rng, _SIGMA, known)
         place.append(places[-1])
         rate.append(rates[-1])
-    # 99 % and more of chi-square(120) / 60 lies within 1.25 and 2.9.
+    # The 99 % interval of chi-square(120) / 60 is within 1.25 and 2.9.
     assert 1.25 < np.mean(place) < 2.9
     assert 1.25 < np.mean(rate) < 2.9
 
 
 def test_the_gravity_gradient_takes_the_tides_out_of_a_minute_s_prediction() -> None:
-    """Of ten passes within 250 km, integrated beside it: on a straight line 1.2e-3 rad and more off."""
+    """In ten passes within 250 km, an extrapolation along a straight line is 1.2e-3 rad or more off."""
     rng = np.random.default_rng(9)
     times = np.arange(0.0, 60.5, 2.0)
     for _ in range(10):
@@ -117,7 +118,7 @@ def test_a_track_ends_when_its_object_stays_away() -> None:
     for index, time in enumerate(flown.times):
         seen = flown.directions[index : index + 1] if time < 8.0 else np.zeros((0, 3))
         ends += [time for _ in tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE))[1]]
-    # Seen at 7 s for the last time, and looked for with each frame.
+    # The last sighting is at 7 s, and the search continues with each frame.
     assert ends == [7.0 + TrackSettings().coast + 1.0]
     assert tracker.objects == ()
 
@@ -126,7 +127,7 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
     rng = np.random.default_rng(5)
     times = np.arange(0.0, 30.0, 1.0)
     slow = a_pass(rng, np.radians(0.1), times, 15.0).directions
-    # The same sky, mirrored about a plane through the first one's middle: the paths cross there.
+    # The same sky, mirrored at a plane through the middle of the first path, where both paths cross.
     middle = slow[15]
     normal = np.cross(middle, slow[16])
     normal /= np.linalg.norm(normal)
@@ -145,7 +146,7 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
 
 
 def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None:
-    """Where they meet, to 3 px, the frame shows one, of both lights and between them. Twenty pairs."""
+    """Where they meet, to 3 px, the frame shows one object with the flux of both. Twenty pairs."""
     rng = np.random.default_rng(77)
     times = np.arange(0.0, 30.0, 1.0)
     for _ in range(20):
@@ -170,7 +171,7 @@ def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None
 
 
 def _turn_onto(start: FloatArray, end: FloatArray, roll: float) -> FloatArray:
-    """Return the matrix (3, 3) that turns `start` to `end` and then about it."""
+    """Return the matrix (3, 3) that rotates `start` to `end` and then about it."""
     across = np.cross(start, end)
     turn = np.arctan2(np.linalg.norm(across), start @ end) * across / np.linalg.norm(across)
     both = multiply(from_rotation_vector(-roll * end), from_rotation_vector(-turn))

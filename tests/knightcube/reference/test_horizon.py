@@ -29,7 +29,7 @@ PAPER_POINTS = np.array([[258.0, 128.0], [215.0, 256.0], [200.0, 384.0]])
 
 def test_the_papers_three_points_give_its_circle_to_its_digits() -> None:
     circle = fit_circle(PAPER_POINTS)
-    # Printed (837.17, 393.79) and 637.3; in full 837.1786, 393.7905, 637.2538.
+    # The paper states (837.17, 393.79) and 637.3; the full values are 837.1786, 393.7905, 637.2538.
     assert circle.centre == pytest.approx([837.1786, 393.7905], abs=5e-5)
     assert circle.radius == pytest.approx(637.2538, abs=5e-5)
     assert np.floor(100.0 * circle.centre) / 100.0 == pytest.approx([837.17, 393.79])
@@ -38,7 +38,7 @@ def test_the_papers_three_points_give_its_circle_to_its_digits() -> None:
 
 
 def test_scan_lines_with_the_papers_edges_lead_to_the_papers_circle() -> None:
-    """Dark sky, bright Earth from the printed pixels on, noise, a star and a dark cloud gap on the way."""
+    """The line has a dark sky, a bright Earth from the published pixels on, noise, a star and a dark gap."""
     generator = np.random.default_rng(3)
     lines = generator.normal(12.0, 3.0, (3, 512))
     for line, (start, _) in zip(lines, PAPER_POINTS, strict=True):
@@ -87,9 +87,9 @@ def test_points_on_no_circle_are_refused(points: FloatArray, complaint: str) -> 
 
 ALTITUDE = 380e3
 FOCAL = 386.77
-"""px: 512 across 67 deg."""
+"""Focal length (px): 512 px across 67 deg."""
 CAMERAS = (
-    # Boresight along body x: right is body y; along body y: right is minus x. Rows run down along body z.
+    # Boresight along body x: right is body y; along body y: right is -x. Rows run down along body z.
     LevelCamera(np.array([0.0, 1.0]), (255.5, 255.5)),
     LevelCamera(np.array([-1.0, 0.0]), (255.5, 255.5)),
 )
@@ -97,12 +97,12 @@ BORESIGHTS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def _seen_circle(camera: LevelCamera, boresight: FloatArray, nadir: FloatArray) -> HorizonCircle:
-    """Return the circle through three limb points at the picture's middle, projected exactly."""
+    """Return the circle through three limb points at the image centre, projected exactly."""
     right = np.array([*camera.right, 0.0])
     down = np.array([0.0, 0.0, 1.0])
     cosine = np.sqrt(1.0 - (6_371_008.8 / (6_371_008.8 + ALTITUDE)) ** 2)
     x = np.array([-20.0, 0.0, 20.0]) / FOCAL
-    # (b + x r + y d) . n = cosine |b + x r + y d|, solved for y by bisection.
+    # Bisection for y in (b + x r + y d) . n = cosine |b + x r + y d|.
     low, high = np.full(3, -2.0), np.full(3, 5.0)
     for _ in range(80):
         y = 0.5 * (low + high)
@@ -122,7 +122,7 @@ def test_two_level_cameras_show_a_small_tilt(tilt_deg: tuple[float, float]) -> N
 
 
 def test_the_horizon_plane_lies_below_by_the_tangents_projection() -> None:
-    """At 380 km the limb is 2,233 km away and dips 19.3 deg (errata, 4.1): 739 km below."""
+    """At 380 km the limb is 2,233 km away and 19.3 deg below the horizontal (errata, 4.1): 739 km lower."""
     assert horizon_plane_depth(ALTITUDE) == pytest.approx(2_233e3 * np.sin(np.radians(19.32)), rel=1e-3)
 
 
@@ -133,7 +133,7 @@ def test_cameras_that_look_the_same_way_are_refused() -> None:
 
 
 def test_nadir_is_carried_on_by_the_rotation_of_a_sight() -> None:
-    """The shortest rotation is about an axis normal to the sight: for such a turn equation (6) is exact."""
+    """The shortest rotation has an axis normal to the line of sight, for which equation (6) is exact."""
     before = np.array([0.0, 0.0, 1.0])
     rotation = turn(np.array([0.02, -0.01, 0.0]))
     nadir = np.array([0.1, 0.9, 0.3])

@@ -35,7 +35,7 @@ def _stars(seed: int, noise: float, half_deg: float = 10.0) -> tuple[FloatArray,
     ("axis", "limits"), [((0, 0, 1), (0.01,)), ((1, 0, 0), (200, 8)), ((0.6, 0.8, 0), (200, 8))]
 )
 def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limits: tuple[float, ...]) -> None:
-    """A roll about the boresight of 1 deg is exact at once; a tilt of 1 deg leaves arcseconds at first."""
+    """A roll of 1 deg about the boresight is exact after one step; a tilt of 1 deg leaves arcseconds."""
     observed, reference, true = _stars(3, 0.0)
     prior = multiply(from_rotation_vector(np.radians(1.0) * np.array(axis)), true)
     for steps, limit in enumerate(limits, start=1):
@@ -46,7 +46,7 @@ def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limit
 
 
 def test_noisy_stars_give_the_attitude_of_the_q_method_within_its_uncertainty() -> None:
-    """The plane weighs stars at the edge of 20 deg by up to 1.06 more than the sphere does."""
+    """The plane gives stars at the edge of 20 deg up to 1.06 times the weight that the sphere gives."""
     for seed in range(10):
         observed, reference, _ = _stars(100 + seed, SIGMA)
         optimal = SOLVERS["davenport"](observed, reference, np.full(15, SIGMA))

@@ -67,7 +67,7 @@ def drawn(seed: int) -> StarList:
 
 
 def check_identified(name: str) -> None:
-    """Compare what a method finds on lists of the sky and of no sky with the record."""
+    """Compare the results of a method on lists of the sky and on random lists with the record."""
     found = [METHODS[name].identify(drawn(seed).field(), sky()) for seed in (1, 2)]
     found.append(METHODS[name].identify(draw_random(kind(), 12, np.random.default_rng(3)).field(), sky()))
     check(__file__, f"identified {name}", found)
@@ -83,7 +83,7 @@ def test_the_identification_by_a_classical_method_is_as_recorded(name: str) -> N
 
 
 def moving(seed: int) -> tuple[StarList, FloatArray, StarMotion]:
-    """Return a list of stars, their directions and their motion, of which one is wrong."""
+    """Return a list of stars, their directions and their motion; the motion of one star is wrong."""
     one = drawn(seed)
     rng = np.random.default_rng(seed)
     direction = one.field().direction

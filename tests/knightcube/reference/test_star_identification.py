@@ -41,7 +41,7 @@ LISTS = 8
 
 @lru_cache(maxsize=1)
 def _sky() -> KnownSky:
-    """Return the guide stars of a 15 deg field; the default method's triangles stay empty."""
+    """Return the guide stars of a 15 deg field, without the triangles of the default method."""
     stars = choose_guide_stars(load(), 7.0, 2026.5, float(np.deg2rad(40.0 / 3600.0)))
     none = TriangleIndex(np.zeros(0, np.uint32), np.zeros((0, 3), np.uint16), np.zeros((0, 2), np.uint8))
     half = float(np.tan(np.deg2rad(7.5)))
@@ -59,12 +59,12 @@ def _drawn(kind: ListKind, seed: int) -> list[StarList]:
 
 
 def _right(answer: StarMatch, drawn: StarList) -> bool:
-    """Tell whether all claimed stars are true and the attitude is off by less than ten sigmas of a star."""
+    """Return whether all identifications are true and the attitude error is below ten sigmas of a star."""
     if answer.status is not MatchStatus.IDENTIFIED or answer.fix is None:
         return False
     claimed = answer.star >= 0
     off = angle_between(answer.fix.quaternion, drawn.attitude)
-    # About the boresight a star's error counts by its lever, a tenth of a radian.
+    # About the boresight, the error of a star counts with its lever arm, a tenth of a radian.
     return bool(
         np.all(answer.star[claimed] == drawn.star[claimed])
         and off < 10.0 * drawn.kind.noise_px / drawn.camera.focal_length / 0.1
@@ -73,7 +73,7 @@ def _right(answer: StarMatch, drawn: StarList) -> bool:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_the_stars_of_a_clean_list_are_all_found(name: str) -> None:
-    """0.1 px of noise: all right, and of the stars that are guide stars nearly all named."""
+    """With 0.1 px of noise all identifications are right, and nearly all guide stars are identified."""
     for drawn in _drawn(_kind(), 1):
         answer = METHODS[name].identify(drawn.field(), _sky())
         assert _right(answer, drawn)
@@ -81,7 +81,7 @@ def test_the_stars_of_a_clean_list_are_all_found(name: str) -> None:
 
 
 def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None:
-    """Michalski, eq. 31: the same to 1 % for pairs 30 errors apart or more; wider for two blended stars."""
+    """Michalski, eq. 31: equal to 1 % for pairs 30 errors apart or more, wider for blended stars."""
     drawn = _drawn(_kind(noise_px=0.3), 6)[0]
     view = next(views(drawn.field(), DEFAULT))
     one, other = (np.array(index) for index in zip(*combinations(range(view.stars), 2), strict=True))
@@ -97,7 +97,7 @@ def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_false_and_missing_stars_are_survived(name: str) -> None:
-    """Two false stars and a tenth of the others missing: at most one list refused, none wrong."""
+    """With two false stars and a tenth missing, at most one list is refused and none is wrong."""
     answers = [
         (METHODS[name].identify(d.field(), _sky()), d) for d in _drawn(_kind(false_stars=2, lost=0.1), 2)
     ]
@@ -109,7 +109,7 @@ def test_false_and_missing_stars_are_survived(name: str) -> None:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_half_a_pixel_of_noise_is_survived(name: str) -> None:
-    """Voting fell from 0.3 px on while a pair's many partners voted each: half of such lists were refused."""
+    """With half a pixel of noise, the many partners of a pair must not outvote the true one."""
     lists = _drawn(_kind(noise_px=0.5, false_stars=2, lost=0.1), 3)
     answers = [METHODS[name].identify(drawn.field(), _sky()) for drawn in lists]
     assert all(answer.fix is None or _right(answer, one) for answer, one in zip(answers, lists, strict=True))
@@ -146,7 +146,7 @@ def test_points_strewn_at_random_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_mirrored_sky_is_refused(name: str) -> None:
-    """All angles, areas and moments are those of the sky; only the sense of turning is not."""
+    """Angles, areas and moments are those of the sky; only the orientation differs."""
     drawn = _drawn(_kind(), 4)[0]
     field = drawn.field()
     mirrored = replace(field, direction=field.direction * np.array([-1.0, 1.0, 1.0]))
@@ -171,7 +171,7 @@ def test_a_field_of_view_that_is_not_known_is_refused_with_the_reason(name: str)
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_two_points_within_their_errors_of_one_another_do_no_harm(name: str) -> None:
-    """One guide star is the best match of both, and fixes no attitude by itself."""
+    """One guide star is the best match of both points, and does not determine an attitude."""
     drawn = _drawn(_kind(noise_px=2.0), 11)[0]
     field = drawn.field()
     twice = field.subset(np.repeat(np.arange(len(field)), 2))
@@ -194,7 +194,7 @@ def test_the_triangle_tables_hold_only_triangles_that_the_field_can_show() -> No
 
 
 def _motion(drawn: StarList, seed: int) -> tuple[StarMotion, FloatArray]:
-    """Return velocities under 1 deg/s, false points moving at their own will, and the rate."""
+    """Return velocities of at most 1 deg/s, random ones for false points, and the rate."""
     rng = np.random.default_rng(seed)
     field = drawn.field()
     rate = np.deg2rad([0.6, -0.7, 0.4])
@@ -207,7 +207,7 @@ def _motion(drawn: StarList, seed: int) -> tuple[StarMotion, FloatArray]:
 
 @pytest.mark.parametrize("false", [2, 5, 10])
 def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> None:
-    """Of the stars one in a hundred may be lost, of the false points one in ten share by chance."""
+    """One in a hundred stars may be lost, and one in ten false points may agree with the rate by chance."""
     kept, strangers, points = 0, 0, 0
     for number, drawn in enumerate(_drawn(_kind(false_stars=false), 7)):
         motion, rate = _motion(drawn, number)
@@ -217,14 +217,15 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
         points += int(true.sum())
         strangers += int(shared.shares[~true].sum())
         off = shared.rate - rate
-        assert off @ np.linalg.solve(shared.covariance, off) < 25.0  # chi-square of 3, one in 60,000
+        # chi-square with 3 degrees of freedom, exceeded once in 60,000
+        assert off @ np.linalg.solve(shared.covariance, off) < 25.0
         assert _right(identify_by_rate(drawn.field(), _sky(), motion=motion), drawn)
     assert kept >= 0.99 * points
     assert strangers <= 0.1 * false * LISTS
 
 
 def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
-    """The law v' = -w x v: the direction after a small turn of the body, by its attitude matrix."""
+    """By v' = -w x v: the direction after a small rotation of the body, from its attitude matrix."""
     rate, step = np.array([0.02, -0.01, 0.03]), 1e-4
     before = np.array([0.1, 0.2, 1.0]) / np.linalg.norm([0.1, 0.2, 1.0])
     after = attitude_matrix(from_rotation_vector(rate * step)) @ before
@@ -232,7 +233,7 @@ def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
 
 
 def test_a_previous_attitude_turned_by_the_rate_names_too_few_stars_for_a_pattern() -> None:
-    """Four stars a second later, which lost in space are not enough."""
+    """Four stars a second later, which are not enough for identification lost in space."""
     drawn = _drawn(_kind(), 8)[0]
     whole, rate = _motion(drawn, 8)
     few = np.arange(5)

@@ -30,7 +30,7 @@ def _found_by_hand(key: FloatArray, low: float, high: float) -> list[int]:
 def test_ranges_hold_the_keys_that_a_search_through_all_finds(
     drawn: FloatArray, ends: list[tuple[float, float]], cells: int | None
 ) -> None:
-    """Many equal keys, few cells or many, ranges that are empty, reversed or beyond all keys."""
+    """The keys are often equal; cells are few or many; ranges are empty, reversed or beyond all keys."""
     key = np.sort(drawn)
     index = star_tables.build_k_vector(key, cells)
     start, stop = index.ranges([low for low, _ in ends], [high for _, high in ends])
@@ -50,7 +50,7 @@ def test_a_key_that_is_the_low_end_is_in_and_one_that_is_the_high_end_is_out(
 
 
 def test_a_million_skewed_keys_agree_with_bisection() -> None:
-    """float32 keys with nearly all in a few cells, and values that are keys themselves."""
+    """The keys are float32, nearly all in a few cells, and some values are keys themselves."""
     rng = np.random.default_rng(11)
     key = np.sort(rng.exponential(1.0, 1_000_000).astype(np.float32) ** 4)
     ends = np.concatenate([rng.choice(key, 400).astype(np.float64), rng.uniform(-1.0, 1.1 * key[-1], 400)])
@@ -93,12 +93,12 @@ def _sky(count: int) -> GuideStars:
 
 @pytest.fixture(scope="module")
 def table() -> PairTable:
-    """300 stars, pairs within 0.4 rad."""
+    """Return the pairs of 300 stars within 0.4 rad."""
     return star_tables.build_pairs(_sky(300), 0.4)
 
 
 def test_the_table_has_every_pair_within_the_widest_angle_and_no_other(table: PairTable) -> None:
-    """By the arc cosine of all products, to float32."""
+    """Compare with the arc cosine of all products, up to float32."""
     direction = _sky(300).direction
     one, other = np.triu_indices(300, 1)
     angle = np.arccos(np.clip(np.sum(direction[one] * direction[other], axis=-1), -1.0, 1.0))
@@ -131,7 +131,7 @@ def test_the_magnitude_limit_gives_the_wanted_number_of_stars_in_a_field() -> No
 
 @pytest.mark.parametrize("degrees", [0.01, 0.1, 5.0, 90.0])
 def test_the_variance_of_a_cosine_is_that_of_drawn_pairs(degrees: float) -> None:
-    """Pairs as close as their errors included; 20,000 draws give a standard deviation to 1.5 % (3 sigma)."""
+    """Some pairs are as close as their errors; 20,000 draws give the deviation to 1.5 % (3 sigma)."""
     rng = np.random.default_rng(4)
     sigma = np.radians([0.02, 0.05])
     first, second = np.array([1.0, 0.0, 0.0]), np.array([np.cos(np.radians(degrees)), 0.0, 0.0])

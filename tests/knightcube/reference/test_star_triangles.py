@@ -69,7 +69,7 @@ def test_spherical_area_is_that_of_the_sum_of_angles_and_of_equation_32(seed: in
 
 @pytest.mark.parametrize("seed", range(3))
 def test_spherical_moment_is_the_adaptive_integral_of_its_definition(seed: int) -> None:
-    """Equation 34 by iterated adaptive quadrature, theta by its cosine and sine."""
+    """Equation 34 is integrated by iterated adaptive quadrature, theta by its cosine and sine."""
     corners = _corners(seed)
     middle = corners.sum(axis=0) / np.linalg.norm(corners.sum(axis=0))
     volume = abs(float(np.linalg.det(corners)))
@@ -84,7 +84,7 @@ def test_spherical_moment_is_the_adaptive_integral_of_its_definition(seed: int) 
 
 
 def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
-    """The definition (34) as Cole & Crassidis sum it, each triangle cut in four, seven times."""
+    """The definition (34) is summed as by Cole & Crassidis: triangles are quartered seven times."""
     corners = _corners(1)
     middle = corners.sum(axis=0) / np.linalg.norm(corners.sum(axis=0))
     triangles = corners[None]
@@ -98,7 +98,7 @@ def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
     theta = 2.0 * np.arcsin(0.5 * np.linalg.norm(centre - middle, axis=-1))
     total = float(np.sum(theta**2 * spherical_shape(triangles)[0]))
-    # A cut leaves a quarter of the error: 1/128 squared of the moment about, here.
+    # Each division leaves a quarter of the error: about (1/128)^2 of the moment.
     assert spherical_shape(corners[None])[1][0] == pytest.approx(total, rel=2e-4)
 
 

@@ -20,7 +20,7 @@ from tests.support.scenes import catalogue
 CAMERA = StarCameraModel(columns=512, rows=512)
 EXPOSURE = 0.2
 TIMES = np.linspace(-0.1, 0.1, 9)
-"""s from mid-exposure."""
+"""Times (s) from mid-exposure."""
 
 
 def frame_job(

@@ -1,4 +1,4 @@
-"""From rendered frames to an attitude: horizon and Sun of four cameras, with honest covariances."""
+"""Tests of the attitude from rendered frames: horizon and Sun of four cameras, with correct covariances."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def attitude() -> FloatArray:
 
 
 def sun() -> FloatArray:
-    """Return the Sun's direction: 24 deg off the zenith, in the top camera's field, the limb by day."""
+    """Return the Sun's direction, 24 deg off the zenith, in the top camera's field, with a sunlit limb."""
     zenith = POSITION[0] / np.linalg.norm(POSITION[0])
     towards = zenith + 0.45 * np.array([0.0, 0.6, 0.8])
     return np.asarray(towards / np.linalg.norm(towards))
 
 
 def frame_of(camera: WideCamera, seed: int) -> Image:
-    """Return what a camera of the suite exposes."""
+    """Return the frame of a camera of the suite."""
     looking = multiply(np.array(camera.mounting), attitude())
     scene = EarthScene(POSITION[0], looking / np.linalg.norm(looking), ASTRONOMICAL_UNIT * sun())
     return render(MODEL, scene, np.random.default_rng(seed))
@@ -56,7 +56,7 @@ def observation_of(
 
 @pytest.fixture(scope="module")
 def sights() -> dict[str, VectorObservation]:
-    """Three horizons and a Sun, as the finders measured them, in body axes."""
+    """Return the measured directions of three horizons and a Sun, in body axes."""
     found = {}
     knowledge = HorizonKnowledge(position=POSITION[0], sun=sun())
     down = -POSITION[0] / np.linalg.norm(POSITION[0])
@@ -73,12 +73,12 @@ def sights() -> dict[str, VectorObservation]:
 
 
 def off(fix: AttitudeFix) -> FloatArray:
-    """Return the error (3,), rad."""
+    """Return the attitude error (3,), rad."""
     return rotation_vector(multiply(attitude(), conjugate(fix.quaternion)))
 
 
 def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, VectorObservation]) -> None:
-    """As far off as it says: the turn about the vertical is known by a Sun 24 deg off it, 2.5 times worse."""
+    """The Sun, 24 deg off the vertical, gives the rotation about it 2.5 times worse, as claimed."""
     fix = weighted_fit(list(sights.values()))
     error = off(fix)
     assert np.max(np.abs(np.degrees(error))) < 0.15

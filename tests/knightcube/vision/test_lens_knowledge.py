@@ -1,4 +1,4 @@
-"""Knowledge of the lens from solved frames: accuracy, honesty, a changed lens, and its use in a frame.
+"""Tests of the lens from solved frames: accuracy, covariance, a changed lens, and its use in a frame.
 
 Star positions are computed with the true lens by `Lens.project`, not with the equations under test.
 """
@@ -39,7 +39,7 @@ NOISE = 0.05
 
 @dataclass(frozen=True)
 class TrueCamera:
-    """A lens, and the line time of its shutter, s."""
+    """A lens, and the line time (s) of its shutter."""
 
     lens: Lens
     line_time: float = 0.0

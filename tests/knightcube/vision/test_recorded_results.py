@@ -1,4 +1,4 @@
-"""Sun, solar strings, lens calibration and frame jobs give the results of the record, to five digits."""
+"""Tests that Sun, solar strings, lens calibration and frame jobs equal the record to five digits."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Tests of the Sun direction on simulated frames with and without the Sun.
+"""Tests of the Sun direction on simulated frames with and without the Sun, also from several cameras.
 
-Tests of several cameras: the solar strings choose the camera to read, and give the direction if no camera
-finds the Sun.
+Solar strings choose the camera to read, and give the direction if no camera finds the Sun.
 """
 
 from __future__ import annotations

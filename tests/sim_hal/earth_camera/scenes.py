@@ -44,8 +44,8 @@ def limb_scene(
 ) -> EarthScene:
     """Return a scene above `zenith` (3,), the Sun towards `sun` (3,), and a horizontal limb in the centre.
 
-    `dip` rad turns the boresight below the limb's middle; the azimuth is the Sun's, or the pole's
-    when the Sun is overhead.
+    `dip` (rad) rotates the boresight below the centre of the limb. The azimuth is that of the Sun, or that of
+    the pole if the Sun is overhead.
     """
     zenith = zenith / np.linalg.norm(zenith)
     side = np.cross(zenith, sun)
@@ -66,10 +66,10 @@ def random_scene(
     altitudes: tuple[float, float] = (LOW, HIGH),
     accept: Callable[[EarthScene], bool] | None = None,
 ) -> EarthScene:
-    """Return a scene with the horizon in view, everything else at random.
+    """Return a random scene with the horizon in view.
 
-    `view` states the limb on the detector: all in daylight, partly in day and night, all in night, or any.
-        `accept` may refuse a scene. Raises RuntimeError when none is found.
+    `view` states the light on the visible limb: all day, partly day and night, all night, or any. `accept`
+    may refuse a scene. Raises RuntimeError if none is found.
     """
     for _ in range(_MOST_DRAWS):
         scene = _draw(generator, model, altitudes)
@@ -95,7 +95,7 @@ def random_sun_scene(
 ) -> EarthScene:
     """Return a scene with the whole Sun at a random pixel, at least `margin` px inside the edge.
 
-    With a negative margin, the Sun may be outside by this amount. Raises RuntimeError when none is found.
+    With a negative margin, the Sun may be outside by this amount. Raises RuntimeError if none is found.
     """
     for _ in range(_MOST_DRAWS):
         size = np.array([model.columns, model.rows])

@@ -56,7 +56,7 @@ def test_darkness_reads_the_pedestal_with_the_stated_noise() -> None:
 
 
 def test_the_linear_cameras_noise_is_that_of_the_charge() -> None:
-    """Shot noise: variance in e- is the charge plus the read noise's; then the full well ends it."""
+    """The variance in e- is that of the charge plus the read noise, up to the full well."""
     model = EarthCameraModel.fuga15d(
         response="linear",
         bits=16,
@@ -147,7 +147,7 @@ def test_the_disc_is_centred_where_the_lens_projects_the_suns_direction(model: E
 
 
 def test_all_the_suns_light_arrives_pi_in_these_units() -> None:
-    """The irradiance of a matt white surface's radiance one is pi, whatever the disc's size in pixels."""
+    """A matt white surface of radiance one has an irradiance of pi, whatever the disc's size in px."""
     sun = ASTRONOMICAL_UNIT * np.array([0.1, 0.05, 1.0]) / np.linalg.norm([0.1, 0.05, 1.0])
     scene = _deep_space(sun, np.array([0.0, 0.0, 1.0]))
     for model in (CLEAN, EarthCameraModel.fuga15d(scatter=0.0, field_of_view=np.radians(20.0))):
@@ -175,7 +175,7 @@ def test_glare_holds_its_share_of_the_light_and_stays_when_the_sun_leaves_the_fi
     rays = pixel_rays(model.lens)
     solid = (rays[:, 2].reshape(light.shape)) ** 3 / model.lens.focal_length**2
     chords = np.linalg.norm(rays - ahead, axis=1).reshape(light.shape)
-    # The part of the scattering law's logarithmic integral between 3 deg and the inscribed circle of 60 deg.
+    # Fraction of the scattering law's logarithmic integral between 3 deg and the inscribed circle of 60 deg.
     ring = (chords > np.radians(3.0)) & (chords < 1.0)
     square = model.scatter_angle**2
     part = np.log((1.0 + 1.0 / square) / (1.0 + np.radians(3.0) ** 2 / square)) / np.log(1.0 + 2.0 / square)
@@ -254,7 +254,7 @@ def test_logarithmic_and_linear_frames_saturate_in_the_core_and_nowhere_in_the_d
 
 @pytest.mark.parametrize("aside", [1e-3, 1e-6, 1e-9])
 def test_a_sun_at_a_right_angle_to_the_boresight_leaves_no_disc(aside: float) -> None:
-    """Through a lens without folding, its image is at coordinates beyond the range of integers."""
+    """Without folding by the lens, its image is at coordinates beyond the range of integers."""
     model = EarthCameraModel.fuga15d(scatter=0.0, k1=-0.05, k2=0.01)
     boresight = np.array([0.0, 1.0, 0.0])
     # The rim of 0.27 deg crosses the plane beyond which the lens sees nothing.

@@ -25,14 +25,14 @@ AIR = Atmosphere()
 
 
 def _nadir_scene(sun: FloatArray, altitude: float = 800e3) -> EarthScene:
-    """Return a camera over latitude 0, longitude 0 that looks straight down, the pole to its right."""
+    """Return a camera over latitude 0, longitude 0 that looks straight down, with the pole to its right."""
     x = np.array([1.0, 0.0, 0.0])
     attitude = pointing(-x, np.array([0.0, -1.0, 0.0]))
     return EarthScene((SEMI_MAJOR_AXIS + altitude) * x, attitude, ASTRONOMICAL_UNIT * sun)
 
 
 def _solar_cosines(scene: EarthScene) -> FloatArray:
-    """Return the cosine (rows, columns) of the Sun from the zenith, of a round Earth; NaN off it."""
+    """Return the cosine (rows, columns) of the Sun's zenith distance on a round Earth; NaN off it."""
     sight = look(scene, pixel_rays(QUIET.lens))
     places = np.where(sight.hits[:, None], sight.places, np.nan)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
@@ -103,11 +103,11 @@ def test_the_night_side_is_dark_and_its_limb_too() -> None:
 
 
 def test_brightness_under_the_sun_is_that_of_matt_ground_seen_through_air() -> None:
-    """Between the sea's and the clouds', each dimmed twice by the air, plus the air's own light."""
+    """It is between those of sea and clouds, each dimmed twice by the air, plus the light of the air."""
     light = expected_radiance(QUIET, _nadir_scene(np.array([1.0, 0.0, 0.0])))[206:306, 206:306]
     dimmed = np.exp(-2.0 * AIR.optical_depth)
     haze = 1.5 * 0.375 * (1.0 - np.exp(-AIR.optical_depth))
-    # The camera looks down as far as 9 deg from the zenith; the Sun is as far there.
+    # Sun and camera are up to 9 deg from the zenith in the image.
     assert 0.96 * OCEAN * dimmed + 0.9 * haze < light.min()
     assert light.max() < CLOUD * dimmed + 1.02 * haze
 
@@ -153,7 +153,7 @@ def _angles_from_nadir(scene: EarthScene, directions: FloatArray) -> FloatArray:
 
 
 def test_over_the_pole_the_limb_is_a_circle_whose_angle_is_that_of_the_meridian_ellipse() -> None:
-    """A line from height z on the axis touches x^2/a^2 + y^2/b^2 = 1 at slope a^2/(z^2 - b^2) = tan^2."""
+    """A line from height z on the axis touches x^2/a^2 + y^2/b^2 = 1 at the slope a^2/(z^2 - b^2) = tan^2."""
     distance = SEMI_MINOR_AXIS + 600e3
     scene = EarthScene(np.array([0.0, 0.0, distance]), quaternion.IDENTITY, SUN)
     directions, _ = limb_directions(scene)
@@ -162,7 +162,7 @@ def test_over_the_pole_the_limb_is_a_circle_whose_angle_is_that_of_the_meridian_
 
 
 def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> None:
-    """Along the equator asin(a/r), as of a sphere; towards the poles atan(b/sqrt(r^2 - a^2))."""
+    """The angle is asin(a/r) along the equator, and atan(b/sqrt(r^2 - a^2)) towards the poles."""
     distance = SEMI_MAJOR_AXIS + 500e3
     scene = EarthScene(np.array([distance, 0.0, 0.0]), quaternion.IDENTITY, SUN)
     directions, _ = limb_directions(scene, 4)
@@ -176,7 +176,7 @@ def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> Non
 
 @pytest.mark.parametrize("height", [0.0, APPARENT_LIMB_HEIGHT])
 def test_every_limb_direction_lies_on_the_tangent_cone(height: float) -> None:
-    """(d' M p)^2 = (d' M d)(p' M p - 1) with M = diag(1/a^2, 1/a^2, 1/b^2), whatever the attitude."""
+    """(d' M p)^2 = (d' M d)(p' M p - 1) with M = diag(1/a^2, 1/a^2, 1/b^2) for any attitude."""
     generator = np.random.default_rng(1)
     for _ in range(5):
         scene = random_scene(generator, NOISELESS)
@@ -216,7 +216,7 @@ def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
     towards = (places - scene.position) @ scene.camera_matrix.T
     crossed = np.cross(towards, rays) / np.linalg.norm(towards, axis=1, keepdims=True)
     assert np.abs(crossed).max() < 1e-9
-    # The first of the two intersections, on the camera's side.
+    # The first of the two intersections is on the camera's side.
     assert np.all(places @ scene.position > 0.0)
 
 

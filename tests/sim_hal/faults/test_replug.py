@@ -30,7 +30,7 @@ def pull_out(ends: tuple[int, int]) -> None:
 
 
 def receive(port: PySerialPort, patience: float = 3.0) -> bytes:
-    """Return the next bytes, whatever the port says until then."""
+    """Return the next bytes, ignoring errors of the port until then."""
     deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         try:

@@ -42,7 +42,7 @@ def integrated_by_brute_force(
 ) -> FloatArray:
     """Return the pixel-integrated image of a point that spends equal times at each of `path` (k, 2).
 
-    From the definition, in double precision, with scipy's erf and no table; k should be thousands.
+    The sum uses the definition in double precision with scipy's erf; k should be thousands.
     """
     scale = sigma * np.sqrt(2.0)
     across = np.arange(shape[1] + 1) - 0.5 - path[:, :1]

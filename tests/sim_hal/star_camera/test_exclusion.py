@@ -24,7 +24,7 @@ def _tilted(axis: FloatArray, towards: FloatArray, degrees: float) -> FloatArray
 
 
 def test_the_boresight_is_the_cameras_z_through_its_mounting() -> None:
-    """Errata to 2.16: a camera mounted so that it looks along body x; body turned by 90 deg about z."""
+    """Errata to 2.16: the camera looks along body x, and the body is rotated by 90 deg about z."""
     body = quaternion.from_rotation_vector(np.array([[0.0, 0.0, 0.5 * np.pi]]))
     rows = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     mounting = quaternion.from_matrix(rows)
@@ -41,7 +41,7 @@ def _below_horizontal(degrees: float) -> tuple[float, float, float]:
     ("degrees", "excluded"), [(0.0, True), (10.26, True), (10.27, False), (170.0, False)]
 )
 def test_the_sun_spoils_a_frame_to_its_limb(degrees: float, excluded: bool) -> None:
-    """Half the field and the Sun's radius of 0.2666 deg at 1 AU; its parallax in orbit is 10" at most."""
+    """The limit is half the field plus the Sun's radius of 0.2666 deg; its parallax is 10" at most."""
     boresight = _tilted(SUN / ASTRONOMICAL_UNIT, np.array([[0.0, 0.0, 1.0]]), degrees)
     assert sun_in_field(boresight, np.zeros((1, 3)), SUN, HALF)[0] == excluded
 
@@ -56,7 +56,7 @@ def test_the_sun_is_seen_from_the_camera_not_from_the_earths_centre() -> None:
 
 @pytest.mark.parametrize("above_limb", [9.9, 10.1, 25.0])
 def test_the_earth_spoils_a_frame_to_its_limb(above_limb: float) -> None:
-    """At 380 km the horizon dips by 19.3 deg (Meller et al. 4.1: "20 deg")."""
+    """At 380 km the horizon is 19.3 deg below the horizontal (Meller et al. 4.1: "20 deg")."""
     dip = np.degrees(np.arccos(EARTH_RADIUS / np.linalg.norm(CAMERA)))
     assert dip == pytest.approx(19.3, abs=0.1)
     horizontal, up = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 1.0, 0.0]])

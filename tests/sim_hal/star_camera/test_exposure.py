@@ -22,7 +22,7 @@ FINE = 20_001
 
 
 def _path(model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray) -> FloatArray:
-    """Return the star's pixels at the middles of equal steps, the attitudes by scipy's own interpolation."""
+    """Return the star's pixels at the middle of equal steps, with attitudes interpolated by scipy."""
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second, for these tests only
 
     edges = np.linspace(times[0], times[-1], FINE)
@@ -59,7 +59,7 @@ def test_a_curved_streak_about_the_boresight_is_exact() -> None:
 
 
 def test_a_streak_of_changing_rate_is_exact() -> None:
-    """It speeds up from rest: four times the light falls on the first half of the path as on an even one."""
+    """Accelerating from rest, the camera gives the first half of the path four times the usual flux."""
     times = np.linspace(0.0, 1.0, 101)
     turn = np.outer(times**2, [60.0 / FOCAL, 30.0 / FOCAL, 0.0])
     attitudes = quaternion.multiply(quaternion.from_rotation_vector(turn), POINTING)
@@ -68,7 +68,7 @@ def test_a_streak_of_changing_rate_is_exact() -> None:
 
 @pytest.mark.parametrize("jitter", [0.003, 0.03, 0.3, 1.0])
 def test_jitter_between_samples_is_followed(jitter: float) -> None:
-    """Kinks of up to about one pixel at each of 200 samples; the smallest are treated as smooth motion."""
+    """The motion has kinks of up to about a pixel at 200 samples; the smallest count as smooth."""
     rng = np.random.default_rng(8)
     times = np.linspace(0.0, 1.0, 201)
     turn = np.outer(times, [0.0, 50.0 / FOCAL, 0.0]) + rng.normal(0.0, jitter / FOCAL, (201, 3))
@@ -95,7 +95,7 @@ def test_the_light_is_the_same_however_far_the_star_moves(heading: float, streak
 
 
 def test_a_streak_runs_along_minus_omega_cross_v_over_the_known_length() -> None:
-    """Turned by 80 px about +x, a star at the boresight moves from z towards +y: v' = -w x v = (0, +w, 0)."""
+    """Rotated by 80 px about +x, a star at the boresight moves towards +y: v' = -w x v = (0, +w, 0)."""
     star = at_pixels(MODEL, MODEL.pinhole.centre)
     angle = 70.0 / FOCAL
     image = expected_electrons(MODEL, star, [0.0], *turning([angle, 0.0, 0.0]))
@@ -105,7 +105,7 @@ def test_a_streak_runs_along_minus_omega_cross_v_over_the_known_length() -> None
     profile = image.sum(axis=0)
     assert profile.argmax() in (int(x), int(x) + 1)
     lit = image.sum(axis=1)
-    # Half the even brightness is reached at the ends; the middle of the streak is flat.
+    # At the ends the brightness is half of that of the flat middle.
     half = 0.5 * np.median(lit[int(y) + 10 : int(y + length) - 10])
     start, *_, end = np.flatnonzero(lit > half)
     first = start - (lit[start] - half) / (lit[start] - lit[start - 1])
@@ -157,7 +157,7 @@ def test_an_edge_cuts_a_streak_without_moving_the_rest() -> None:
 
 @pytest.mark.parametrize(("when", "crossings"), [(0.0, 0.5), (0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (1.0, 0.5)])
 def test_a_sweep_across_the_sky_shows_each_star_while_it_crosses(when: float, crossings: float) -> None:
-    """A rotation of 0.5 rad, or seven fields of view; the star is on the boresight at `when`."""
+    """The rotation is 0.5 rad, or seven fields of view; the star is on the boresight at `when`."""
     rate = np.array([0.0, 0.5, 0.0])
     then = quaternion.multiply(quaternion.from_rotation_vector(when * rate), POINTING)
     star = at_pixels(MODEL, MODEL.pinhole.centre, then)
@@ -167,7 +167,7 @@ def test_a_sweep_across_the_sky_shows_each_star_while_it_crosses(when: float, cr
 
 
 def test_the_thesis_model_streaks_too() -> None:
-    """The mean of still images at 2,000 steps, as Sease adds them up."""
+    """The expected image is the mean of still images at 2,000 steps, as in Sease's sum."""
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.03, psf="bilinear")
     star = at_pixels(model, [20.0, 20.0])
     times, attitudes = turning(np.array([-9.0, -25.0, 0.0]) / model.pinhole.focal_length)
@@ -245,7 +245,7 @@ def _history(rate: object, samples: int = 2) -> tuple[FloatArray, FloatArray]:
 def _by_brute_force(
     model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray, magnitude: float = 2.0
 ) -> FloatArray:
-    """Return the image row by row, each from 1,000 instants of its own exposure; attitudes by scipy."""
+    """Return the image row by row, each from 1,000 instants of its own exposure, with attitudes by scipy."""
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second, for these tests only
 
     camera_to_reference = Slerp(times, Rotation.from_quat(attitudes))
@@ -276,7 +276,7 @@ def _worst(model: StarCameraModel, star: FloatArray, times: FloatArray, attitude
 def test_every_row_is_the_integral_over_its_own_exposure(
     line_time: float, velocity: tuple[float, float]
 ) -> None:
-    """Motions of up to 0.15 px per line time, with the shutter and against it."""
+    """The motion is up to 0.15 px per line time, in both directions of the shutter."""
     model = replace(ROLLING_MODEL, line_time=line_time)
     vx, vy = velocity
     span = EXPOSURE + model.rows * line_time
@@ -304,7 +304,7 @@ def test_a_changing_rate_is_exact() -> None:
 
 
 def test_jitter_is_followed() -> None:
-    """Kinks of 0.1 px every 5 ms beside 150 px/s."""
+    """The motion has kinks of 0.1 px every 5 ms at 150 px/s."""
     times = np.linspace(0.0, EXPOSURE + READOUT, 45)
     rng = np.random.default_rng(3)
     turn = np.outer(times, [0.0, 150.0 / ROLLING_FOCAL, 0.0]) + rng.normal(0.0, 0.1 / ROLLING_FOCAL, (45, 3))
@@ -314,14 +314,14 @@ def test_jitter_is_followed() -> None:
 
 @pytest.mark.parametrize("start", [(60.0, -2.0), (60.0, 101.0), (-25.0, 50.0), (110.0, 90.0)])
 def test_streaks_that_an_edge_cuts_are_exact(start: tuple[float, float]) -> None:
-    """Stars that enter from above, below and the left, and leave at the corner."""
+    """Stars enter from above, below and the left, and leave at the corner."""
     vertical = 100.0 if start[1] < 60.0 else -100.0 if start[0] < 100.0 else 200.0
     rate = np.array([vertical, -200.0, 0.0]) / ROLLING_FOCAL
     assert _worst(ROLLING_MODEL, at_pixels(ROLLING_MODEL, start), *_history(rate)) < 2e-3
 
 
 def test_a_track_under_a_rolling_shutter_is_a_star_under_the_opposite_turn() -> None:
-    """A camera at rest and an object that moves as the star of a turning camera does: the same image."""
+    """A camera at rest with a moving object gives the image of a star in a rotating camera."""
     times, attitudes = _history(np.array([100.0, -120.0, 0.0]) / ROLLING_FOCAL, 23)
     star = at_pixels(ROLLING_MODEL, [40.0, 40.0])
     seen = quaternion.attitude_matrix(attitudes) @ star[0]
@@ -343,7 +343,7 @@ def test_a_still_camera_sees_what_a_global_shutter_sees() -> None:
 
 
 def test_with_hardly_any_line_time_a_field_of_streaks_is_a_global_shutters() -> None:
-    """Stars on and around the detector that cross each edge, and a few stars behind the camera."""
+    """Stars on and around the detector cross each edge, and a few stars are behind the camera."""
     rng = np.random.default_rng(6)
     stars = at_pixels(ROLLING_MODEL, rng.uniform(-150.0, 250.0, (300, 2)))
     stars[:20] *= -1.0
@@ -367,7 +367,7 @@ def test_stars_far_down_streak_later() -> None:
 
 
 def test_a_streak_that_runs_down_after_the_shutter_is_longer_and_brighter_in_all() -> None:
-    """At 400 px/s and 0.2 ms a line its own row's exposure takes 1 / (1 - 0.08) times as long to pass."""
+    """At 400 px/s and 0.2 ms per line, the exposure of its row takes 1 / (1 - 0.08) times as long to pass."""
     star = at_pixels(ROLLING_MODEL, [60.0, 3.0])
     times, attitudes = turning([400.0 / ROLLING_FOCAL, 0.0, 0.0], 0.1 + READOUT)
     rolling = expected_electrons(ROLLING_MODEL, star, [2.0], times, attitudes).sum()

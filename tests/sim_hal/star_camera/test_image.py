@@ -51,7 +51,7 @@ def _check_moments(frames: Image, mean: FloatArray, variance: FloatArray) -> Non
 
 @pytest.mark.parametrize("light", [0.0, 3.0, 30.0, 37.4, 37.6, 60.0, 1000.0])
 def test_mean_and_variance_are_right_on_both_sides_of_the_faint_limit(light: float) -> None:
-    """Variance 150 e-^2 of the background, so faint to 37.5 e- of light; 1/12 is the rounding's."""
+    """The variance is 150 e-^2 of the background, up to 37.5 of faint light, and 1/12 of rounding."""
     image = np.full((96, 96), light)
     _check_moments(_frames(DEEP, image, 200), image + 150.0, image + 150.0 + 1.0 / 12.0)
 
@@ -126,7 +126,7 @@ def test_a_bright_star_saturates_at_the_converters_top() -> None:
 
 
 def test_a_bright_star_saturates_at_the_full_well() -> None:
-    """20,000 e- at 2 e- a count and a pedestal of 100: 10,100 counts, and read noise of 5 counts on top."""
+    """20,000 e- at 2 e-/count and a pedestal of 100 are 10,100 counts, with a read noise of 5 counts."""
     model = replace(DEEP, full_well=20_000.0, gain=2.0)
     frame = render(model, at_pixels(model, [40.0, 40.0]), [-3.0], *still(), np.random.default_rng(1)).astype(
         float
@@ -169,7 +169,7 @@ def test_light_is_rounded_to_the_nearest_count() -> None:
 
 
 def test_the_thesis_noise_is_uniform_and_never_negative() -> None:
-    """Text at 2.11: sqrt(signal) U + sqrt(RN^2 + DC T) U, U between 0 and 1; sqrt(400) and sqrt(150) here."""
+    """Text at 2.11: sqrt(signal) U + sqrt(RN^2 + DC T) U, with U in 0..1; here sqrt(400) and sqrt(150)."""
     model = replace(DEEP, noise="uniform")
     image = np.full((96, 96), 400.0)
     frames = _frames(model, image, 200)
@@ -216,7 +216,7 @@ def test_a_source_brighter_than_any_number_of_wells_does_not_overflow() -> None:
 
 @pytest.mark.parametrize("slopes", [(2.0, 0.0), (0.0, -1.5), (0.5, 0.25)])
 def test_stray_light_grows_across_the_frame_and_brings_its_own_noise(slopes: tuple[float, float]) -> None:
-    """In counts a pixel from the darkest corner on; at 2 e- a count its variance is half its mean."""
+    """The level is in counts from the darkest corner; at 2 e-/count its variance is half its mean."""
     model = replace(DEEP, background_gradient=slopes, gain=2.0)
     across, down = slopes
     stray = across * np.arange(96) + down * np.arange(96)[:, None]
@@ -237,7 +237,7 @@ SMALL = StarCameraModel(columns=64, rows=48, field_of_view=np.radians(4.0))
 
 
 def test_a_star_of_magnitude_zero_gives_liebes_flux() -> None:
-    """19,000 e-/s for each mm^2 of a 25 mm aperture, 0.2 s: 1.8653e6 e-."""
+    """19,000 e-/s for each mm^2 of a 25 mm aperture in 0.2 s are 1.8653e6 e-."""
     image = expected_electrons(SMALL, at_pixels(SMALL, [30.2, 20.7]), [0.0], *still(0.2))
     assert image.sum() == pytest.approx(19_000 * math.pi * 12.5**2 * 0.2, rel=1e-5)
 
@@ -251,7 +251,7 @@ def test_no_light_is_lost_whatever_the_place_in_the_pixel(psf: str, point: tuple
 
 
 def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
-    """Errata to 2.8: Pogson, not 2.5 a magnitude (which would give 97.7)."""
+    """Errata to 2.8: the scale is Pogson's, not 2.5 per magnitude (which would give 97.7)."""
     star, history = at_pixels(SMALL, [30.2, 20.7]), still()
     bright, faint = (expected_electrons(SMALL, star, [v], *history).sum() for v in (1.0, 6.0))
     assert bright / faint == pytest.approx(100.0, rel=1e-5)
@@ -268,7 +268,7 @@ def test_light_grows_with_exposure_and_with_the_square_of_the_aperture() -> None
 @settings(max_examples=40, deadline=None)
 @given(st.floats(12.0, 50.0), st.floats(12.0, 35.0), st.sampled_from([0.6, 1.0, 1.7]))
 def test_the_centroid_is_the_projection(x: float, y: float, sigma: float) -> None:
-    """An undersampled image (sigma 0.3 px, say) would be biased by the pixels: that is the pixels' doing."""
+    """An undersampled image (such as sigma 0.3 px) would be biased by the pixels."""
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf_sigma=sigma)
     image = expected_electrons(model, at_pixels(model, [x, y]), [-5.0], *still())
     assert centroid(image) == pytest.approx([x, y], abs=1e-3)

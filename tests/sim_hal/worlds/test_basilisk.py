@@ -36,7 +36,7 @@ def both(
 
 
 def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradient() -> None:
-    """WMM2025 and IGRF-14 differ by degree 13, so that the attitudes differ by a milliradian."""
+    """The degree 13 of IGRF-14, which WMM2025 lacks, changes the attitude by a milliradian."""
     currents = [np.array([0.05, -0.03, 0.02])]
     theirs, ours = both(FreeBodySection(craft="cubesat_3u", disturbances=CALM), lambda: currents[0])
     for second in range(1, 121):
@@ -56,7 +56,7 @@ def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradie
 
 
 def test_disturbances_turn_the_body_about_as_ours_do() -> None:
-    """Sunlight, dipoles and drag of a density within the day bulge; from rest, for five minutes."""
+    """Sunlight, dipoles and drag act on a body from rest for five minutes."""
     body = FreeBodySection(
         orbit=OrbitSection(local_time=12.0), disturbances=Disturbances(gravity_gradient=0.0)
     )

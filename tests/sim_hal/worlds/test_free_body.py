@@ -124,7 +124,7 @@ def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> 
 
 
 def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None:
-    """At 500 km: gravity gradient 4.9e-8, dipole of 1e-3 A m^2 2 to 5e-8, drag 6e-9 N m end on."""
+    """In N m at 500 km: gravity gradient 4.9e-8, dipole of 1e-3 A m^2 2 to 5e-8, drag along x 6e-9."""
     sizes: dict[str, list[float]] = {}
     for seed in range(12):
         body = FreeBody(FreeBodySection(craft="cubesat_3u"), lambda: np.zeros(3), seed=seed)
@@ -350,7 +350,7 @@ def test_the_campaign_of_pointing_judges_the_weights_that_are_flown(name: str, c
 
 
 def test_the_filter_expects_the_errors_of_tilted_coils_that_the_world_draws() -> None:
-    """Mean square of the nine elements of the coil matrix in expected standard deviations, 200 satellites."""
+    """Mean square of the coil matrix's elements in expected standard deviations, over 200 satellites."""
     config = as_orbit(reader.load(FOLDER / "orbit_1u_tilted.yaml"))
     coils, prior = config.coils.map(), filter_settings(config).coils
     assert prior is not None

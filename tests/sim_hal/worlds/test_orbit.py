@@ -120,7 +120,7 @@ def _by_kepler(elements: KeplerianElements, time: float) -> FloatArray:
 
 @pytest.mark.parametrize("elements", [LOW, replace(LOW, eccentricity=0.0), VALLADO])
 def test_two_bodies_keep_keplers_laws(elements: KeplerianElements) -> None:
-    """Over ten of the thesis's orbits, to a centimetre of at most 66,000 km."""
+    """The test covers ten of the thesis's orbits, to a centimetre of at most 66,000 km."""
     orbit = propagate(elements, 55_000.0, j2=0.0)
     for time in (0.0, 17.3, 5000.0, 31_234.5, 55_000.0):
         assert orbit.positions_at(np.array([time]))[0] == pytest.approx(_by_kepler(elements, time), abs=0.01)
@@ -137,7 +137,7 @@ def _potential(position: FloatArray) -> float:
 def test_the_acceleration_is_the_gradient_of_the_potential(
     anomaly: float, tilt: float, radius: float
 ) -> None:
-    """2.14 as printed: second differences of the path against first differences of J2's potential."""
+    """Compare second differences of the path with first differences of J2's potential (2.14 as printed)."""
     elements = KeplerianElements(semi_major_axis=radius, inclination=tilt, true_anomaly=anomaly)
     step = 2.0
     orbit = propagate(elements, 2.0 * step)
@@ -170,7 +170,7 @@ def _secular_rate(times: FloatArray, angles: FloatArray) -> float:
 
 @pytest.mark.parametrize("inclination", [28.5, 50.0, 89.0, 98.2])
 def test_the_node_regresses_at_the_secular_rate(inclination: float) -> None:
-    """-3/2 J2 (R/p)^2 n cos i (Vallado, section 9.6), to the first order in J2: 0.2 %."""
+    """The rate is -3/2 J2 (R/p)^2 n cos i (Vallado, section 9.6), to first order in J2: 0.2 %."""
     elements = KeplerianElements(semi_major_axis=7078e3, inclination=np.radians(inclination))
     times = np.linspace(0.0, 30.0 * elements.period, 3001)
     mean_motion = 2.0 * np.pi / elements.period
@@ -192,7 +192,7 @@ def test_a_sun_synchronous_orbit_follows_the_sun() -> None:
 
 @pytest.mark.parametrize("inclination", [30.0, 63.4349, 85.0])
 def test_the_perigee_turns_at_the_secular_rate(inclination: float) -> None:
-    """3/4 J2 (R/p)^2 n (5 cos^2 i - 1), and not at all at the critical inclination of 63.43 deg."""
+    """The rate is 3/4 J2 (R/p)^2 n (5 cos^2 i - 1), zero at the critical inclination of 63.43 deg."""
     elements = KeplerianElements(
         semi_major_axis=26_000e3,
         eccentricity=0.7,
@@ -269,7 +269,10 @@ ABERRATION = 20.5 * ARCSECOND
 def test_the_sun_stands_where_it_was_published(
     julian_date: float, published: tuple[float, float, float]
 ) -> None:
-    """Those are geometric; the apparent place is 20.5" behind along the ecliptic. To 40" and 1e-4 AU."""
+    """The references are geometric; the apparent Sun is 20.5" behind along the ecliptic.
+
+    To 40" and 1e-4 AU.
+    """
     place = np.array(published)
     pole = np.array([0.0, -np.sin(OBLIQUITY), np.cos(OBLIQUITY)])
     apparent = place - ABERRATION * np.cross(pole, place)
@@ -395,7 +398,7 @@ def test_without_bulge_and_walks_the_air_is_the_same_on_all_sides_and_the_dipole
 
 
 def test_the_air_turns_with_the_earth() -> None:
-    """At the equator of an eastward orbit the flow is slower by 0.4929 km/s at 6,760 km."""
+    """At the equator of an eastward orbit the air speed is lower by 0.4929 km/s at 6,760 km."""
     environment = Environment(
         elements(OrbitSection(inclination_deg=0.0), DATE), DATE, np.random.default_rng(1)
     )

@@ -92,9 +92,8 @@ FLIGHTS: tuple[Flight, ...] = (
         ("bus: nack @ 12 for 4", "pwm: brown-out @ 25", "monitor: bits @ 30 for 10", "bus: hang @ 48 for 3"),
     ),
     # The KnightCube starts at 0.6 deg/s: streak rates, detumbling, attitude acquisition, slews that avoid
-    # exclusion cones
-    # to Sun and nadir, Earth in star frames, Sun and limb in the horizon cameras; GPS and a camera fail for a
-    # time.
+    # exclusion cones to Sun and nadir, Earth in star frames, Sun and limb in the horizon cameras; GPS and a
+    # camera fail for a time.
     Flight(
         "orbit",
         "config/orbit.yaml",

@@ -176,7 +176,7 @@ class BothEnds:
         self.collect()
 
     def collect(self) -> None:
-        """Take what came down."""
+        """Process the received telemetry."""
         self.packets += self.terminal.take()
 
     def stages(self, counter: int, spi: int = 1) -> list[str]:
@@ -198,6 +198,6 @@ class BothEnds:
         return row  # type: ignore[no-any-return]  # numpy types no row of a structured array
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the open files and sockets."""
         self.flight.close()
         self.log.close()

@@ -81,7 +81,7 @@ def test_it_is_the_solution_of_scipy() -> None:
         observed = _observed(rng, normalise(rng.normal(size=4)), reference, sigma)
         found = _solve(observed, reference, sigma)
         rotation, root_loss = Rotation.align_vectors(observed, reference, weights=1.0 / sigma**2)
-        # scipy's quaternion turns vectors, ours turns axes: conjugate.
+        # scipy's quaternion rotates vectors and ours rotates axes, hence the conjugate.
         assert angle_between(found.quaternion, conjugate(rotation.as_quat())) < 1e-10
         assert found.loss == pytest.approx(0.5 * root_loss**2, rel=1e-6)
 
@@ -126,7 +126,7 @@ def test_the_covariance_and_the_loss_are_those_of_the_errors() -> None:
         error = to_rotation_vector(multiply(found.quaternion, conjugate(q)))
         squared.append(error @ np.linalg.solve(found.covariance, error))
         losses.append(2.0 * found.loss)
-    # Means of chi-squares of 3 and of 2n - 3 = 9 degrees: three standard errors either way.
+    # Means of chi-squares of 3 and of 2n - 3 = 9 degrees of freedom, within three standard errors.
     assert np.mean(squared) == pytest.approx(3.0, abs=3.0 * np.sqrt(6.0 / runs))
     assert np.mean(losses) == pytest.approx(9.0, abs=3.0 * np.sqrt(18.0 / runs))
 

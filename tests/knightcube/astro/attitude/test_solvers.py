@@ -80,7 +80,7 @@ def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
 def test_a_solver_loses_no_more_than_the_profile_matrix_has_lost(
     name: str, angle: float | None, n: int, half_field: float | None
 ) -> None:
-    """Before it is settled: rounding over the gap between K's eigenvalues, against numpy's eigenvector."""
+    """Before the refinement the error is rounding over the gap between K's eigenvalues."""
     rng = np.random.default_rng([61, n])
     for _ in range(20):
         seen = sight(rng, n, half_field, 1e-5, angle)
@@ -98,7 +98,7 @@ def test_the_polynomials_root_is_the_largest_eigenvalue(seed: int, n: int) -> No
         unit(rng.normal(size=(n, 3))), unit(rng.normal(size=(n, 3))), np.full(n, 1.0 / n)
     )
     values = np.linalg.eigvalsh(davenport_matrix(profile))
-    # A simple root's error is rounding over the slope; of two that are close it is rounding's own root.
+    # The error of a simple root is rounding over the slope; that of two close roots is the root of rounding.
     slope = np.prod(values[3] - values[:3])
     assert largest_eigenvalue(profile) == pytest.approx(values[3], abs=min(1e-6, 1e-14 / slope))
 
@@ -133,14 +133,14 @@ def test_the_default_is_scipys_solution() -> None:
         seen = sight(rng, 20, _FIELD, 1e-5)
         rotation, root_loss = Rotation.align_vectors(seen.observed, seen.reference, weights=seen.sigma**-2.0)
         fix = solve(seen.observed, seen.reference, seen.sigma)
-        # scipy's quaternion turns vectors, ours turns axes: conjugate.
+        # scipy's quaternion rotates vectors and ours rotates axes, hence the conjugate.
         assert angle_between(fix.quaternion, conjugate(rotation.as_quat())) < 1e-10
         # scipy's loss is a difference of numbers 1e11 times as large.
         assert fix.loss == pytest.approx(0.5 * root_loss**2, rel=1e-3)
 
 
 def test_two_close_stars_are_settled_to_the_digits_that_their_directions_have() -> None:
-    """B alone leaves 1e-8 rad of the turn about two stars 1e-4 rad apart; two stars fix it in closed form."""
+    """B alone gives the rotation about stars 1e-4 rad apart to 1e-8 rad only; a closed form is exact."""
     rng = np.random.default_rng(65)
     for _ in range(20):
         seen = sight(rng, 2, None, 1e-9)

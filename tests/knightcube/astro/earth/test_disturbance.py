@@ -19,7 +19,7 @@ from tests.knightcube.gnc.control.pointing_requests import (
 )
 
 ARM = np.array([0.012, -0.009, 0.013])
-"""m."""
+"""Vector (m) from the centre of mass to the centre of pressure."""
 VIEWS = attitude_matrix(normalise(np.random.default_rng(5).normal(size=(200, 4))))
 SPEED, DENSITY = 7_600.0, 1e-12
 

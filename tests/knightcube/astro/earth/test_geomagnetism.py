@@ -12,8 +12,8 @@ from knightcube.errors import UsageError
 from sim_hal.worlds import magnetic_field as true
 from tests.support import build_igrf
 
-# NOAA NCEI, WMM2025 test values (WMM2025_TEST_VALUES.txt, as it ships in the PyPI package AHRS 0.4.0): year,
-# height km, latitude and longitude deg, north, east and down nT.
+# NOAA NCEI, WMM2025 test values (WMM2025_TEST_VALUES.txt in the PyPI package AHRS 0.4.0): year, height km,
+# latitude and longitude deg, north, east and down nT.
 NOAA = (
     (2025.0, 0.0, 80.0, 0.0, 6521.6, 145.9, 54791.5),
     (2025.0, 0.0, 0.0, 120.0, 39677.8, -109.6, -10580.2),
@@ -65,7 +65,7 @@ def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tup
 
 
 def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
-    """400 km, all over the Earth, 2025 to 2029.9: within 40 nT and 0.15 deg, 10 nT in the mean."""
+    """At 400 km, 2025 to 2029.9, the models agree within 40 nT and 0.15 deg, 10 nT on average."""
     rng = np.random.default_rng(5)
     away = rng.standard_normal((60, 3))
     positions = 6.778e6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
@@ -80,7 +80,7 @@ def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
 
 
 def test_the_true_field_has_no_sources_and_no_currents() -> None:
-    """Divergence and curl by central differences over 20 km: below 1e-6 of the field's own slope."""
+    """Divergence and curl by central differences over 20 km are below 1e-6 of the slope of the field."""
     place, step = np.array([3.1e6, -4.2e6, 4.3e6]), 2e4
     slope = np.empty((3, 3))
     for axis in range(3):
@@ -104,7 +104,8 @@ def test_the_ring_current_weakens_the_field_at_the_magnetic_equator() -> None:
     quiet = true.ring_current(DATE, 20e-9)
     assert np.linalg.norm(quiet) == pytest.approx(20e-9)
     north = celestial_to_terrestrial(DATE) @ quiet
-    # The dipole's pole of 2025 is at 80.8 N, 72.8 W (IGRF-14): the ring current's field points away from it.
+    # The dipole's pole of 2025 is at 80.8 N, 72.8 W (IGRF-14); the field of the ring current points away from
+    # it.
     _, latitude, _ = geodetic(-7e6 * north / np.linalg.norm(north))
     assert np.degrees(float(latitude)) == pytest.approx(80.8, abs=0.4)
 
@@ -160,7 +161,7 @@ def test_the_stored_table_is_the_builder_s() -> None:
 
 
 def test_many_positions_give_exactly_the_fields_of_each() -> None:
-    """From below the ground to the geostationary orbit, in the years of the model and after them."""
+    """Positions reach from below the ground to the geostationary orbit, also after the model's years."""
     generator = np.random.default_rng(3)
     directions = generator.normal(size=(100, 3))
     heights = np.geomspace(6.3e6, 4.2e7, 100)[:, None]

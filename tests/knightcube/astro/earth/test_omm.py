@@ -1,4 +1,4 @@
-"""Mean elements as CelesTrak and Space-Track publish them, and element sets that must be refused."""
+"""Tests of mean elements as CelesTrak and Space-Track publish them, and of refused element sets."""
 
 from __future__ import annotations
 

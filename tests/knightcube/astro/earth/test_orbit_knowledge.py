@@ -48,7 +48,7 @@ def test_the_frame_of_sgp4_is_turned_into_the_frame_of_the_stars_as_published() 
     np.testing.assert_allclose(mean_equator_to_celestial(date, -0.4399619) @ teme, celestial, atol=40.0)
     terrestrial = 1e3 * np.array([-1033.4793830, 7901.2952754, 6380.3565958])
     found = celestial_to_terrestrial(date, -0.4399619) @ celestial
-    # TT is 64.184 s ahead of UTC in 2004, not 69.184: precession and nutation do not notice.
+    # TT is 64.184 s ahead of UTC in 2004, not 69.184, which hardly affects precession and nutation.
     np.testing.assert_allclose(found, terrestrial, atol=40.0)
 
 
@@ -83,7 +83,7 @@ def fix_of(state: FloatArray, date: float, **spread: float) -> GpsFix:
 
 
 def test_a_fix_carried_on_is_where_another_integrator_has_the_satellite() -> None:
-    """Dormand and Prince's order 8 in sim_hal, 20 minutes on: to 20 m and 0.02 m/s."""
+    """Dormand and Prince's order 8 of sim_hal after 20 minutes agrees to 20 m and 0.02 m/s."""
     elements = KeplerianElements(
         semi_major_axis=EARTH_RADIUS + 380e3, eccentricity=0.002, inclination=0.9, ascending_node=1.0
     )
@@ -130,7 +130,7 @@ def _summed(line: str) -> str:
 
 
 def test_a_decayed_orbit_is_reported() -> None:
-    """The verification set's 28872, which SGP4 lets fall within 50 minutes of its epoch."""
+    """Satellite 28872 of the verification set decays within 50 minutes of its epoch according to SGP4."""
     first = "1 28872U 05037B   05333.02012661  .25992681  00000-0  24476-3 0  1534"
     second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"
     with pytest.raises(OrbitError, match="SGP4"):

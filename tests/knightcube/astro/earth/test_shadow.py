@@ -19,7 +19,7 @@ def _behind(depth: float, aside: float) -> FloatArray:
 
 @pytest.mark.parametrize("depth", [3000e3, 6500e3, 42_164e3, 384_400e3])
 def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
-    """By similar triangles from the two spheres' radii, to first order in the cone's angle."""
+    """The lengths follow by similar triangles from the radii, to first order in the cone angle."""
     inner = np.arcsin((SUN_RADIUS - EARTH_RADIUS) / ASTRONOMICAL_UNIT)
     outer = np.arcsin((SUN_RADIUS + EARTH_RADIUS) / ASTRONOMICAL_UNIT)
     umbra = EARTH_RADIUS / np.cos(inner) - depth * np.tan(inner)
@@ -34,7 +34,7 @@ def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
 
 
 def test_the_umbra_ends_where_hipparchus_had_it() -> None:
-    """1.38 million km behind the Earth: beyond it the Sun is a ring, of the discs' areas."""
+    """Beyond 1.38 million km the Sun is a ring, whose area is the difference of both discs."""
     tip = EARTH_RADIUS * ASTRONOMICAL_UNIT / (SUN_RADIUS - EARTH_RADIUS)
     assert tip == pytest.approx(1.384e9, rel=2e-3)
     assert sunlit_share(_behind(0.999 * tip, 0.0), SUN) == 0.0
@@ -71,7 +71,7 @@ def test_between_earth_and_sun_it_is_day_everywhere() -> None:
 
 
 def test_the_cylinder_is_as_wide_as_the_earth() -> None:
-    """Errata to 2.15: of the object's own position; at any depth the edge is one radius off the axis."""
+    """Errata to 2.15: the position is the object's, and at any depth the edge is one radius off the axis."""
     for depth in (1000e3, 42_164e3):
         assert sunlit_share(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical") == 0.0
         assert sunlit_share(_behind(depth, EARTH_RADIUS + 10.0), SUN, "cylindrical") > 0.0

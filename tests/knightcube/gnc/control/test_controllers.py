@@ -1,7 +1,4 @@
-"""Tests that each configured name gives its controller, and that all have the same interface.
-
-Each name in a configuration means its controller, and all of them keep to one interface.
-"""
+"""Tests that each configured name gives its controller, and that all have the same interface."""
 
 from __future__ import annotations
 

@@ -122,7 +122,8 @@ def test_a_fast_body_is_braked_not_pushed(speed: float) -> None:
     """The field is extrapolated between windows: at 10 rad/s it rotates by 2.5 rad in between."""
     body = FreeBody(np.array([0.0, speed, 0.0]), 4.5e-4, np.zeros(3), 1.05e-3 * np.eye(3), 4)
     rates, _ = fly(body, 15.0, Detumbler(SCHEDULE, BRAKING))
-    # 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time: 0.37 rad/s, as long as the field is known that well.
+    # 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time gives 0.37 rad/s, as long as the field is known
+    # accurately.
     assert rates[-1] < rates[0] - min(0.9 * speed, 0.33)
 
 

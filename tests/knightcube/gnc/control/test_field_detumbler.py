@@ -1,6 +1,6 @@
 """Tests of detumbling by magnetometer only: its start, and a spin about the field direction.
 
-The momentum plan removes what it says in the time it says, near the least time there is.
+The momentum plan must remove the planned momentum in the planned time, close to the minimum time.
 """
 
 from __future__ import annotations
@@ -152,11 +152,11 @@ def test_the_coils_never_spin_up_a_body_of_another_inertia_beyond_the_multiple(
 
 
 BIAS = np.array([4e-4, -3e-4, 5e-4])
-"""rad/s, of the gyro."""
+"""Gyro bias (rad/s)."""
 
 
 def test_with_a_gyro_a_slow_spin_along_the_field_is_never_made_faster() -> None:
-    """The field turns by a right angle in 178 s; in the least time the body would be spun up five times."""
+    """The field rotates by 90 deg in 178 s; the fastest plan would spin the body up fivefold."""
     speeds = fly(np.array([0.001, 0.0, 0.02]), 260.0, sooner=4.0, gyro=lambda rate: rate + BIAS)
     assert speeds.max() < 1.1 * speeds[0]
     assert speeds[-1] < math.radians(0.5)
@@ -175,7 +175,7 @@ def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
 
 @pytest.mark.parametrize("late", [0.001, 0.04])
 def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
-    """What lies along the field is first spun up across it, as the field turns."""
+    """The component along the field first grows across it while the field rotates."""
     speeds = fly(np.array([0.1, 0.05, 0.03]), 240.0, late=late)
     assert speeds[-1] < math.radians(0.5)
 
@@ -204,7 +204,7 @@ def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
 
 
 def test_a_spin_of_a_turn_in_two_seconds_is_braked() -> None:
-    """Half a turn from pause to pause, where B-dot brakes no more: the samples of one pause show the rate."""
+    """The body rotates by 180 deg between pauses, so only the samples within a pause show the rate."""
     speeds = fly(np.array([2.0, -2.4, 0.3]), 60.0)
     assert speeds[-1] < 0.95 * speeds[0]
 
@@ -225,7 +225,7 @@ def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
 
 @pytest.mark.parametrize("gyro", [True, False])
 def test_the_coils_act_soon_after_the_begin_by_a_rate_that_is_bounded(gyro: bool) -> None:
-    """Samples every 25 ms, coils off: a gyro tells the rate at once, the field alone within a second."""
+    """With the coils off, a gyro shows the rate at the first sample, and the field within a second."""
     law, rate, rng = detumbler(), np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
     law.begin(0)
     for now_ns in range(0, 2_000_000_000, 25_000_000):
@@ -348,7 +348,7 @@ def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
 
 
 def test_what_the_rest_allows_is_not_waited_for() -> None:
-    """A tenth of the momentum lies along the field, which takes longer to turn than the others to stop."""
+    """A tenth of the momentum is along the field, which rotates more slowly than the rest is removed."""
     momentum = np.array([1e-4, 0.0, 1e-5])
     exact, allowed = (
         momentum_plan(momentum, FIELD_AHEAD, TIMES, DIPOLE_LIMIT, rest) for rest in (1e-7, 1.2e-5)

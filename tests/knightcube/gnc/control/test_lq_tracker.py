@@ -26,7 +26,7 @@ WEIGHTS = 20.0, 1.0
 @settings(deadline=None)
 @given(st.floats(0.01, 1e4), st.floats(0.01, 1e3))
 def test_gains_are_those_of_a_general_solver(state_weight: float, input_weight: float) -> None:
-    """(5.28-5.32) with the state (e', e): the Riccati equation as scipy solves it."""
+    """The gains (5.28-5.32) with the state (e', e) are those of scipy's solution of the Riccati equation."""
     integrators, entry = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])
     riccati = solve_continuous_are(integrators, entry, state_weight * np.eye(2), [[input_weight]])
     expected = (entry.T @ riccati)[0] / input_weight
@@ -46,7 +46,7 @@ def fly(
     state: tuple[float, float],
     duration: float,
 ) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Return rows of (t, theta, omega, current), the tracker evaluated inside each Runge-Kutta stage."""
+    """Return rows of (t, theta, omega, current); each Runge-Kutta stage evaluates the tracker."""
     step, rows = 0.005, []
     x = np.array(state)
 
@@ -72,7 +72,7 @@ def path() -> PolynomialPath:
 
 
 def test_the_error_follows_the_linear_system_exactly(path: PolynomialPath) -> None:
-    """With e = sin(theta_p - theta), e'' = -K (e', e) from 0.6 rad off, while the coil is strong enough."""
+    """From 0.6 rad off, the error e obeys e'' = -K (e', e) while the coil is strong enough."""
     tracker = LqTracker(STRONG, *WEIGHTS)
     start = path.sample(0)
     run = fly(STRONG, tracker, path, (start.angle - 0.6, start.rate + 0.1), 4.0)
@@ -87,7 +87,7 @@ def test_the_error_follows_the_linear_system_exactly(path: PolynomialPath) -> No
 
 
 def test_the_second_derivative_of_the_error_is_exact(path: PolynomialPath) -> None:
-    """5.24, 5.25 corrected against differences of sin(theta_p - theta) along a made-up motion."""
+    """Compare 5.24 and 5.25 (corrected) with differences of the error along an artificial motion."""
     step = 1e-3
 
     def angles(time: float) -> tuple[float, float, float]:
@@ -104,7 +104,7 @@ def test_the_second_derivative_of_the_error_is_exact(path: PolynomialPath) -> No
         d = wanted.angle - angle
         exact = math.cos(d) * (wanted.acceleration - acceleration) - math.sin(d) * (wanted.rate - rate) ** 2
         assert exact == pytest.approx(numeric, abs=1e-6)
-        # The command makes the error's second derivative -K (e', e): undo the plant and compare.
+        # The commanded current must make the error's second derivative -K (e', e) through the plant model.
         command = tracker.command(wanted, angle, rate)
         turned = STRONG.acceleration(angle, rate, command.current)
         made = math.cos(d) * (wanted.acceleration - turned) - math.sin(d) * (wanted.rate - rate) ** 2

@@ -31,7 +31,7 @@ def torque_current(angle: float, acceleration: float) -> float:
 def test_the_gains_solve_the_riccati_equation_of_the_double_integrator() -> None:
     weight, cost = 7.0, 2.0
     rate_gain, error_gain = lq_gains(weight, cost)
-    # States e', e; A' P + P A - P B R^-1 B' P + Q = 0 with K = R^-1 B' P and Q = weight I.
+    # The states are e', e; A' P + P A - P B R^-1 B' P + Q = 0 with K = R^-1 B' P and Q = weight I.
     matrix, entry = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])
     other = rate_gain * error_gain * cost
     solution = np.array([[rate_gain * cost, error_gain * cost], [error_gain * cost, other]])
@@ -131,7 +131,7 @@ def test_an_error_beyond_one_radian_is_treated_as_one_radian(error: float, is_he
 
 @pytest.mark.parametrize("strength", [0.02, 0.4])
 def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reach(strength: float) -> None:
-    """Piecewise constant accelerations, integrated exactly."""
+    """Accelerations are piecewise constant and integrated exactly."""
     made = manoeuvres(strength, 0.2, 3.0)
     assert len(made) == 4
     extremes = []
@@ -154,7 +154,7 @@ def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reac
     assert extremes[0][1] == pytest.approx(0.75**2 * 0.2)
     assert made[1][2].duration == made[3][2].duration == 3.0
     assert made[1][2].share == 0.0
-    # The opposite pulse is a short one: a second at most.
+    # The opposite pulse is short: a second at most.
     short = made[0][3].duration
     assert short == pytest.approx(min(1.0, 0.5 * math.sqrt(0.2 / strength)))
     assert made[2][0].share == -made[0][0].share
@@ -181,7 +181,7 @@ def cycles(controller: ExcitationController, count: int, angle: float, rate: flo
 def test_a_manoeuvre_begins_after_a_second_at_rest(angle: float, rate: float, moves: bool) -> None:
     controller = ExcitationController(PLANT, PERIOD, SETTINGS)
     cycles(controller, 41, angle, rate)
-    # A pulse demands half of the coil's limit; the tracker demands a current of its own.
+    # A pulse demands half of the coil's limit; the tracker demands its own current.
     pulses = {round(abs(one.demanded), 9) for one in cycles(controller, 20, angle, rate)}
     assert (pulses == {0.074}) is moves
 
@@ -198,7 +198,7 @@ def test_a_body_that_does_not_come_to_rest_is_given_up_after_a_minute() -> None:
 
 
 def test_a_pulse_ends_where_the_body_could_not_be_stopped_within_the_bound() -> None:
-    """With 0.7 of the torque available: w^2 / (2 a) is the stopping distance."""
+    """With 0.7 of the torque available, the stopping distance is w^2 / (2 a)."""
     bound = angle_of(0.2)
     braking = 0.7 * 0.5 * STRENGTH * math.cos(0.3)
     limit = math.sqrt(2.0 * braking * (bound - 0.3))
@@ -215,7 +215,7 @@ def test_a_reset_skips_the_manoeuvre_that_was_under_way() -> None:
     assert cycles(controller, 45, 0.0, 0.0)[-1].current == pytest.approx(0.074)
     controller.reset()
     assert controller.command(REST, 0.0, 0.0).current == pytest.approx(0.0)
-    # The second manoeuvre: one pulse, one opposite, and a free swing.
+    # The second manoeuvre has one pulse, one opposite pulse, and a free swing.
     swing = [one.current for one in cycles(controller, 1000, 0.0, 0.0)]
     zeros = sum(1 for one in swing[41:] if one == 0.0)
     assert zeros >= round(2.0 / PERIOD)

@@ -1,7 +1,4 @@
-"""Tests that a body far off its path is damped in any attitude until it is slow.
-
-A body that is astray is held still: damping takes energy in any attitude, until the body is slow.
-"""
+"""Tests that a body far off its path is damped in any attitude until it is slow."""
 
 from __future__ import annotations
 
@@ -56,7 +53,7 @@ def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_
 
 @pytest.fixture(scope="module")
 def law() -> PointingLaw:
-    """Nadir along the flight; the orbit lies in the plane of the dipole, where the field turns least."""
+    """Return the nadir law; the orbit is in the plane of the dipole, where the field rotates least."""
     return PointingLaw(table_from(np.zeros(3), np.zeros(3), 290, until=6_500.0), LIMIT)
 
 
@@ -114,7 +111,7 @@ def test_the_shapes_are_constant_with_the_flight_and_with_the_sun() -> None:
     np.testing.assert_array_equal(torque[:, :, CONSTANT], np.tile(np.eye(3), (2, 1, 1)))
     for k, time in enumerate(times):
         place, flight = ORBIT.position_at(np.array([time]))[0], ORBIT.velocity_at(np.array([time]))[0]
-        flight = flight - np.cross([0.0, 0.0, 7.292115e-5], place)  # the air turns with the Earth
+        flight = flight - np.cross([0.0, 0.0, 7.292115e-5], place)  # the air rotates with the Earth
         np.testing.assert_allclose(torque[k, :, AIR].T @ flight, 0.0, atol=1e-8)
     day, night = (np.linalg.norm(torque[k, :, AIR]) for k in (0, 1))
     assert day > 1.3 * night
@@ -186,7 +183,7 @@ def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
     for _ in range(50):
         rate, field = 0.02 * rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
         torque = np.cross(damping_dipole(inertia, rate, field), field)
-        # The power of -J rate across the field; for equal moments never positive.
+        # Power of the torque -J rate across the field, which is never positive for equal moments.
         assert float(rate @ torque) < 1e-3 * float(np.linalg.norm(rate) * np.linalg.norm(torque))
         assert (
             abs(float(torque @ field)) < 1e-12 * float(np.linalg.norm(torque) * np.linalg.norm(field)) + 1e-24

@@ -125,7 +125,7 @@ def test_more_dipole_than_there_is_and_more_rate_than_allowed_are_refused() -> N
 
 
 def test_the_flow_of_an_error_is_the_derivative_of_the_acceleration(rolling: PlannedMotion) -> None:
-    """By differences: a rotation changes the torques of coils, gravity gradient, drag and solar pressure."""
+    """Compare with differences: a rotation changes the torques of coils, gravity, drag and sunlight."""
     ahead, count, size = expected(), 200, 1e-4
     motion = rolling.references(ahead.wanted.times).until(count)
     dipole = rolling.control[:count]
@@ -170,7 +170,7 @@ def test_a_begin_off_the_law_is_led_into_it() -> None:
 
 @pytest.mark.parametrize("roll", [60.0, -100.0])
 def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: float) -> None:
-    """Full steps with the derivative of the continuous motion gave motions with errors of 40 deg, or none."""
+    """Full steps with the derivative of the continuous motion would give errors of 40 deg, or no motion."""
     ahead = expected(BULGED)
     q = multiply(from_rotation_vector(np.radians([1.0, -1.0, roll])), ahead.wanted.quaternion[0])
     begun = ahead.wanted.until(KEPT + 1)
@@ -184,7 +184,7 @@ def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: 
 
 
 def test_the_derivative_of_a_step_is_exact(rolling: PlannedMotion) -> None:
-    """By differences, for a body that rotates at 2 deg/s, or 20 deg in a step."""
+    """Compare with differences, for a body that rotates at 2 deg/s, or 20 deg in a step."""
     ahead, size = expected(), 1e-6
     spun = PlannedMotion(rolling.quaternion, rolling.rate + np.array([0.02, -0.02, 0.02]), rolling.control)
     linear = derivative(ahead, spun)

@@ -22,7 +22,7 @@ def follow(
     """Simulate some seconds of a body that rolls about the Sun direction, and return the true direction."""
     rng = np.random.default_rng(3)
     for second in range(begin, end):
-        # The body turns about the Sun alone, so that its direction stays.
+        # The body rotates about the Sun only, so the Sun's direction in body axes is constant.
         rate = 2e-4 * SUN
         measured = rate + bias - propagated.bias
         propagated.propagate(second * SECOND_NS, attitude_matrix(from_rotation_vector(measured)))

@@ -21,7 +21,7 @@ def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
         angle = 4e-3 * k * STEP
         field = 3e-5 * np.array([np.cos(angle), np.sin(angle), 0.6])
         acting = coils * np.sin(0.7 * k * STEP)
-        # Held by a torque that the coils know of, the body stays slow.
+        # A known coil torque opposes the rate, so the body stays slow.
         hold = cross_product(field, -2e-5 * rate) / (field @ field)
         torque = cross_product(acting + hold + dipole, field) - cross_product(rate, INERTIA * rate)
         rate = rate + STEP * torque / INERTIA

@@ -1,14 +1,17 @@
 """Flights that compare the filter's errors with its covariance: NEES and NIS with all disturbances.
 
-Each run is sim_hal's testbed (suspended; a thread of 0..2e-5 N m/rad and 0..4e-6 N m s/rad unknown
-to the filter, and a draught; steps of q2 flown by the estimate itself) or of a body free in orbit (three
-axes, random attitude, a torque that walks at random, a field that turns). The coils' gain is off by 10 %
-(1 sigma). The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias, loses 2 %
-of its packets and falls silent twice for 0.5..1 s. Every 5 s the star camera gives, 0.2..0.6 s late, the mean
-rate over 1 s with a full covariance when the stars streak; on the free body it gives an attitude too.
+The worlds are sim_hal's testbed and a body that is free in orbit. The testbed has a thread of 0..2e-5 N m/rad
+and 0..4e-6 N m s/rad, which the filter does not know, and a torque of the air; the estimate steers it through
+steps of q2. The free body rotates about three axes from a random attitude, with a random walk of the torque
+and a rotating field. The coils' gain has an error of 10 % (1 sigma).
 
-NEES over its degrees of freedom is 1 for an honest covariance: 95 % band from chi-square over independent
-runs. NIS over its degrees of freedom has a band of the same kind, over all accepted measurements.
+The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias, loses 2 % of its
+packets and is silent twice for 0.5..1 s. Every 5 s the star camera gives, with a delay of 0.2..0.6 s, the
+mean rate over 1 s with a full covariance if the stars are streaks, and on the free body also an attitude.
+
+NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band is that of chi-square over
+independent runs. NIS divided by its degrees of freedom has a band of the same kind, over all accepted
+measurements.
 """
 
 from __future__ import annotations
@@ -61,7 +64,7 @@ Result = dict[str, Any]
 
 QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4
 EXPOSURE, CAMERA_PERIOD = 40, 200
-"""Cycles."""
+"""Exposure and period of the camera in cycles."""
 LEAST_STREAK = 1.0e-3
 """Length (rad) of the shortest streak: three px of a field of 20 deg."""
 RATE_SIGMAS: FloatArray = np.array([1.5e-5, 1.5e-5, 1.5e-4])
@@ -127,7 +130,7 @@ class Camera:
 
 
 class Pilot:
-    """Steers by the estimate: steps of q2 on the thread, or currents that excite all axes of a free body."""
+    """Steering by the estimate: steps of q2 on the thread, or excitation of all axes of a free body."""
 
     def __init__(self, rng: np.random.Generator, suspended: bool) -> None:
         self._suspended = suspended
@@ -163,12 +166,12 @@ def mean_rate(start: FloatArray, end: FloatArray, span: float) -> FloatArray:
 def seen_from(
     axes: FloatArray, sigmas: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return an error (3,) and its covariance (3, 3), of `sigmas` (3,) along the columns of `axes`."""
+    """Return a random error (3,) and its covariance, with `sigmas` (3,) along the columns of `axes`."""
     return axes @ (sigmas * rng.standard_normal(3)), (axes * sigmas**2) @ axes.T
 
 
 def random_axes(rng: np.random.Generator) -> FloatArray:
-    """Return three orthogonal directions (3, 3): a random camera mounting."""
+    """Return three orthogonal directions (3, 3), as a random mounting of the camera."""
     return np.asarray(np.linalg.qr(rng.standard_normal((3, 3)))[0])
 
 
@@ -181,7 +184,7 @@ LOST_SHARE = 0.02
 
 @dataclass(slots=True)
 class Tally:
-    """What one run adds up."""
+    """Sums of one run."""
 
     nis: dict[str, list[float]] = field(default_factory=dict)
     nees: list[float] = field(default_factory=list)
@@ -196,7 +199,7 @@ class Tally:
 
 
 def filter_of(world: World) -> AttitudeFilter:
-    """Return the filter for a world, with its noise settings but without its unknown errors."""
+    """Return the filter for a world: it has the noise settings, but not the unknown errors."""
     push = DRAUGHT if world.suspended else DRAG
     settings = replace(
         KNOWN_PLANT,
@@ -212,7 +215,7 @@ def filter_of(world: World) -> AttitudeFilter:
 
 
 def run(scene: str, seed: tuple[int, ...], seconds: int = SECONDS, claimed: float = 1.0) -> Result:
-    """Fly `testbed` or `free`; `claimed` multiplies the claimed variances of the IMU."""
+    """Fly `testbed` or `free`; `claimed` multiplies the assumed variances of the IMU."""
     rng = np.random.default_rng(seed)
     world: World = SuspendedWorld(rng) if scene == "testbed" else FreeWorld(rng)
     bias = rng.normal(0.0, BIAS_SIGMA, 3)
@@ -260,7 +263,7 @@ def _result(suspended: bool, tally: Tally, bias: FloatArray, last: Estimate) -> 
 
 
 def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
-    """Return error^T P^-1 error of the free errors."""
+    """Return error^T P^-1 error of the free error states."""
     turn = to_rotation_vector(multiply(world.attitude, conjugate(estimate.quaternion)))
     error = np.concatenate(
         [

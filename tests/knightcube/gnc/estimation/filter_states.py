@@ -26,7 +26,7 @@ NO_ERRORS = BodyErrors(
 
 
 def moved(state: FilterState, error: FloatArray) -> FilterState:
-    """Return the state with an error put in."""
+    """Return the state plus an error."""
     e = error.tolist()
     return FilterState(
         compose(exponential(*e[0:3]), state.quaternion),

@@ -42,7 +42,7 @@ RATE_COVARIANCE: FloatArray = np.eye(3) * RATE_SIGMA**2
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Truth (n, 4) and (n, 3), samples, commands; cycle k is at k CYCLE_NS, its command holds from then."""
+    """Truth (n, 4) and (n, 3), samples and commands; cycle k is at k CYCLE_NS, when its command begins."""
 
     attitudes: FloatArray
     rates: FloatArray
@@ -60,7 +60,7 @@ def fly(
     amplitude: float = 0.05,
     driven: Callable[[int, FloatArray], FloatArray] = lambda _, command: command,
 ) -> Flight:
-    """Return a flight with noise of the unit and of the coils, a gyro bias and a thread or a drag.
+    """Return a flight with noise of the unit and of the coils, a gyro bias, and a thread or drag.
 
     `amplitude` (A) is the amplitude of the currents; `driven` gives the coils' currents by cycle and command.
     """
@@ -88,7 +88,7 @@ def fly(
 
 
 def begin(flight: Flight, suspended: bool, settings: FilterSettings = SETTINGS) -> AttitudeFilter:
-    """Return a filter started on the first sample of a flight."""
+    """Return a filter that starts on the first sample of a flight."""
     filter_ = AttitudeFilter(SUSPENDED if suspended else FREE, settings)
     filter_.start(*flight.samples[0])
     filter_.command(0, flight.commands[0], flight.fields[0])

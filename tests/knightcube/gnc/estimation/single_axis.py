@@ -1,13 +1,12 @@
 """A linear Kalman filter of the rotation about the thread, as reference for the three-axis filter.
 
-Its states are angle, rate and disturbance.
-The angle theta = 2 asin q2 is used rather than q2 because its kinematics are linear (Sease 5.9 is not):
-theta' = omega, omega' = u + d, with u the acceleration that the plant model gives for the known current and d
-what the model does not know (the thread's torque), a random walk. Each measurement is applied at its own
-time. After a late measurement, the later measurements are applied again. A rate from a streaked image is the
-mean rate over its exposure. Until the exposure ends, the angle at its start is kept as one more state
-(stochastic cloning, Roumeliotis and Burdick 2002), so that an acceleration within the exposure does not
-contradict the mean.
+Its states are angle, rate and disturbance. The angle theta = 2 asin q2 is used instead of q2, because its
+kinematics are linear (Sease 5.9 is not): theta' = omega and omega' = u + d. The acceleration u is that of the
+plant model for the known current. The disturbance d, such as the thread's torque, is a random walk. Each
+measurement is applied at its own time. After a late measurement, the later measurements are applied again. A
+rate from a streaked image is the mean rate over its exposure. Until the exposure ends, the angle at its start
+is an additional state (stochastic cloning, Roumeliotis and Burdick 2002), so an acceleration within the
+exposure does not contradict the mean.
 """
 
 from __future__ import annotations
@@ -46,13 +45,14 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class FilterSettings:
-    """Noise and bounds of the filter.
+    """Noise and limits of the filter.
 
     Attributes:
-        current_noise: A, standard deviation of the coil current about its command, one draw a cycle.
-        control_period: s.
-        disturbance_walk: rad/s^2 per sqrt(s), the random walk of the unmodelled acceleration.
-        disturbance_start: rad/s^2, standard deviation of that acceleration at the start.
+        current_noise: standard deviation (A) of the coil current about its command, independent in each
+        cycle.
+        control_period: control period, s.
+        disturbance_walk: random walk of the unmodelled acceleration, rad/s^2 per sqrt(s).
+        disturbance_start: standard deviation of that acceleration at the start, rad/s^2.
         gate_sigma: largest normalised innovation of an accepted measurement.
         history_ns: largest delay of a measurement that is used, ns.
     """
@@ -76,7 +76,7 @@ class _Checkpoint:
 
 
 class SingleAxisFilter:
-    """Holds the estimate, its recent measurements and the recent commands."""
+    """The estimate, its recent measurements and the recent commands."""
 
     REJECTIONS_TO_RESTART = 40
     """Number of refused measurements in a row after which the filter restarts."""
@@ -127,7 +127,7 @@ class SingleAxisFilter:
         return used
 
     def at(self, time_ns: int) -> Estimate:
-        """Return the estimate propagated to `time_ns`; the filter itself stays where it is."""
+        """Return the estimate propagated to `time_ns`; the filter itself does not change."""
         last = self._history[-1]
         newest = next((c for c in reversed(self._history) if c.used), last)
         state, covariance = self._propagate(last.state, last.covariance, last.measurement.time_ns, time_ns)

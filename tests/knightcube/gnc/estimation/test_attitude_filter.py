@@ -51,7 +51,7 @@ def assert_same(a: Estimate, b: Estimate) -> None:
 
 @BOTH
 def test_late_measurements_give_what_they_would_have_given_in_time(suspended: bool) -> None:
-    """A mean rate and a star attitude in the middle of its exposure, in all orders of arrival."""
+    """A mean rate, and a star attitude in the middle of its exposure, arrive in all orders."""
     flight = fly(1, 100, suspended)
     mean = exposure(flight, 40, 60, 1e-10 * np.eye(3))
     off = multiply(from_rotation_vector(np.full(3, 1e-5)), flight.attitudes[50])
@@ -88,7 +88,7 @@ def test_exposures_may_overlap(suspended: bool) -> None:
 
 @BOTH
 def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
-    """A bias of 1 mrad/s is found to 2 % in 20 s of attitudes and rates."""
+    """In 20 s of attitudes and rates, a bias of 1 mrad/s is found to 2 %."""
     flight = fly(3, 800, suspended)
     filter_ = begin(flight, suspended)
     follow(filter_, flight)
@@ -100,7 +100,7 @@ def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
 
 
 def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> None:
-    """All within three sigma after 30 s; torsion and gain ten times better known than before."""
+    """After 30 s errors are within three sigma, and torsion and gain are known ten times better."""
     flight = fly(4, 1200, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -149,7 +149,7 @@ def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
 def test_a_drop_out_widens_the_covariance_and_is_recovered_from(suspended: bool) -> None:
     """In three seconds without samples, sigma grows and the error stays within four sigma.
 
-    Then both recover.
+    Afterwards both decrease again.
     """
     flight = fly(7, 500, suspended)
     filter_ = begin(flight, suspended)

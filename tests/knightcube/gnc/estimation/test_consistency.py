@@ -19,7 +19,7 @@ def fly(scene: str, runs: int, **parameters: float) -> list[Result]:
 
 @pytest.fixture(scope="module")
 def flown() -> dict[str, list[Result]]:
-    """Return honest runs of both scenes."""
+    """Return runs of both scenes with correct claims."""
     return {"testbed": fly("testbed", 8), "free": fly("free", 3)}
 
 
@@ -27,7 +27,7 @@ def flown() -> dict[str, list[Result]]:
 def test_errors_and_innovations_are_as_large_as_the_filter_says(
     scene: str, flown: dict[str, list[Result]]
 ) -> None:
-    """Final NEES in its 99.9 % band; NIS of 40 Hz measurements within 4 %, of the camera's within a half."""
+    """The final NEES is in its 99.9 % band, the NIS at 40 Hz within 4 %, and the camera's within half."""
     results = flown[scene]
     runs = len(results)
     facts = consistency.scene_facts(results)

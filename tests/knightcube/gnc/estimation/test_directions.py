@@ -89,7 +89,7 @@ def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
         for measurement in (seen, wide)
     ]
     assert squares[0] > 0.01
-    # The plane is across the expected direction, 2 mrad off: its square remains.
+    # The plane is normal to the expected direction, 2 mrad off, so the square of the innovation stays.
     assert squares[1] == pytest.approx(squares[0], rel=0.05)
 
 
@@ -153,7 +153,7 @@ def test_a_wrong_direction_does_not_pass_the_gate_and_a_right_one_does() -> None
 
 
 def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> None:
-    """300 nT of hard iron, 20 nT of noise, 100 readings of a body that tumbles: to 2 nT, and it says so."""
+    """100 readings of a tumbling body with 20 nT of noise give 300 nT of hard iron to 2 nT, as claimed."""
     rng = np.random.default_rng(6)
     flight = fly(4, 400, False)
     filter_ = AttitudeFilter(FREE, replace(SETTINGS, field_bias_start=5e-7))

@@ -36,7 +36,7 @@ def problem(measured: int, seed: int = 3) -> tuple[FloatArray, FloatArray, Float
 
 
 def joseph(covariance: FloatArray, gain: FloatArray, rows: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the covariance after a correction with any gain, by Joseph's form."""
+    """Return the covariance after a correction with an arbitrary gain, by Joseph's form."""
     keep = np.eye(len(covariance)) - gain @ rows
     return np.asarray(keep @ covariance @ keep.T + gain @ noise @ gain.T)
 

@@ -34,7 +34,7 @@ SETTINGS = FreeFilterSettings()
 
 
 class Sky:
-    """A body at rest in a field that turns and is off its model by a Gauss-Markov process of `sigma` T."""
+    """A body at rest in a rotating field whose model has a Gauss-Markov error of `sigma` (T)."""
 
     def __init__(self, sigma: float, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -97,7 +97,7 @@ def test_a_contradicted_estimate_expects_the_error_of_the_start_again() -> None:
 
 @pytest.mark.parametrize("sigma", [1e-8, 5e-8])
 def test_without_stars_the_attitude_is_off_by_what_is_claimed(sigma: float) -> None:
-    """Five times without stars for 1,000 s, with stars for 300 s in between."""
+    """The body is five times without stars for 1,000 s, with 300 s of stars in between."""
     nees, claims, sky = [], [], copy.deepcopy(flown_with_stars(sigma))
     for _ in range(5):
         sky.fly(300.0, stars=True)

@@ -22,7 +22,7 @@ def settings(inertia: FloatArray = INERTIA) -> FieldRateSettings:
 
 
 def tumbling(rate: FloatArray, inertia: FloatArray, times: FloatArray, dipole: FloatArray) -> FloatArray:
-    """Return rate and field (n, 6) in body axes, by an integrator that knows nothing of the filter's."""
+    """Return rate and field (n, 6) in body axes, by an integrator that is independent of the filter."""
 
     def flow(time: float, state: FloatArray) -> FloatArray:
         w = state[4:]
@@ -42,7 +42,7 @@ def tumbling(rate: FloatArray, inertia: FloatArray, times: FloatArray, dipole: F
 def follow(
     rate: FloatArray, truth: FloatArray, seconds: float, seed: int = 1
 ) -> tuple[FieldRate, FloatArray]:
-    """Feed a filter a sample each 0.2 s; return the filter and the last true state."""
+    """Give a filter a sample every 0.2 s; return the filter and the last true state."""
     times = np.arange(0.0, seconds, 0.2)
     states = tumbling(rate, truth, times, DIPOLE)
     rng, found = np.random.default_rng(seed), FieldRate(settings())
@@ -78,7 +78,7 @@ def test_an_inertia_off_by_several_per_cent_is_found_from_the_tumble(seed: int) 
 
 
 def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() -> None:
-    """In a field that does not turn nobody can see it."""
+    """The field does not rotate, so the spin along it is not observable."""
     found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
     for _ in range(50):
         found.advance(np.zeros(3), 0.2)
@@ -89,7 +89,7 @@ def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() ->
 
 
 def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
-    """A body at rest in a field that does not turn: nothing but the gyro shows what turns along the field."""
+    """The body is at rest in a constant field, so only the gyro shows rotation about the field."""
     found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
     false = 0.05 * FIELD / np.linalg.norm(FIELD)
 

@@ -40,7 +40,7 @@ POSITION = np.array([6.878e6, 0.0, 0.0])
 
 
 def around(time: float) -> FilterEnvironment:
-    """Return a field that turns by two turns in 95 min; no air, no light, a gradient of nothing."""
+    """Return a field that makes two rotations in 95 min, without air, sunlight and gravity gradient."""
     turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * time, 0.0])))
     nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
     return FilterEnvironment(turned.T @ np.array([1e-5, 2e-5, 3e-5]), 1e3 * POSITION, nothing, 0.0)
@@ -49,7 +49,7 @@ def around(time: float) -> FilterEnvironment:
 def fly(
     seconds: int, seed: int, age: float = 0.0, settings: FreeFilterSettings | None = None
 ) -> tuple[FreeFilter, FloatArray, FloatArray]:
-    """Return the filter, the true attitude and rate after `seconds` of drift, stars each 10 s."""
+    """Return the filter and the true attitude and rate after `seconds` of drift, with stars every 10 s."""
     rng = np.random.default_rng(seed)
     found = FreeFilter(INERTIA, settings or FreeFilterSettings())
     q, w = IDENTITY, np.array([1e-3, -5e-4, 8e-4])
@@ -114,7 +114,7 @@ def test_two_directions_make_a_coarse_attitude_fine_and_a_false_one_is_refused()
     assert found.knowledge is Knowledge.COARSE
     precise = 1e-4**2 * np.eye(3)
     for reference in np.eye(3)[:2]:
-        for _ in range(2):  # the first is off by a degree: linear in small turns only
+        for _ in range(2):  # the first update starts a degree off, and is linear in small rotations only
             assert found.direction(attitude_matrix(true) @ reference, reference, precise) or found.refused
     assert found.knowledge.value == "fine"
     assert angle_between(found.quaternion, true) < 2e-3

@@ -40,14 +40,14 @@ BIAS = np.array([4e-5, -3e-5, 2e-5])
 AXES_TURN = np.array([0.004, 0.012, -0.010])
 GYRO_SIGMA, STAR = 4.4e-5, 5e-5
 CYCLES = 40
-"""Of the coils, a second."""
+"""Number of coil cycles per second."""
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 NOTHING = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
 AROUND = FilterEnvironment(FIELD, np.array([6.878e9, 0.0, 0.0]), NOTHING, 0.0)
 
 
 class Craft:
-    """A rigid body whose principal axes are turned, with gyros that have a bias."""
+    """A rigid body with rotated principal axes, and gyros with a bias."""
 
     def __init__(self, turn: FloatArray, rate: FloatArray, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -56,7 +56,7 @@ class Craft:
         self.quaternion, self.rate = IDENTITY, rate
 
     def second(self, dipole: FloatArray, noise: float) -> FloatArray:
-        """Fly a second under a dipole (3,) A m^2 with `noise` A m^2 of each cycle; return the gyro's mean."""
+        """Simulate a second under a dipole (3,) with `noise` (A m^2) per cycle; return the gyro's mean."""
         dt, rates, inverse = 1.0 / CYCLES, [], np.linalg.inv(self.inertia)
         for _ in range(CYCLES):
             acting = dipole + noise * self.rng.standard_normal(3)
@@ -70,7 +70,7 @@ class Craft:
         return np.asarray(np.mean(rates, axis=0) + BIAS + GYRO_SIGMA * self.rng.standard_normal(3))
 
     def seen(self, sigma: float) -> FloatArray:
-        """Return the attitude with an error of `sigma` rad an axis."""
+        """Return the attitude with an error of `sigma` (rad) per axis."""
         return multiply(from_rotation_vector(sigma * self.rng.standard_normal(3)), self.quaternion)
 
 
@@ -81,7 +81,7 @@ def errors(found: FreeFilter, craft: Craft) -> FloatArray:
 
 
 def fly(craft: Craft, found: FreeFilter, seconds: int, dipole: FloatArray, noise: float) -> None:
-    """Fly with a gyro each second and stars each ten."""
+    """Simulate with a gyro mean every second and stars every ten."""
     for second in range(1, seconds + 1):
         mean = craft.second(dipole, noise)
         found.begin_mean()
@@ -92,7 +92,7 @@ def fly(craft: Craft, found: FreeFilter, seconds: int, dipole: FloatArray, noise
 
 
 def started(craft: Craft, settings: FreeFilterSettings) -> FreeFilter:
-    """Return a filter with a star's attitude and one sample of the gyro."""
+    """Return a filter with a star attitude and one sample of the gyro."""
     found = FreeFilter(INERTIA, settings)
     gyro = craft.rate + BIAS + GYRO_SIGMA * craft.rng.standard_normal(3)
     found.start(craft.seen(STAR), STAR**2 * np.eye(3), gyro, by_stars=True)
@@ -157,7 +157,7 @@ def test_the_first_seconds_of_a_fast_tumble_do_not_make_the_inertia_too_certain(
 
 
 def inertia_square(found: FreeFilter, craft: Craft) -> float:
-    """Return the squared error of the inertia, normalised by its covariance: chi-square with 6."""
+    """Return the NEES of the inertia, a chi-square with 6 degrees of freedom."""
     true = (craft.inertia - INERTIA) / np.trace(INERTIA)
     error = true[[0, 1, 2, 1, 2, 0], [0, 1, 2, 2, 0, 1]] - found._constants[INERTIA_ERROR]
     return float(error @ np.linalg.solve(found.covariance[INERTIA_ERROR, INERTIA_ERROR], error))
@@ -227,7 +227,7 @@ def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> N
 
 
 def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
-    """False directions had taught it. Kept as a guess, it led each new start astray until the next star."""
+    """False directions caused the bias. As an initial value, it would lead each new start astray."""
     craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
     known = settings.error_state(INERTIA).prior[SLOW, SLOW]
     taught = np.zeros(len(known))
@@ -244,7 +244,7 @@ def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
 
 
 def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_size() -> None:
-    """In heavy air a walk of a constant size is too small, and the filter refuses stars in the end."""
+    """In dense air a constant random walk is too small, and the filter would reject stars in the end."""
     settings = FreeFilterSettings(errors=NO_ERRORS)
     prior = settings.error_state(INERTIA).prior[SLOW, SLOW]
     first, seconds = TORQUES.start - SLOW.start + AIR.start, 100
@@ -263,7 +263,7 @@ def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_
 
 
 def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
-    """Half a second of rest and half a second of a dipole have the mean of half the dipole for a second."""
+    """A dipole in the second half of a step rotates the body less than its mean over the whole step."""
     dipole = np.array([0.0, 0.09, 0.0])
     apart, together = (FreeFilter(INERTIA, FreeFilterSettings(errors=NO_ERRORS)) for _ in range(2))
     for found in (apart, together):
@@ -281,7 +281,7 @@ def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
 
 
 def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time() -> None:
-    """A body that rotates shows a pulse another field at the end of a step than in its middle."""
+    """The field in the axes of a rotating body differs between the middle and the end of a step."""
     spin, dipole = np.array([0.05, -0.1, 0.08]), np.array([0.09, -0.05, 0.02])
     rates = []
     for late in (False, True):
@@ -300,14 +300,14 @@ def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time()
 
 
 def test_after_a_large_correction_the_remaining_error_is_that_of_the_corrected_axes() -> None:
-    """The direction that a measurement shows accurately is fixed in space, not in the body."""
+    """The direction that a measurement determines accurately is fixed in space, not in the body."""
     prior, noise = 0.3**2 * np.eye(3), np.diag([1.0, 1e-4, 1e-4]) ** 2
     wide = FreeFilter(INERTIA, FreeFilterSettings(errors=NO_ERRORS))
     wide.start(IDENTITY, prior, np.zeros(3))
     assert wide.attitude(from_rotation_vector(np.array([0.0, 0.4, 0.0])), noise)
     covariance = wide.covariance[ATTITUDE, ATTITUDE]
     correction = to_rotation_vector(wide.quaternion)
-    # An error e before the correction c is log(exp(e) exp(-c)) after it.
+    # An error e before the correction c becomes log(exp(e) exp(-c)).
     drawn = np.random.default_rng(3).multivariate_normal(
         np.zeros(3), np.linalg.inv(np.linalg.inv(prior) + np.linalg.inv(noise)), 4000
     )

@@ -34,7 +34,7 @@ def test_the_coefficients_give_eulers_acceleration_of_a_full_tensor() -> None:
 
 @pytest.mark.parametrize("believed", [CUBESAT_3U, KNIGHTCUBE])
 def test_the_modes_span_other_bodies_and_gyros_with_weights_of_about_one(believed: FloatArray) -> None:
-    """The acceleration that a wrong gyro shows of a wrong body is explained to a hundredth of the error."""
+    """The modes explain the apparent acceleration of a wrong body and gyro to a hundredth of the error."""
     rng = np.random.default_rng(7)
     modes = coefficient_modes(believed, BodyErrors())
     for _ in range(20):

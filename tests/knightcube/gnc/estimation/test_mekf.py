@@ -44,7 +44,7 @@ def walks_of(bias: float, disturbance: float) -> FloatArray:
 
 
 def difference(a: FilterState, b: FilterState) -> FloatArray:
-    """Return the error (19,) of b, by which it is off a."""
+    """Return the error (19,) of b relative to a."""
     turn = logarithm(compose(a.quaternion, inverse(b.quaternion)))
     mine, theirs = (
         np.array([*s.rate, *s.bias, *s.disturbance, *s.parameters, s.latency, *s.field_bias]) for s in (a, b)
@@ -53,7 +53,7 @@ def difference(a: FilterState, b: FilterState) -> FloatArray:
 
 
 def test_the_transition_is_how_errors_grow() -> None:
-    """Columns by central differences over one cycle; the remainder is of the third order of the step."""
+    """Compare with central differences over one cycle; the remainder is of third order in the step."""
     for body, state, free in ((FREE, STATE, [*range(12), 14]), (SUSPENDED, HUNG, ABOUT_THREAD)):
         step = 1e-5
         for column in free:
@@ -62,13 +62,13 @@ def test_the_transition_is_how_errors_grow() -> None:
             down, _ = propagate(body, STILL, moved(state, -bump), np.eye(SIZE), TORQUING, 0.025)
             covariance = np.outer(bump, bump) / step**2
             _, carried = propagate(body, STILL, state, covariance, TORQUING, 0.025)
-            # The square root of a covariance of rank one is the column, up to its sign.
+            # The square root of a covariance of rank one is the column up to its sign.
             grown = difference(up, down) / (2.0 * step)
             np.testing.assert_allclose(carried, np.outer(grown, grown), atol=3e-5)
 
 
 def test_a_step_is_the_product_of_the_whole_matrices() -> None:
-    """Transition, noise and a kept attitude as plain dense products (22, 22), to rounding."""
+    """Compare with dense products (22, 22) of transition, noise and a cloned attitude, up to rounding."""
     rng = np.random.default_rng(4)
     rate_noise = np.diag(rng.uniform(0.0, 1e-8, 3))
     noise = ProcessNoise(1e-7, rate_noise, rng.uniform(0.0, 1e-9, SIZE), unknown_current=0.1)
@@ -86,7 +86,7 @@ def test_a_step_is_the_product_of_the_whole_matrices() -> None:
 def dense_step(
     body: RigidBody, noise: ProcessNoise, state: FilterState, torquing: Torquing, dt: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transition and added noise (22, 22) of one step with one kept attitude, written out whole."""
+    """Return transition and added noise (22, 22) of one step with one cloned attitude, as dense matrices."""
     middle = compose(exponential(*(0.5 * dt * w for w in state.rate)), state.quaternion)
     model = body.linearise(middle, state.rate, state.parameters, torquing, 0.5 * dt)
     flow, added = np.zeros((22, 22)), np.zeros((22, 22))
@@ -102,7 +102,7 @@ def dense_step(
 
 
 def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
-    """Diagonals of 4000 draws over 20 cycles of noise held, walked and integrated: within 10 %."""
+    """The diagonals over 4000 random sequences of 20 cycles with held noise agree within 10 %."""
     rng = np.random.default_rng(3)
     draws, cycles, dt = 4000, 20, 0.025
     sigma, walk, bias_walk = 2e-3, 5e-4, 1e-5
@@ -172,13 +172,13 @@ def test_correcting_by_an_exact_attitude_gives_that_attitude() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
-    """Exact and hopeless measurements in any order, from one rad to a microradian."""
+    """Accurate and useless measurements come in any order, from one radian to a microradian."""
     rng = np.random.default_rng(seed)
     noise = ProcessNoise(1e-7, np.zeros((3, 3)), walks_of(1e-9, 1e-9))
     state, covariance = STATE, np.diag(10.0 ** rng.uniform(-8.0, 0.0, SIZE))
     for _ in range(20):
         size = 10.0 ** rng.uniform(-12.0, 0.0)
-        # As predicted: the covariance does not know, and the body is not torn about.
+        # Each measurement equals its prediction, so it changes the covariance only.
         if rng.random() < 0.5:
             seen = AttitudeMeasurement(0, np.array(state.quaternion), size * np.eye(3))
             found = innovation(state, seen, False)

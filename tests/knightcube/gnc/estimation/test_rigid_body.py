@@ -56,7 +56,7 @@ def test_free_it_obeys_eulers_equation() -> None:
 def test_its_derivatives_are_those_of_its_acceleration(suspended: bool) -> None:
     thread = {"stiffness": 1e-5, "damping": 2e-6} if suspended else {}
     body = RigidBody(SKEWED, DIPOLE, FIELD, suspended, **thread)
-    # A turn that is not about the thread changes the twist otherwise: off the thread there is no truth.
+    # A rotation that is not about the thread changes the twist differently.
     q = exponential(0.0, 0.7, 0.0) if suspended else Q
     model = body.linearise(q, RATE, body.parameters, body.torquing(CURRENTS), 0.0)
     step = 1e-6

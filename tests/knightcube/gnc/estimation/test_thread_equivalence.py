@@ -24,11 +24,11 @@ from tests.knightcube.gnc.estimation.single_axis_flights import PERIOD, PLANT, S
 from tests.support.consistency_worlds import KNOWN_PLANT
 
 ODD: FloatArray = np.array([3e-3, 0.0, -1e-2])
-"""rad/s about the other axes: no business of the thread's."""
+"""Rate (rad/s) about the other axes, which does not affect the thread."""
 
 
 def on_three_axes(measurement: single_axis.Measurement) -> Measurement:
-    """Return a scalar measurement as one of three axes."""
+    """Return a scalar measurement as a measurement of three axes."""
     covariance = measurement.variance * np.eye(3)
     if measurement.component == single_axis.ANGLE:
         return AttitudeMeasurement(measurement.time_ns, about_axis_y(measurement.value), covariance)
@@ -39,7 +39,7 @@ def on_three_axes(measurement: single_axis.Measurement) -> Measurement:
 
 
 def largest_difference(driven: bool) -> tuple[float, float]:
-    """Return how far estimates (in sigma) and covariances (relative) of both filters are ever apart."""
+    """Return the largest differences of estimates (in sigma) and covariances (relative) of both filters."""
     truth, commands, measurements = simulate(np.random.default_rng(3), 300)
     gain = PLANT.torque_constant / PLANT.inertia
     settings = replace(
@@ -49,7 +49,7 @@ def largest_difference(driven: bool) -> tuple[float, float]:
         disturbance_start=SETTINGS.disturbance_start,
         bias_start=0.0,
         bias_walk=0.0,
-        # The single axis takes the coil's noise as that of a coil across the field, at every angle.
+        # The single-axis filter assumes the coil noise of a coil across the field at every angle.
         rate_walk=gain * SETTINGS.current_noise * math.sqrt(SETTINGS.control_period),
     )
     one, three = single_axis.SingleAxisFilter(PLANT, SETTINGS), AttitudeFilter(SUSPENDED, settings)
@@ -88,7 +88,7 @@ def test_adrift_the_two_filters_agree_to_rounding() -> None:
 
 
 def test_driven_they_differ_by_what_the_single_axis_leaves_out() -> None:
-    """The torque's change with the angle, which it knows in the state and not in the covariance: 0.5 %."""
+    """The single-axis filter includes the change of torque with angle in the state only: 0.5 %."""
     states, covariances = largest_difference(driven=True)
     assert states < 5e-3
     assert covariances < 5e-3

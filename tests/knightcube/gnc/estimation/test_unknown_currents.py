@@ -16,7 +16,7 @@ from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight,
 from tests.support.consistency_worlds import CYCLE_NS
 
 STUCK, FOUND, FREE_AGAIN, END = 400, 420, 600, 800
-"""Cycles: the chip keeps its registers, half a second later that is found, then it obeys again."""
+"""Cycles: the chip gets stuck, this is found half a second later, and the chip works again."""
 LIMIT = 0.148
 
 
@@ -31,7 +31,7 @@ def flown() -> Flight:
 
 
 def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
-    """Return the filter after the flight; the loop may report from `FOUND` on that the chip does not obey."""
+    """Return the filter after the flight; the loop may report from `FOUND` that the chip does not respond."""
     filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
     follow(filter_, flown, 1, min(FOUND, until))
     if reported:

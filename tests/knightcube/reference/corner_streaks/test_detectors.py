@@ -28,7 +28,7 @@ def _patch(rows: list[list[float]]) -> FloatArray:
 
 
 def _by_the_corrected_equations(patch: FloatArray) -> float:
-    """Return 3.9-3.13 corrected at the middle of a 3 x 3 patch, in the thesis's own symbols."""
+    """Return the corrected 3.9-3.13 at the centre of a 3 x 3 patch, in the thesis's own symbols."""
     centre, right, left, below, above = patch[1, 1], patch[1, 2], patch[1, 0], patch[2, 1], patch[0, 1]
     r_a = (right - centre) ** 2 + (left - centre) ** 2
     r_b = (below - centre) ** 2 + (above - centre) ** 2
@@ -42,7 +42,7 @@ def _by_the_corrected_equations(patch: FloatArray) -> float:
 
 
 def _by_brute_force(patch: FloatArray, neighbours: int) -> float:
-    """Return the least squared change over 4001 diameters, the ring's intensities interpolated linearly."""
+    """Return the smallest squared change over 4001 diameters, with linear interpolation along the ring."""
     ring = [(1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0), (0, 1), (0, 2)]
     chosen = ring if neighbours == 8 else ring[::2]
     values = np.array([patch[place] for place in chosen]) - patch[1, 1]
@@ -55,10 +55,10 @@ def _by_brute_force(patch: FloatArray, neighbours: int) -> float:
 
 
 def test_a_patch_computed_by_hand() -> None:
-    """Centre 5; right 1, left 3, below 8, above 6: r_A = 16 + 4, r_B = 9 + 1.
+    """The centre is 5; right 1, left 3, below 8, above 6: r_A = 16 + 4, r_B = 9 + 1.
 
-    B1 = (8-1)(1-5) + (6-3)(3-5) = -34, B2 = (8-3)(3-5) + (6-1)(1-5) = -30; B = -34, C = 20,
-    A = 10 - 20 + 68 = 58, A + B = 24 > 0: R = 20 - 34^2/58 = 2/29.
+    B1 = (8-1)(1-5) + (6-3)(3-5) = -34, B2 = (8-3)(3-5) + (6-1)(1-5) = -30; B = -34, C = 20, A = 10 - 20 + 68
+    = 58, A + B = 24 > 0: R = 20 - 34^2/58 = 2/29.
     """
     patch = _patch([[0, 6, 0], [3, 5, 1], [0, 8, 0]])
     assert simple_response(patch, 4)[1, 1] == 10.0
@@ -66,13 +66,13 @@ def test_a_patch_computed_by_hand() -> None:
 
 
 def test_where_no_direction_between_is_lower_the_simple_response_stands() -> None:
-    """Right 1, left 3, below 1, above 1 about 5: B1 = B2 = (-2)(-2) = 4, not negative."""
+    """The pixels right 1, left 3, below 1 and above 1 around 5 give B1 = B2 = (-2)(-2) = 4, not negative."""
     patch = _patch([[0, 1, 0], [3, 5, 1], [0, 1, 0]])
     assert interpixel_response(patch, 4)[1, 1] == 20.0
 
 
 def test_eight_neighbours_by_hand() -> None:
-    """All of the ring 0 but the corner pair f = i = 5 about 5: along that diagonal nothing changes."""
+    """The ring is 0 except f = i = 5, around 5: along that diagonal the intensity does not change."""
     patch = _patch([[5, 0, 0], [0, 5, 0], [0, 0, 5]])
     assert simple_response(patch, 4)[1, 1] == 50.0
     assert simple_response(patch, 8)[1, 1] == 0.0
@@ -87,7 +87,7 @@ def test_with_four_neighbours_it_is_the_corrected_equations() -> None:
 
 
 def test_the_printed_b1_would_not_be_the_least_change() -> None:
-    """3.12 as printed mixes two diameters; the corrected one is what brute force finds."""
+    """Equation 3.12 as printed mixes two diameters; the corrected one agrees with an exhaustive search."""
     patch = _patch([[0, 6, 0], [3, 5, 1], [0, 8, 0]])
     printed = (8 - 1) * (1 - 5) + (6 - 1) * (3 - 5)
     assert printed != -34
@@ -110,8 +110,8 @@ def test_edges_and_flat_parts_answer_nothing_and_corners_do(neighbours: int) -> 
     response = trajkovic_response(image, neighbours, 0.05, 0.05)
     assert response[20, 35] == 0.0
     assert response[5, 5] == 0.0
-    # By hand: r_A = r_B = 1, B = B2 = -1, A = 2 with four; with eight the diagonal below left adds nothing
-    # lower.
+    # By hand with four neighbours: r_A = r_B = 1, B = B2 = -1, A = 2; with eight the lower left diagonal adds
+    # nothing lower.
     assert response[20, 20] == pytest.approx(0.5 if neighbours == 4 else 1.0)
 
 
@@ -165,7 +165,7 @@ def _streak(roll: float, length: float = 40.0) -> tuple[FloatArray, FloatArray]:
     return image, true_endpoints(camera, star, rotation)[0]
 
 
-# Trajkovic's neighbours see slanting streaks otherwise than straight ones: no constant takes that away.
+# The response of Trajkovic's detectors depends on the direction of a streak, which no constant corrects.
 _TOLERANCE: dict[DetectorName, float] = {
     "harris": 0.1,
     "minimum-eigenvalue": 0.1,
@@ -177,7 +177,7 @@ _TOLERANCE: dict[DetectorName, float] = {
 _ROLLS = [0.0, 0.4, 0.8, 1.6, 2.5]
 
 
-# Four neighbours take a streak near the diagonals for a row of corners, and it is refused.
+# With four neighbours, a streak near the diagonals looks like a row of corners, and is refused.
 _TOO_SLANTED = [0.8, 2.5]
 
 
@@ -212,7 +212,7 @@ def test_without_its_constant_each_detector_is_biased_inward_by_it(detector: Det
 
 @pytest.mark.parametrize("detector", DETECTOR_NAMES)
 def test_a_crossing_of_two_streaks_has_not_two_corners(detector: DetectorName) -> None:
-    """Four ends, or for Trajkovic-4, whose response grows with brightness, the crossing alone."""
+    """There are four ends; Trajkovic-4, whose response grows with brightness, sees only the crossing."""
     crossing = _streak(0.0)[0] + _streak(0.5 * np.pi)[0]
     assert len(_corners(crossing, StreakSettings.of(detector))) != 2
 
@@ -223,7 +223,7 @@ def test_trajkovic_4_refuses_a_streak_near_a_diagonal(roll: float) -> None:
 
 
 def test_the_centre_of_intensity_of_the_image_lies_far_inside_the_streak() -> None:
-    """The thesis's own localisation: streaks.md has 2.2 px for 7 x 7 pixels."""
+    """The thesis uses this localisation: streaks.md states 2.2 px for 7 x 7 pixels."""
     image, truth = _streak(0.0)
     found = np.linalg.norm(np.diff(_corners(image, StreakSettings(centre_of="image")), axis=0))
     assert 1.5 < 0.5 * (np.linalg.norm(truth[1] - truth[0]) - found) < 2.5

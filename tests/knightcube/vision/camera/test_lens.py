@@ -1,9 +1,4 @@
-"""Tests of the calibrated lens against the pinhole and against its own polynomial, and of rejected lenses.
-
-Tests of the pinhole camera against its definition.
-
-The exposure time is chosen by the rate, so that streaks have a measurable length.
-"""
+"""Tests of the calibrated lens against the pinhole and its own polynomial, and of rejected lenses."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class Instant:
 
     @property
     def sun_in_body(self) -> FloatArray:
-        """The truth (3,)."""
+        """True direction (3,) of the Sun."""
         return np.asarray(attitude_matrix(self.attitude) @ self.sun)
 
     def knowledge(self, sigma: float = 0.05) -> HorizonKnowledge:

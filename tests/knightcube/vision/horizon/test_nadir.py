@@ -1,6 +1,6 @@
 """Tests of the nadir from rendered frames: in daylight, at the terminator, and without a limb.
 
-Tests of the nadir from several cameras: a joint fit of the limb, and a coarse nadir without a limb in view.
+With several cameras: a joint fit of the limb, and a coarse nadir without a limb in view.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def dusk() -> tuple[EarthScene, Image]:
 
 
 def known(one: EarthScene) -> HorizonKnowledge:
-    """Return what a GPS receiver knows."""
+    """Return the prior knowledge of a GPS receiver."""
     return HorizonKnowledge(position=one.position, sun=one.sun, pole=one.pole)
 
 

@@ -1,9 +1,7 @@
-"""Tests of the three indicators: by hand, for stars at every angle, and for objects that are not stars.
+"""Tests of the detection of objects.
 
-Tests of objects among stars: detections, false alarms and overlaps with stars.
-
-Tests of objects that cross in the frame, from pixels to tracks, and of the attitude from a crowded sky at
-rest.
+The indicators are tested by hand, for stars at every angle, and for objects. Frames test detections, false
+alarms, overlaps with stars, objects that cross, and the attitude from a crowded sky at rest.
 """
 
 from __future__ import annotations

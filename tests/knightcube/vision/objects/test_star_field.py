@@ -21,7 +21,7 @@ SIGMA = 0.1 * PIXEL
 
 
 def sky(rng: np.random.Generator, density: int = 900) -> FloatArray:
-    """Return stars over the whole sky, about 7 in a field of 20 deg of 900."""
+    """Return `density` stars over the whole sky; 900 stars are about 7 in a field of 20 deg."""
     stars = rng.standard_normal((density, 3))
     return np.asarray(stars / np.linalg.norm(stars, axis=1, keepdims=True))
 
@@ -38,7 +38,7 @@ def seen(stars: FloatArray, attitude: FloatArray, rng: np.random.Generator) -> F
 
 
 def flown(rate: FloatArray, error: float, frames: int) -> list[tuple[FloatArray, LocatedFrame, FieldPoints]]:
-    """Return true attitudes, results and points of frames a second apart, the object being the last point."""
+    """Return true attitudes, results and points of frames a second apart; the last point is the object."""
     rng = np.random.default_rng(4)
     stars, field, rows = sky(rng, 4000), StarField(), []
     start = from_rotation_vector(np.array([0.3, -0.2, 0.9]))

@@ -56,7 +56,7 @@ def spoilt_scene(scene: Scene, kind: str, number: int) -> Scene:
 
 
 def found_boresight(scene: Scene) -> FloatArray | None:
-    """Return the boresight (3,) found by the star tracker; None where it refuses."""
+    """Return the boresight (3,) that the star tracker finds, or None if it refuses the frame."""
     field = scene.field_deg
     camera, scale = believed(scene.pixels, field, field * (1.0 - FIELD_SHARE), field * (1.0 + FIELD_SHARE))
     found = solve_frame(scene.pixels, camera, scale, _EXPOSURE, sky(), SolveSettings())

@@ -45,7 +45,7 @@ def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> 
 
 
 def test_only_a_reach_below_the_useful_one_is_left_out() -> None:
-    """Half of the stars are strewn and half are beside each other, where the brightest are many or few."""
+    """Half of the stars are random, and half are close together where bright stars are many or few."""
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(2000, 2)
     both = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(2000)])
     direction = np.random.default_rng(3).permutation(both)

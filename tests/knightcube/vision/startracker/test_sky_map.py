@@ -1,7 +1,4 @@
-"""Tests of right ascension, declination and roll against known directions.
-
-Tests of aberration against its published constant, its geometry, and the published velocity of the Earth.
-"""
+"""Tests of right ascension, declination and roll, and of aberration."""
 
 from __future__ import annotations
 

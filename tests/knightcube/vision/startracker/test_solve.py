@@ -1,7 +1,4 @@
-"""Tests of the attitude from a frame with points, with streaks, with a prior, and without usable stars.
-
-Tests of the attitude error at mid-exposure if the body accelerates or vibrates.
-"""
+"""Tests of the attitude from frames with points, streaks, priors, no stars, and uneven motion."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Tests of the bound on chance matches against random stars, and of the order statistic against enumeration.
-
-Tests of tracking from a prior, and of the verification that all methods share.
-"""
+"""Tests of the bound on chance matches, of tracking from a prior, and of the verification."""
 
 from __future__ import annotations
 
@@ -50,10 +47,9 @@ def _chance(observed: int, spread: float) -> Chance:
 def test_the_bound_is_not_below_what_strewn_stars_show() -> None:
     """Sky and image are random sets of ten stars in a unit square.
 
-    All rotations and shifts at a known scale are tried.
-
-    Every pair of image stars is aligned with every sky pair of equal length, and the largest number of
-    matches is counted. The frequency of five matches is compared with the bound.
+    All rotations and shifts at a known scale are tried. Every pair of image stars is aligned with every sky
+    pair of equal length, and the largest number of matches is counted. The frequency of five matches is
+    compared with the bound.
     """
     rng = np.random.default_rng(5)
     sigma, gate, stars, trials, reached = 0.004, 3.0, 10, 120, 0

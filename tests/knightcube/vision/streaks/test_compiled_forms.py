@@ -1,4 +1,4 @@
-"""The compiled forms of the streak fit equal their numpy forms for the arguments of real fits."""
+"""Tests that compiled and numpy forms of the streak fit agree for the arguments of real fits."""
 
 from __future__ import annotations
 

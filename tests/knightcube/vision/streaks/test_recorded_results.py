@@ -1,4 +1,4 @@
-"""The motion of small simulated frames is that of the record, to five digits, with all its attributes."""
+"""Tests that the motion of small simulated frames equals the record to five digits, with all attributes."""
 
 from __future__ import annotations
 

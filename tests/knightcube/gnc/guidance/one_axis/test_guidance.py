@@ -31,7 +31,7 @@ def newer() -> StepPlan:
 
 @pytest.fixture
 def guidance(good: StepPlan) -> PathGuidance:
-    """Return guidance that flies `good` since 100 s."""
+    """Return guidance that follows `good` from 100 s on."""
     guidance = PathGuidance(KNIGHTCUBE, RULES)
     guidance.aim(TARGET)
     assert guidance.offer(good, 100 * SECOND, 100 * SECOND, START, 0.0).accepted
@@ -75,7 +75,7 @@ def spoilt(path: PolynomialPath, row: int, value: float) -> PolynomialPath:
 def refused(
     guidance: PathGuidance, offered: StepPlan, origin: float, now: float, angle: float, rate: float
 ) -> str:
-    """Return why `offered` is refused; the path being flown must be the old one still."""
+    """Return why `offered` is refused, and check that the old path is still followed."""
     before = guidance.path
     verdict = guidance.offer(offered, round(origin * SECOND), round(now * SECOND), angle, rate)
     assert not verdict.accepted
@@ -99,11 +99,11 @@ def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) 
 
 
 def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
-    """A ripple of Chebyshev degree 40, too fine for 24 nodes: nothing at most of them, amperes between."""
+    """A ripple of Chebyshev degree 40 is too fine for 24 nodes: zero at most nodes, amperes between them."""
     count = 41
     columns = np.zeros((count, 3))
     columns[-len(newer.path.series) :] = newer.path.series
-    columns[0, 2] = 0.02  # on q2'' only, as a planner's error between nodes would be
+    columns[0, 2] = 0.02  # in q2'' only, like a planner's error between nodes
     rippled = replace(newer.path, series=tuple((a, b, c) for a, b, c in columns.tolist()))
     assert "limit is 0.148 A" in refused(guidance, replace(newer, path=rippled), 101, 101, START, 0.004)
 
@@ -206,7 +206,7 @@ def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: PathGuidance)
 
 
 def test_the_limit_is_judged_under_the_disturbance_that_the_plan_allowed_for() -> None:
-    """A push of 0.03 rad/s^2 takes 108 mA to hold against: with it this path is within the limit."""
+    """With a disturbance of 0.03 rad/s^2, which takes 108 mA to compensate, the path is within the limit."""
     pushed = replace(KNIGHTCUBE, disturbance=0.03)
     helped = plan(pushed, 0.1, 0.0, 0.2, 0.0, 5.5)
     guidance = PathGuidance(KNIGHTCUBE, RULES)

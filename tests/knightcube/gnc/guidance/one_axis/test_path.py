@@ -1,7 +1,4 @@
-"""Tests of Legendre-Gauss-Lobatto nodes against published values and their exactness.
-
-The cubic prey of 5.35-5.38.
-"""
+"""Tests of Legendre-Gauss-Lobatto nodes and their exactness, and of the cubic prey of 5.35-5.38."""
 
 from __future__ import annotations
 
@@ -88,7 +85,7 @@ def test_the_prey_joins_both_states(
 
 
 def test_coefficients_are_those_of_equations_5_37_and_5_38() -> None:
-    """By hand for 0.4 at 0.01 to -0.3 at 0 in 10 s: C2 = [3 (-0.7) - 0.2]/100, C3 = (-0.01 + 0.46)/300."""
+    """By hand for 0.4 at 0.01 to -0.3 at rest in 10 s: C2 = [3 (-0.7) - 0.2]/100, C3 = (-0.01 + 0.46)/300."""
     prey = CubicPrey.between(0.4, 0.01, -0.3, 0.0, 10.0)
     assert (prey.c0, prey.c1) == (0.4, 0.01)
     assert prey.c2 == pytest.approx(-0.023, abs=1e-15)

@@ -53,7 +53,7 @@ def test_q2_and_angle_are_two_names_of_one_motion(angle: float, rate: float) -> 
 
 
 def test_the_acceleration_of_q2_is_the_derivative_of_the_rate() -> None:
-    """Along q2 = 0.5 sin(0.3 t), against central differences of 5.9."""
+    """Compare with central differences of 5.9 along q2 = 0.5 sin(0.3 t)."""
     step = 1e-5
 
     def rate_at(time: float) -> float:

@@ -17,7 +17,7 @@ from tests.support.recorded_results import check
 
 
 def plant(current_limit: float | None = None) -> SingleAxisPlant:
-    """Return the demonstration's testbed, with another limit of its currents, A."""
+    """Return the demonstration's testbed with another current limit (A)."""
     config = demo_config(1.0)
     if current_limit is not None:
         coils = configuration.replace(config.coils, current_limit=current_limit)

@@ -1,7 +1,4 @@
-"""Tests that paths are optimal within the planning horizon, and of their values beyond it.
-
-Which horizon a path gets, where it begins, and what it allows for.
-"""
+"""Tests that paths are optimal over the planning horizon, and of the horizon, start and limits of a path."""
 
 from __future__ import annotations
 
@@ -46,7 +43,7 @@ THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
 
 
 def peak_between_nodes(problem: Problem, found: StepPlan) -> float:
-    """Return the largest |I| over the limit on 2001 even points of the flown path."""
+    """Return the largest |I| over the limit at 2001 uniform points of the path."""
     motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 2001))
     return float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
 
@@ -60,7 +57,7 @@ def flown_energy(problem: Problem, found: StepPlan) -> float:
 
 @pytest.mark.parametrize("problem", [*STEPS, THESIS], ids=lambda p: f"{p.start_q2}->{p.end_q2}")
 def test_the_cost_is_within_half_a_percent_of_the_oracle_at_the_same_horizon(problem: Problem) -> None:
-    """The steps of the demonstration in 10 s, and the thesis's slew at the horizon the planner chose."""
+    """The problems are the steps in 10 s, and the thesis's slew over the planner's horizon."""
     found = problem.planned()
     optimum = solve(problem.slew(found.horizon), intervals=800)
     assert optimum is not None
@@ -76,7 +73,7 @@ def test_a_step_of_a_tenth_is_optimal_within_ten_seconds(problem: Problem) -> No
 
 
 def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
-    """Median within 0.1 %, worst within 1 %; every horizon there is 1.1 times the shortest or more."""
+    """The median is within 0.1 % and the worst within 1 %; horizons are 1.1 times the shortest or more."""
     ratios = []
     for known in known_optima():
         found = known.problem.planned()
@@ -89,15 +86,15 @@ def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
 
 
 def bang_bang_time(problem: Problem) -> float:
-    """Return the shortest time without a thread: full torque one way, then the other, one switch.
+    """Return the shortest time without a thread: full torque in one direction, then in the other.
 
-    Energy gives the switch: J w^2/2 changes by the torque constant times I times the change of sin(theta);
-    time is the integral of d(theta)/w, with theta = end + x^2 taking the root out of each end.
+    Energy determines the switch: J w^2/2 changes by the torque constant times I times the change of
+    sin(theta). Time is the integral of d(theta)/w; theta = end + x^2 removes the square root at each end.
     """
     pull = problem.plant.torque_constant * problem.plant.current_limit / problem.plant.inertia
     start, end = angle_of(problem.start_q2), angle_of(problem.end_q2)
     sign = math.copysign(1.0, end - start)
-    # A first rate against the slew is stopped first: the bang carries the body out to where it rests.
+    # A rate against the slew is removed first: the torque moves the body outwards to the point of rest.
     sine = math.sin(start) - sign * problem.start_rate**2 / (2.0 * pull)
     rest = math.asin(sine)
     switch = math.asin(0.5 * (sine + math.sin(end)))
@@ -180,7 +177,7 @@ def test_the_reference_point_changes_the_parameters_and_not_the_path() -> None:
 
 @pytest.mark.parametrize("horizon", [9.0, 14.0])
 def test_gradients_are_exact(horizon: float) -> None:
-    """Energy and limits against central differences, by every parameter and by the horizon."""
+    """Compare energy and limits with central differences by every parameter and by the horizon."""
     family = PathFamily.around(BoundaryStates(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
     program = PathProgram(THREAD, family, 0.68, horizon, PathCost.HEAT)
     rng = np.random.default_rng(0)
@@ -222,7 +219,7 @@ def test_a_plan_survives_the_way_to_another_process() -> None:
 
 
 def test_staying_where_one_is_costs_nothing() -> None:
-    """The trivial problem, which NLopt may end as limited by rounding."""
+    """NLopt may end this trivial problem with the status of rounding errors."""
     found = plan(KNIGHTCUBE, 0.2, 0.0, 0.2, 0.0, 10.0)
     assert found.status == PlanStatus.OPTIMAL
     assert found.energy == pytest.approx(0.0, abs=1e-12)
@@ -230,7 +227,7 @@ def test_staying_where_one_is_costs_nothing() -> None:
 
 
 def test_q2_is_kept_within_its_bound_where_the_optimum_would_pass_it() -> None:
-    """Moving outwards the free optimum swings to 0.48; bounded at 0.465 it turns earlier and pays for it."""
+    """The free optimum moves outwards to 0.48; with the bound 0.465 it reverses earlier at a higher cost."""
 
     def largest_q2(found: StepPlan) -> float:
         angle, *_ = found.path.motion(np.linspace(0.0, found.horizon, 999))
@@ -248,7 +245,7 @@ def test_q2_is_kept_within_its_bound_where_the_optimum_would_pass_it() -> None:
 def test_an_optimiser_that_gives_no_path_is_an_error_and_no_plan(
     monkeypatch: pytest.MonkeyPatch, failure: str
 ) -> None:
-    """NLopt hands NaN back without an exception, and raises where a problem is trivial or infeasible."""
+    """NLopt returns NaN without an exception, and raises for trivial or infeasible problems."""
 
     class Failing(nlopt.opt):  # type: ignore[misc]  # nlopt has no types
         def optimize(self, start: FloatArray) -> FloatArray:
@@ -289,13 +286,13 @@ def test_what_cannot_be_planned_is_refused_with_its_reason(
 
 
 def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
-    """The steps and the twenty known problems; `python -m tests.studies.bench plan` measures."""
+    """The problems are the steps and the twenty known ones; the benchmark `plan` measures more."""
     problems = [*STEPS, THESIS, *(known.problem for known in known_optima())]
     assert np.median([ordinary_seconds(problem.planned, 2) for problem in problems]) < 0.003
 
 
 def test_the_planner_starts_without_scipys_optimisers() -> None:
-    """They cost half a second of import on board."""
+    """Their import takes half a second on board."""
     code = "import sys, knightcube.gnc.guidance.one_axis.guidance; print('scipy.optimize' in sys.modules)"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == "False"
@@ -305,13 +302,13 @@ CARRIED = replace(KNIGHTCUBE, stiffness=2e-5, damping=2e-6, disturbance=-3e-3)
 
 
 def test_the_shortest_times_are_the_published_ones() -> None:
-    """Twenty problems solved by collocation elsewhere: the shooting that the tests use agrees to 1e-3."""
+    """For twenty problems solved by another collocation, the shooting method of the tests agrees to 1e-3."""
     for known in known_optima():
         assert shortest_time(known.problem.slew(1.0)) == pytest.approx(known.shortest, rel=1e-3)
 
 
 def test_from_a_tenth_above_the_shortest_horizon_on_paths_are_optimal_and_within_the_limits() -> None:
-    """A slice of `python -m tests.studies.bench plan`: thread, disturbance and moving ends among them."""
+    """A slice of `python -m tests.studies.bench plan` with thread, disturbance and moving ends."""
     costs = []
     for problem, shortest in feasible_problems(40, seed=11):
         found = problem.planned()
@@ -334,7 +331,7 @@ def test_a_horizon_just_long_enough_is_kept_or_stretched_by_less_than_a_percent(
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1e-3, 2e-2), st.floats(2e-5, 2e-3))
 def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price: float) -> None:
-    """With cos(theta) = 1 the least energy is 12 R (a/g)^2 / T^3; the price is its slope."""
+    """With cos(theta) = 1 the minimum energy is 12 R (a/g)^2 / T^3; the cost of time equals its slope."""
     gain = KNIGHTCUBE.torque_constant / KNIGHTCUBE.inertia
     expected = (36.0 * KNIGHTCUBE.resistance * (angle / gain) ** 2 / price) ** 0.25
     found = plan(KNIGHTCUBE, 0.0, 0.0, q2_of(angle), 0.0, 10.0, time_cost=price)
@@ -344,7 +341,7 @@ def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price
 
 
 def test_no_horizon_nearby_is_better_at_the_price() -> None:
-    """Against the collocation oracle at other horizons, energy and price of time added."""
+    """Compare with the sum of energy and time cost of the collocation oracle at other horizons."""
     price = 0.2
     for problem, _ in feasible_problems(10, seed=3):
         found = problem.planned(time_cost=price)
@@ -370,7 +367,7 @@ def test_an_impossible_price_is_refused(price: float) -> None:
 
 
 def rest_of(problem: Problem, found: StepPlan, share: float) -> tuple[Problem, int]:
-    """Return the remaining path after `share` of it, from a little off it, and the time elapsed in ns."""
+    """Return the path after the fraction `share`, from slightly off it, and the elapsed time (ns)."""
     elapsed_ns = round(share * found.horizon * 1e9)
     at = found.path.sample(elapsed_ns)
     left = Problem(
@@ -395,7 +392,7 @@ def test_the_last_path_makes_the_next_plan_cheaper_and_changes_nothing_else() ->
         np.testing.assert_allclose(warm.node_q2, cold.node_q2, atol=1e-4)
         cold_total += cold.evaluations
         warm_total += warm.evaluations
-    # How many it takes differs a little with the processor's rounding.
+    # The number of evaluations differs slightly with the rounding of the processor.
     assert warm_total < 0.9 * cold_total
 
 
@@ -408,7 +405,7 @@ def test_a_last_path_that_does_not_fit_does_no_harm() -> None:
 
 
 def test_the_planned_current_flies_the_body_under_thread_and_disturbance_to_its_moving_end() -> None:
-    """Open loop: the path's current in the equation of motion, by Runge-Kutta, ends where the plan ends."""
+    """Without feedback, the path's current in the equation of motion ends where the plan ends."""
     found = plan(CARRIED, 0.1, 0.01, -0.2, 0.015, 11.0)
     count = 2200
     step = found.horizon / count

@@ -50,7 +50,7 @@ def test_nadir_along_the_flight_turns_once_an_orbit_about_the_pitch_axis() -> No
 
 
 def test_rate_and_acceleration_carry_the_attitude_on() -> None:
-    """Over a ground target at 3 km/s and more, where both change all the time."""
+    """The target is on the ground at 3 km/s and more, where rate and acceleration change all the time."""
     beneath = celestial_to_terrestrial(JULIAN_DATE) @ ORBIT.position_at(np.array([300.0]))[0]
     longitude, latitude, _ = (float(part) for part in geodetic(beneath))
     law = AttitudeLaw(Z, ground(latitude, longitude), X, velocity)
@@ -64,7 +64,7 @@ def test_rate_and_acceleration_carry_the_attitude_on() -> None:
     assert np.linalg.norm(found.rate, axis=1).max() > 5.0 * RATE
     overhead = law.attitudes(ORBIT, np.array([300.0]))[0]
     down = nadir(ORBIT, np.array([300.0]))[0]
-    # 300 s of the Earth's turn move the place by 1.3 deg, seen from 500 km.
+    # In 300 s the Earth's rotation moves the target by 1.3 deg as seen from 500 km.
     assert np.degrees(np.arccos(attitude_matrix(overhead)[2] @ down)) < 20.0
 
 

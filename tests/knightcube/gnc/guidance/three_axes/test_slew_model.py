@@ -1,7 +1,4 @@
-"""Tests of cubic Hermite interpolation against scipy and cubic functions.
-
-Cubic Hermite interpolation against scipy's, and exact on cubics.
-"""
+"""Tests of cubic Hermite interpolation against scipy and cubic functions."""
 
 from __future__ import annotations
 

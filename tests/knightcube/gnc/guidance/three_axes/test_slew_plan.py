@@ -49,7 +49,7 @@ def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> No
 
 
 def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
-    """Case 21 of `bench orbit_slews`: none of its guesses comes to a path over the asked time."""
+    """In case 21 of `bench orbit_slews` no initial guess leads to a path over the requested time."""
     *_, (_, task) = slews(22, 1, False)
     plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
@@ -74,7 +74,7 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
 
 
 def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> None:
-    """Case 0 of `bench orbit_slews --cones --seed 43`: without limits every path goes through one."""
+    """In case 0 of `bench orbit_slews --cones --seed 43` every path without limits passes through a cone."""
     (_, task), *_ = slews(1, 43, True)
     plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
@@ -84,7 +84,7 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 
 @pytest.mark.parametrize(("seed", "case"), [(43, 18), (43, 40), (44, 44)])
 def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
-    """Turns about the field led all guesses of the first two through cones, which were refused."""
+    """Rotations about the field lead all guesses of the first two slews through cones, which are refused."""
     *_, (_, task) = slews(case + 1, seed, True)
     plan = plan_task(task)
     assert plan.peak <= 1.001
@@ -95,7 +95,7 @@ def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int,
 
 
 def test_a_path_beyond_the_limit_when_flown_takes_longer() -> None:
-    """Case 27 of `bench orbit_slews --seed 44`: closed, its dipoles were 1.4 % over their limit."""
+    """In case 27 of `bench orbit_slews --seed 44` the dipoles with feedback exceed their limit by 1.4 %."""
     *_, (_, task) = slews(28, 44, False)
     plan = plan_task(task)
     assert plan.status is SlewStatus.STRETCHED
@@ -164,7 +164,7 @@ def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() 
     tilted = plan_order(replace(order, craft=turned, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert tilted.energy == pytest.approx(along.energy, rel=1e-4)
     assert tilted.path.heat(turned.weights) == pytest.approx(tilted.energy, rel=1e-3)
-    # The heat of each body axis alone gives another path, which heats more.
+    # A plan with the heat of each body axis alone gives another path with more heat.
     alone = replace(turned, weights=np.diag(turned.weights))
     careless = plan_order(replace(order, craft=alone, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert careless.path.heat(turned.weights) > 1.02 * along.energy

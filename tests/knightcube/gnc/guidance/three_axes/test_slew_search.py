@@ -11,7 +11,7 @@ from tests.support.random_slews import slews
 
 
 def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep_the_cones() -> None:
-    """Case 0 of `bench orbit_slews --cones --seed 43`: without limits every path goes through one."""
+    """In case 0 of `bench orbit_slews --cones --seed 43` every path without limits passes through a cone."""
     (_, task), *_ = slews(1, 43, True)
     solver = SlewSolver(task)
     equations = solver.equations(task.horizon, 24)

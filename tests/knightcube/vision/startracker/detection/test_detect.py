@@ -1,8 +1,6 @@
-"""Tests of detection: stars in simulated frames are found, measured to the bound, and told from others.
+"""Tests of detection: simulated stars are found, measured to the bound, and distinguished from other points.
 
-Tests of detection near predicted star positions.
-
-Tests on real photographs: the brightest detections are catalogue stars at their true positions.
+Further tests are detection near predicted positions, and the brightest detections of real photographs.
 """
 
 from __future__ import annotations

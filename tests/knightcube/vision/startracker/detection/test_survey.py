@@ -1,7 +1,4 @@
-"""Tests of the steps of the survey against independent computations.
-
-Tests on star frames with foregrounds and defects.
-"""
+"""Tests of the steps of the survey against independent computations, and on frames with defects."""
 
 from __future__ import annotations
 
