@@ -1,4 +1,4 @@
-"""Build hooks of the documentation site: guides are listed before module pages in the search results."""
+"""Build hooks of the documentation site: guides are listed before results, decisions and module pages."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
-_MODULE_PAGES = "reference/"
-_WEIGHT_OF_MODULES = 0.2  # relative to a guide with the same words
+_WEIGHTS = {"reference/": 1e-3, "decisions/": 0.1, "sources/": 0.1, "architecture": 0.1, "results/": 0.25}
+"""Weights in the search by the beginning of a page's path, relative to a guide with the same words.
+
+A word in a title weighs 1,000 times as much as a word in the text.
+"""
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
-    """Lower the weight of the page of a module in the search; return its text unchanged."""
-    if page.file.src_uri.startswith(_MODULE_PAGES):
-        page.meta["search"] = {"boost": _WEIGHT_OF_MODULES}
+    """Set the weight of a page in the search, unless the page sets it; return its text unchanged."""
+    for start, weight in _WEIGHTS.items():
+        if page.file.src_uri.startswith(start):
+            page.meta.setdefault("search", {"boost": weight})
     return markdown

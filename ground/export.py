@@ -7,6 +7,7 @@ per element, such as quaternion_1 to quaternion_4. Numbers are written with full
 from __future__ import annotations
 
 import csv
+import math
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
@@ -59,17 +60,25 @@ def write_csv(run: Run, folder: Path) -> list[Path]:
     """Write `<packet>.csv` for each packet type, and return the files. Raises OSError.
 
     The first row contains the names of the columns, and all other rows contain values. The file `fields.csv`
-    has one row for each column of each packet type, with its unit and meaning.
+    has one row for each column of each packet type, with its unit and meaning. NaN is written as `NaN`,
+    because polars reads a column with `nan` as text.
     """
     paths, described = [], []
     for name, columns in tables(run):
         paths.append(folder / f"{name}.csv")
         described += [(name, column.name, column.unit, column.meaning) for column in columns]
-        values = [v if isinstance(v, list) else v.tolist() for v in (column.values for column in columns)]
-        _write_rows(paths[-1], [column.name for column in columns], zip(*values, strict=True))
+        rows = zip(*(_printed(column.values) for column in columns), strict=True)
+        _write_rows(paths[-1], [column.name for column in columns], rows)
     paths.append(folder / "fields.csv")
     _write_rows(paths[-1], ["packet", "name", "unit", "meaning"], described)
     return paths
+
+
+def _printed(values: list[str] | npt.NDArray[Any]) -> list[Any]:
+    """Return the values of a column for a CSV file."""
+    if isinstance(values, list):
+        return values
+    return ["NaN" if math.isnan(value) else value for value in values.tolist()]
 
 
 def _write_rows(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from knightcube.astro.almanac import propagate_orbit as propagate_orbit
     from knightcube.astro.almanac import sun_direction as sun_direction
     from knightcube.astro.almanac import sunlit_fraction as sunlit_fraction
+    from knightcube.errors import InputError as InputError
+    from knightcube.errors import PlanningError as PlanningError
+    from knightcube.errors import UsageError as UsageError
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant as SingleAxisPlant
     from knightcube.gnc.guidance.one_axis.vmc import plan_step as plan_step
     from knightcube.gnc.guidance.three_axes.pointing_target import Goal as Goal
@@ -47,14 +50,17 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "Goal": "knightcube.gnc.guidance.three_axes.pointing_target",
     "HorizonKnowledge": "knightcube.vision.horizon.settings",
+    "InputError": "knightcube.errors",
     "Lens": "knightcube.vision.camera.lens",
+    "LensCalibration": "knightcube.vision.lens_calibration",
     "MatchedStars": "knightcube.vision.star_tracker",
     "Pinhole": "knightcube.vision.camera.lens",
+    "PlanningError": "knightcube.errors",
     "PointingTarget": "knightcube.gnc.guidance.three_axes.pointing_target",
     "SingleAxisPlant": "knightcube.gnc.guidance.one_axis.plant",
     "StarSolution": "knightcube.vision.star_tracker",
     "StarTracker": "knightcube.vision.star_tracker",
-    "LensCalibration": "knightcube.vision.lens_calibration",
+    "UsageError": "knightcube.errors",
     "calibrate_lens": "knightcube.vision.lens_calibration",
     "detect_objects": "knightcube.vision.objects.detect",
     "estimate_rate": "knightcube.vision.streaks.estimate",

@@ -8,7 +8,11 @@ class FlightError(Exception):
 
 
 class UsageError(FlightError):
-    """A mistake of the user, reported in one line with exit status 2 and without a traceback."""
+    """A mistake of the user, such as a file that is not a picture.
+
+    The message names the mistake and its cure in one line. A command prints the message without a traceback
+    and ends with status 2.
+    """
 
 
 class InputError(UsageError):
@@ -26,7 +30,10 @@ class InputError(UsageError):
 
 
 class PlanningError(FlightError):
-    """Error raised if no path was found. The message says why."""
+    """Error raised if a planner finds no path from start to goal within its limits.
+
+    The message states the reason.
+    """
 
 
 def shown(text: str) -> str:

@@ -1,20 +1,17 @@
-"""Solve pictures of the sky, such as photographs, whose field of view need not be known.
-
-python own_pictures.py [--fov DEG] IMAGE... takes PNG, TIFF, JPEG, BMP and FITS files.
-"""
+"""Solve pictures of the sky, such as photographs, whose field of view need not be known."""
 
 from __future__ import annotations
 
-import sys
+import argparse
 
-from knightcube import StarTracker, read_image
-from knightcube.errors import UsageError
+from knightcube import StarTracker, UsageError, read_image
 
-paths, fov_deg = sys.argv[1:], None
-if paths[:1] == ["--fov"]:
-    fov_deg, paths = float(paths[1]), paths[2:]
-tracker = StarTracker(fov_deg)  # without a field of view, 4 to 60 deg are searched
-for path in paths:
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--fov", type=float, help="field of view across the columns, deg; 4 to 60 if omitted")
+parser.add_argument("pictures", nargs="+", help="PNG, TIFF, JPEG, BMP or FITS")
+options = parser.parse_args()
+tracker = StarTracker(options.fov)
+for path in options.pictures:
     try:
         solution = tracker.solve(read_image(path))
     except (UsageError, ValueError) as error:  # not a picture, damaged, or too small

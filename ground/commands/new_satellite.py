@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -26,13 +26,11 @@ from ground.commands.elements import elements_of
 from ground.commands.options import write_new
 from ground.commands.satellite_questions import (
     COIL_EXAMPLE,
-    COIL_QUESTIONS,
     QUESTIONS,
     Apsides,
     Question,
     Values,
     check_values,
-    coil_number,
     read_value,
 )
 from ground.satellite_description import (
@@ -186,10 +184,7 @@ class Answers:
         """
         try:
             for question in self._open():
-                if question.name == "coil":
-                    self._ask_coils(question)
-                else:
-                    self._ask(question.text, question.default, self._taker(question))
+                self._ask(question)
         except KeyboardInterrupt:
             sys.stderr.write(f"\nknightcube: nothing was written; to continue:\n  {self.command()}\n")
             raise
@@ -200,35 +195,12 @@ class Answers:
         """Yield the questions whose values are still unknown, in order."""
         yield from (question for question in QUESTIONS if question.name not in self.values)
 
-    def _taker(self, question: Question) -> Callable[[str], None]:
-        return lambda text: self._take(question, [text])
-
-    def _ask_coils(self, question: Question) -> None:
-        """Ask for three equal coils on the body axes."""
-        texts = {"axis": "xyz"}
-
-        def taker(key: str) -> Callable[[str], None]:
-            def take(text: str) -> None:
-                try:
-                    coil_number(key, text)
-                except ValueError as error:
-                    raise UsageError(str(error)) from error
-                texts[key] = text
-
-            return take
-
-        while question.name not in self.values:
-            for key, text in COIL_QUESTIONS:
-                self._ask(text, None, taker(key))
-            try:
-                self._take(question, [",".join(f"{key}={text}" for key, text in texts.items())])
-            except UsageError as error:
-                sys.stderr.write(f"  {error}\n")
-
-    def _ask(self, text: str, default: str | None, take: Callable[[str], None]) -> None:
+    def _ask(self, question: Question) -> None:
         """Ask until an answer is accepted. Raises EOFError at the end of the input."""
+        default, coils = question.default, question.name == "coil"
+        several = "; spaces between different coils" if coils else ""
         while True:
-            sys.stderr.write(f"{text}{'' if default is None else f' [{default}]'}: ")
+            sys.stderr.write(f"{question.text}{several}{'' if default is None else f' [{default}]'}: ")
             sys.stderr.flush()
             line = sys.stdin.readline()
             if not line:
@@ -236,7 +208,7 @@ class Answers:
             if not (answer := line.strip() or default):
                 continue
             try:
-                return take(answer)
+                return self._take(question, answer.split() if coils else [answer])
             except UsageError as error:
                 sys.stderr.write(f"  {error}\n")
 

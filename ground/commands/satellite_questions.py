@@ -88,7 +88,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
     return read
 
 
-def coil_number(key: str, text: str) -> float:
+def _coil_number(key: str, text: str) -> float:
     """Return the number of a text that describes a coil. Raises ValueError with the permitted range."""
     try:
         return number(*_COIL_RANGES[key])(text)
@@ -112,14 +112,14 @@ def read_coils(text: str) -> list[Coil]:
         if key not in given:
             raise ValueError(f"`{key}` is missing: give coils such as {COIL_EXAMPLE}")
     current, resistance = (
-        coil_number("current", given["current"]),
-        coil_number("resistance", given["resistance"]),
+        _coil_number("current", given["current"]),
+        _coil_number("resistance", given["resistance"]),
     )
     kinds = {key for key in ("dipole", "turns", "area") if key in given}
     if kinds == {"dipole"}:
-        per_ampere = coil_number("dipole", given["dipole"]) / current
+        per_ampere = _coil_number("dipole", given["dipole"]) / current
     elif kinds == {"turns", "area"}:
-        per_ampere = coil_number("turns", given["turns"]) * coil_number("area", given["area"])
+        per_ampere = _coil_number("turns", given["turns"]) * _coil_number("area", given["area"])
     else:
         raise ValueError("give either `dipole` (A m^2 at the current limit), or `turns` and `area` (m^2)")
     return [Coil(axis, per_ampere, resistance, current) for axis in _axes(given["axis"])]
@@ -256,15 +256,6 @@ QUESTIONS = (
     Question("horizon-cameras", "yes|no", "six cameras for Sun and horizon, yes or no", _read_yes, "yes"),
     Question("release", "DEG/S", "rate at the release, deg/s", number(0.1, 30.0, "deg/s"), "10"),
 )
-COIL_QUESTIONS = (
-    (
-        "dipole",
-        "magnetic dipole of each of three equal coils at the current limit, A m^2 (other coils: --coil)",
-    ),
-    ("current", "current limit of each coil, A"),
-    ("resistance", "resistance of each coil, ohm"),
-)
-"""Keys and questions of three equal coils on the body axes."""
 
 
 def read_value(name: str, text: str) -> Any:

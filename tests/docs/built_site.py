@@ -1,8 +1,8 @@
 """Checks the built site: `python -m tests.docs.built_site build/site`; the exit status is 1 for any fault.
 
 The pages must be readable without a network, so no page may load a file from another host. Links are allowed.
-If Chromium is installed, the search of the site is tested on a page that is opened as a file: guides must
-come before pages of modules.
+If Chromium is installed, the search of the site is tested on a page that is opened as a file and
+on a page from a server: guides must come before pages of modules.
 """
 
 from __future__ import annotations
@@ -10,8 +10,12 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from tests.support import browser
@@ -23,6 +27,10 @@ FIRST_FOUND = {
     "campaigns": "fly/simulation.html",
     "renewal": "fly/renewal.html",
     "day of operations": "fly/day-of-operations.html",
+    "tutorial": "tutorial.html",
+    "install on a board": "fly/board.html",
+    "detumble": "fly/orbit.html",
+    "solve pictures": "library/star-tracker.html",
 }
 """Searched words, and the page that must be the first result."""
 _LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href", "object": "data"}
@@ -64,23 +72,46 @@ def problems_of(site: Path) -> list[str]:
     return found
 
 
+class _Quiet(SimpleHTTPRequestHandler):
+    """Serves files without a line for each request."""
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def _served(site: Path) -> Iterator[str]:
+    """Yield the address of a server of the site on this machine."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site))) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> list[str]:
-    """Return a line for each search whose first result is not the right page. Needs Chromium."""
+    """Return a line for each search, in files and from a server, whose first result is not the right page.
+
+    Needs Chromium.
+    """
     found: list[str] = []
     item = "li.md-search-result__item > a.md-search-result__link"
-    with browser.browsing() as chromium:
+    with browser.browsing() as chromium, _served(site) as served:
         page = chromium.new_page()
-        for words, right in first_found.items():
-            page.goto((site.resolve() / "index.html").as_uri())
-            page.click(".md-search__input")
-            # All words are entered at once. Otherwise the results of the first letters would remain on the
-            # page.
-            page.fill(".md-search__input", words)
-            page.keyboard.press("End")  # the page reads the words when a key is released
-            page.wait_for_selector(item, timeout=60_000)
-            first = str(page.get_attribute(item, "href")).partition("?")[0]
-            if not first.endswith(f"/{right}"):
-                found.append(f"search {words!r}: the first result is {first}, not {right}")
+        for address in (site.resolve().as_uri(), served):
+            for words, right in first_found.items():
+                page.goto(f"{address}/index.html")
+                page.click(".md-search__input")
+                # All words are entered at once. Otherwise the results of the first letters would remain.
+                page.fill(".md-search__input", words)
+                page.keyboard.press("End")  # the page reads the words when a key is released
+                page.wait_for_selector(item, timeout=60_000)
+                first = str(page.get_attribute(item, "href")).partition("?")[0]
+                if not first.endswith(f"/{right}"):
+                    found.append(f"search {words!r}: the first result is {first}, not {right}")
     return found
 
 

@@ -273,7 +273,7 @@ class Terminal(io.StringIO):
 
 def test_on_a_terminal_the_values_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "mine.yaml"
-    answers = ["", "heavy", "4", "3u", "550", "", "", "9.5", "", "0.2", "0.1", "40", "none", "no", "5"]
+    answers = ["", "heavy", "4", "3u", "550", "", "", "9.5", "", GIVEN[-1], "none", "no", "5"]
     monkeypatch.setattr(sys, "stdin", Terminal("\n".join(answers) + "\n"))
     done = command("new-satellite", "--out", path)
     assert done.returncode == 0, done.stderr
@@ -290,7 +290,9 @@ def test_on_a_terminal_the_values_are_asked_for(tmp_path: Path, monkeypatch: pyt
 def test_the_answers_are_shown_when_the_file_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    answers = ["", "4", "3u", "", "", "", "", "", "0.2", "0.1", "40", "", "", ""]
+    same = "current=0.1,resistance=40"
+    coils = f"axis=xy,{same},dipole=0.2 axis=z,{same},turns=200,area=0.01"
+    answers = ["", "4", "3u", "", "", "", "", "", coils, "", "", ""]
     monkeypatch.setattr(sys, "stdin", Terminal("\n".join(answers) + "\n"))
     done = command("new-satellite", "--out", tmp_path / "absent" / "mine.yaml")
     assert done.returncode == 2

@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from ground.campaigns.runner import show
 ROOT = Path(__file__).parents[3]
 VARIED = ("plant.inertia=10%", "plant.thread_stiffness=normal 5%", "guidance.cost=heat|supply")
 _END_S = 60.0
-"""Longest time (s) to wait for the end of processes, and for a cluster."""
+"""Longest time (s) to wait for the end of processes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +183,10 @@ def _cluster(folder: Path, stack: ExitStack) -> tuple[str, subprocess.Popen[byte
         stack.callback(process.kill)
         return process
 
-    started("scheduler", "--port", "0")
-    latest = time.monotonic() + _END_S
-    while not facts.is_file() and time.monotonic() < latest:
+    scheduler = started("scheduler", "--port", "0")
+    while not facts.is_file():
+        if scheduler.poll() is not None:
+            raise RuntimeError(f"no scheduler: {(folder / 'dask.log').read_text(encoding='utf-8')}")
         time.sleep(0.1)
     workers = [started(*worker) for _ in range(2)]
     address: str = json.loads(facts.read_text(encoding="utf-8"))["address"]
@@ -225,6 +227,8 @@ def main(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--dask", action="store_true", help="also on a cluster with a lost worker")
     options = parser.parse_args(arguments)
+    if options.dask and find_spec("distributed") is None:
+        parser.error("--dask needs the package distributed: pip install 'knightcube-flight[dask]'")
     with tempfile.TemporaryDirectory(prefix="knightcube-") as name:
         found = killed(Path(name), options.runs, options.duration, options.kills, options.seed, options.dask)
     show({"campaigns": {kind: asdict(one) for kind, one in found.items()}})
