@@ -217,11 +217,21 @@ class EmulatedBench:
         held: Any = self.hardware.world
         held.turn(axis, angle, self.rig.clock.now_ns(), seconds)
 
-    def cover(self, on: bool) -> None:
-        """Put the cap on the lens or take it off. A camera that already has a fault keeps its fault."""
-        camera = self.hardware.camera
-        if camera is not None and camera.fault in {"", "capped"}:
-            camera.fault = "capped" if on else ""
+    def cover(self, on: bool, number: int = 0) -> None:
+        """Put the cap on a lens or take it off. A camera that already has a fault keeps its fault.
+
+        `number` is 0 for the star camera and 1 or more for a horizon camera.
+        """
+        camera = (self.hardware.camera, *self.hardware.orbit.wide)[number]
+        cap = "covered" if number else "capped"
+        if camera is not None and camera.fault in {"", cap}:
+            camera.fault = cap if on else ""
+
+    def light(self, normal: FloatArray) -> None:
+        """Shine a lamp onto the panel with the outward `normal` (3,), body axes; zeros are darkness."""
+        cells = self.hardware.orbit.cells
+        if cells is not None:
+            cells.lamp = normal
 
 
 def open_bench(request: SimulationRequest, config: Config) -> EmulatedBench:

@@ -11,6 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from flight.app.devices import open_camera
 from flight.schema.devices import driver_of, fitted_devices
 from flight.schema.sections import Config
@@ -30,6 +32,8 @@ _ADDRESSES = [address for address in range(0x08, 0x78) if address != 0x70]
 _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}
 _LISTEN_NS = 1_200_000_000
 _LOOK_NS = 20_000_000
+_REGULAR, _PAUSE = 8, 5.0
+"""Smallest number of pauses that are judged, and ratio of the longest to the median one for loose contact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +57,11 @@ def chip_at(bus: I2cBus, address: int) -> str | None:
     return "ina219" if high << 8 | low in _INA219 else ""
 
 
-def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int]:
-    """Return which kind of device sends on a serial line, and its baud rate; ("", 0) if none is recognised.
+def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int, float]:
+    """Return which kind of device sends on a serial line, its baud rate, and its longest pause, s.
 
-    The kind is `vn100` or `gps`. The `rates` are tried first, and then all rates of a VN-100.
+    The kind is `vn100` or `gps`, or "" if none is recognised. The pause is 0 for a device that sends
+    regularly. The `rates` are tried first, and then all rates of a VN-100.
     """
     for rate in dict.fromkeys((*rates, *BAUD_RATES)):
         try:
@@ -64,18 +69,22 @@ def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int]:
             port.set_baud_rate(rate)
             port.receive()
             until_ns, parser, data = rig.clock.now_ns() + _LISTEN_NS, StreamParser(), b""
+            arrivals: list[int] = []
             while rig.clock.now_ns() < until_ns:
                 rig.clock.sleep_until_ns(rig.clock.now_ns() + _LOOK_NS)
                 for arrival_ns, chunk in port.receive():
                     parser.feed(arrival_ns, chunk)
+                    arrivals.append(arrival_ns)
                     data += chunk
         except DeviceError:
-            return "", 0
+            return "", 0, 0.0
         if b"$VN" in data or parser.packets + parser.foreign > 2:
-            return "vn100", rate
+            pauses = np.diff(arrivals) * 1e-9
+            irregular = len(pauses) > _REGULAR and pauses.max() > _PAUSE * np.median(pauses)
+            return "vn100", rate, float(pauses.max()) if irregular else 0.0
         if b"\xb5\x62\x01" in data or b"$GN" in data or b"$GP" in data:
-            return "gps", rate
-    return "", 0
+            return "gps", rate, 0.0
+    return "", 0, 0.0
 
 
 def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
@@ -158,11 +167,15 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     if wanted == "vn100" and section.driver != "vn100":
         return None
     rates = tuple(dict.fromkeys([section.baud_rate, *(one.baud_rate for one in serial.values())]))
-    what, rate = talker(rig, section.device, rates)
+    what, rate, pause = talker(rig, section.device, rates)
     found = None
     if what == wanted and rate != section.baud_rate:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"
         found = Finding(kind, "wrong baud rate", text, f"set `baud_rate: {rate}`, or change the device's")
+    elif what == wanted == "vn100" and pause:
+        text = f"its output arrives on {section.device}, but stops for up to {pause:.2f} s"
+        cure = "check plugs and solder joints for loose contact, and its supply"
+        found = Finding(kind, "intermittent", text, cure)
     elif what == wanted == "vn100":
         text = f"its output arrives on {section.device}, but it does not answer"
         found = Finding(kind, "no answer", text, "check the wire from the host's TX to the unit's RX")

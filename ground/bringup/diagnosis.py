@@ -32,10 +32,16 @@ QUARTER = 0.5 * math.pi
 GRAVITY = 9.80665
 RECOGNISED = math.radians(25.0)
 """Largest angle between a measured and an expected direction that belong together."""
+ASKEW = math.radians(15.0)
+"""Largest angle of a coil's field to its expected direction, if turns by hand do not limit the accuracy."""
 FEWEST = 20
 """Smallest number of samples from which noise is determined."""
 ALIKE = math.radians(15.0)
 """Largest angle between the axes of two sensors that have the same axes."""
+SCALE = 0.1
+"""Largest relative difference of the scales of two axes or sensors that agree."""
+STRONGEST_BIAS = 1.5e-5
+"""Largest constant field (T) of a body, without regard to the strength of the measured field."""
 _AXES = "xyz"
 _NEAR = 0.15
 """Relative difference up to which a measured value agrees with its expected value."""
@@ -115,6 +121,22 @@ def noise_of(values: FloatArray) -> FloatArray:
     return np.asarray(np.std(np.diff(values, axis=0), axis=0) / math.sqrt(2.0))
 
 
+def missing_share(change: FloatArray, noise: float) -> float:
+    """Return the fraction of samples (k, 3) in which a change of the field (T) is missing.
+
+    The fraction is 0 if the change does not exceed eight times the `noise` (T) of a sample.
+    """
+    mean = change.mean(axis=0)
+    along = change @ mean / (np.linalg.norm(mean) or 1.0)
+    full = float(np.quantile(along, 0.8))
+    return float(np.mean(along < 0.5 * full)) if full > 8.0 * noise else 0.0
+
+
+def repeated_share(values: FloatArray) -> float:
+    """Return the fraction of samples (k, 3) that equal the sample before in all axes."""
+    return float(np.mean((np.diff(values, axis=0) == 0.0).all(axis=1)))
+
+
 def allan_deviation(values: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
     """Return averaging times (m,), s, and the Allan deviations (m, 3) of values (k, 3)."""
     sizes = [1 << n for n in range(int(math.log2(max(len(values) // 4, 1))) + 1)]
@@ -138,7 +160,12 @@ def diagnose_rest(
         cure = "check the ground wire and the length of the cable, or lower the baud rate"
         found.append(Finding(part, "corrupted packets", text, cure))
     measured = len(samples.times) / span
-    if abs(measured / (expected.rate_hz * max(1.0 - bad, 0.01)) - 1.0) > 0.05:
+    gaps = np.diff(samples.times)
+    if bad <= 0.01 and len(gaps) > FEWEST and gaps.max() > 4.0 * max(np.median(gaps), 1.0 / expected.rate_hz):
+        text = f"the samples stop {int(np.sum(gaps > 0.5 * gaps.max()))} times, for up to {gaps.max():.2f} s"
+        cure = "check plugs and solder joints for loose contact, and its supply"
+        found.append(Finding(part, "intermittent", text, cure))
+    elif abs(measured / (expected.rate_hz * max(1.0 - bad, 0.01)) - 1.0) > 0.05:
         text = f"{measured:.1f} valid samples per second arrive instead of {expected.rate_hz:g}"
         cure = "check `rate_hz`, the baud rate, which limits the samples, and the cable"
         found.append(Finding(part, "wrong rate", text, cure))
@@ -150,7 +177,14 @@ def diagnose_rest(
         ("accelerometer", samples.acceleration, expected.acceleration, "m/s^2"),
     )
     for name, values, sigma, unit in quantities:
-        found += _noise_findings(f"{part}.{name}", values, sigma, unit)
+        repeated = repeated_share(values)
+        if 0.2 < repeated < 0.98:
+            new = measured * (1.0 - repeated)
+            text = f"{100.0 * repeated:.0f} % of its values repeat: {new:.3g} are new per second"
+            cure = "set the output rate of the sensor to `rate_hz` or more"
+            found.append(Finding(f"{part}.{name}", "wrong rate", text, cure))
+        else:
+            found += _noise_findings(f"{part}.{name}", values, sigma, unit)
     return found + _rest_values(samples, strongest)
 
 
@@ -244,26 +278,35 @@ def diagnose_axes(turns: Turns) -> AxesFound:
     """Return the axes of gyro, accelerometer and magnetometer from the turns about x, y and z."""
     findings: list[Finding] = []
     gyro = _gyro_axes(turns.gyro, findings)
+    if gyro is not None and not findings:
+        findings += _gyro_scale(turns)
     axes: dict[str, FloatArray | None] = {"gyro": gyro}
     # The gyro measures the turns better than a hand makes them, if its scale is right.
     vectors = QUARTER * np.eye(3) if gyro is None or findings else turns.gyro @ gyro
     rotations = [attitude_matrix(from_rotation_vector(vector)) for vector in vectors]
     up = np.array([0.0, 0.0, 1.0])
     force = np.concatenate([turns.before[:, 0], turns.after[:, 0]]) / GRAVITY
+    named: list[Finding] = []
     if np.isfinite(force).all():
         axes["accelerometer"] = _orthogonal(force, np.array([up] * 3 + [one @ up for one in rotations]))
+        if axes["accelerometer"] is None:
+            named += _force_scales(force)
     if np.isfinite(turns.before[:, 1]).all() and np.isfinite(turns.after[:, 1]).all():
-        axes["magnetometer"] = _field_axes(turns.before[:, 1], turns.after[:, 1], rotations, gyro)
+        field = _fitted_field(turns.before[:, 1], turns.after[:, 1], rotations, gyro)
+        axes["magnetometer"] = field.axes
+        named += _field_faults(field)
     for index, name in enumerate(("accelerometer", "magnetometer")):
-        size = float(np.linalg.norm(turns.before[0, index]))
+        part, size = f"inertial_unit.{name}", float(np.linalg.norm(turns.before[0, index]))
         if name in axes and np.abs(turns.after[:, index] - turns.before[:, index]).max() < 0.02 * size:
             axes[name] = None
             text, cure = "its values do not change in the turns", "switch the unit off and on, or replace it"
-            findings.append(Finding(f"inertial_unit.{name}", "stuck", text, cure))
+            findings.append(Finding(part, "stuck", text, cure))
+        elif own := [one for one in named if one.part == part]:
+            findings += own
         elif name in axes and axes[name] is None:
             text = f"its values in the turns are {UNRECOGNISED}"
             cure = "repeat the turns with exact angles of 90 deg, away from iron"
-            findings.append(Finding(f"inertial_unit.{name}", "wrong axes", text, cure))
+            findings.append(Finding(part, "wrong axes", text, cure))
     found = {name: _nearest(matrix) for name, matrix in axes.items() if matrix is not None}
     common = _common(found)
     if common is not None:
@@ -358,25 +401,94 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
     return found
 
 
-def _field_axes(
+def _gyro_scale(turns: Turns) -> list[Finding]:
+    """Return the finding about a gyro whose turns about x and y differ from those of gravity, if any.
+
+    Both angles are measured in the same turn, so that the hand does not limit the comparison.
+    """
+    first, second = turns.before[:2, 0], turns.after[:2, 0]
+    sizes = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    if not np.isfinite(sizes).all() or np.abs(np.sqrt(sizes) / GRAVITY - 1.0).max() > SCALE:
+        return []
+    angles = np.arccos(np.clip(np.sum(first * second, axis=1) / sizes, -1.0, 1.0))
+    ratio = np.linalg.norm(turns.gyro[:2], axis=1) / np.maximum(angles, 0.2 * QUARTER)
+    if np.abs(ratio - 1.0).max() <= SCALE:
+        return []
+    text = f"its angles over those of gravity: x {ratio[0]:.2f}, y {ratio[1]:.2f}"
+    cure = "check the range of its driver, and calibrate its scale"
+    return [Finding("inertial_unit.gyro", "wrong scale", text, cure)]
+
+
+def _wrong_scales(part: str, scales: FloatArray, what: str) -> Finding:
+    """Return the finding about a sensor whose axes have different or wrong scales (3,)."""
+    shown = ", ".join(f"{axis} {value:.2f}" for axis, value in zip(_AXES, scales, strict=True))
+    cure = "check range and unit of each axis in its driver, and calibrate its scale"
+    return Finding(part, "wrong scale", f"{what}: {shown}", cure)
+
+
+def _force_scales(force: FloatArray) -> list[Finding]:
+    """Return the finding about the scales of an accelerometer from specific forces (k, 3), g, if wrong.
+
+    Each axis of a sound sensor is vertical before or after one of the turns.
+    """
+    sizes = np.abs(force).max(axis=0)
+    if sizes.min() < 0.1 or np.abs(sizes - 1.0).max() <= 2.0 * SCALE:
+        return []
+    return [_wrong_scales("inertial_unit.accelerometer", sizes, "its largest values over gravity")]
+
+
+def _field_faults(field: FieldFound) -> list[Finding]:
+    """Return the fault that a fit of the magnetometer's values shows, if any: scales, or a constant field."""
+    part = "inertial_unit.magnetometer"
+    if field.scales is not None:
+        return [_wrong_scales(part, field.scales, "relative scales")]
+    if field.axes is None or field.bias <= max(0.4 * field.size, STRONGEST_BIAS):
+        return []
+    text = f"the body has a field of {1e6 * field.bias:.0f} uT beside {1e6 * field.size:.0f} uT of the site"
+    cure = "remove magnets, iron and currents near it; calibrate its bias if they belong to the body"
+    return [Finding(part, "biased", text, cure)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FieldFound:
+    """The result of a fit of the magnetometer's values in the turns.
+
+    Attributes:
+        axes: orthogonal matrix (3, 3) from body axes to measured axes, or None if none explains the values.
+        size, bias: field of the site and constant field of the body, T.
+        scales: relative scales (3,) of the measured axes if they differ, or None.
+    """
+
+    axes: FloatArray | None
+    size: float
+    bias: float
+    scales: FloatArray | None = None
+
+
+def _fitted_field(
     before: FloatArray, after: FloatArray, turns: Sequence[FloatArray], gyro: FloatArray | None
-) -> FloatArray | None:
+) -> FieldFound:
     """Return the magnetometer's axes from fields (3, 3) before and after turns, with an unknown bias.
 
     The fit starts from the best exchange of axes and from the axes of the gyro.
 
     The common sign is open: of two matrices with opposite signs, the matrix closer to the identity is
-    returned. None is returned if no matrix explains the fields.
+    returned. No matrix is returned if none explains the fields.
     """
     values = np.concatenate([*before, *after])
 
-    def solved(axes: FloatArray) -> tuple[FloatArray, float]:
-        """Return the residuals and the size of the field for given axes."""
+    def unknowns(axes: FloatArray, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals, and field and bias (6,), for given axes and scales."""
         rows = [np.hstack([np.eye(3), np.eye(3)])] * 3
         rows += [np.hstack([axes @ turn @ axes.T, np.eye(3)]) for turn in turns]
-        matrix = np.vstack(rows)
-        unknown = np.linalg.lstsq(matrix, values, rcond=None)[0]
-        return matrix @ unknown - values, float(np.linalg.norm(unknown[:3]))
+        matrix, scaled = np.vstack(rows), values / np.tile(scales, 6)
+        found: FloatArray = np.asarray(np.linalg.lstsq(matrix, scaled, rcond=None)[0], dtype=float)
+        return matrix @ found - scaled, found
+
+    def solved(axes: FloatArray) -> tuple[FloatArray, float]:
+        """Return the residuals and the size of the field for given axes."""
+        residuals, found = unknowns(axes, np.ones(3))
+        return residuals, float(np.linalg.norm(found[:3]))
 
     def rotated(vector: FloatArray, start: FloatArray) -> FloatArray:
         return np.asarray(attitude_matrix(from_rotation_vector(vector)) @ start)
@@ -392,9 +504,21 @@ def _field_axes(
     proper = sorted((one for one in signed_permutations() if np.linalg.det(one) > 0), key=misfit)
     found = min((refined(start) for start in (proper[0], gyro) if start is not None), key=misfit)
     residuals, size = solved(found)
+    if gyro is not None and np.linalg.norm(residuals) > 0.3 * SCALE * size:
+        axes = _nearest(gyro)
+
+        def relative(logs: FloatArray) -> FloatArray:
+            return np.asarray(np.exp(np.array([*logs, -float(logs.sum())])))
+
+        fit = least_squares(lambda logs: unknowns(axes, relative(logs))[0] / (size or 1.0), np.zeros(2))
+        scales = relative(fit.x)
+        better = np.linalg.norm(fit.fun) * size < 0.3 * np.linalg.norm(residuals)
+        if better and scales.min() > SCALE and np.ptp(np.log(scales)) > 2.0 * SCALE:
+            return FieldFound(None, size, 0.0, scales / np.median(scales))
+    bias = float(np.linalg.norm(unknowns(found, np.ones(3))[1][3:]))
     if not size or np.linalg.norm(residuals.reshape(-1, 3), axis=1).max() > RECOGNISED * size:
-        return None
-    return found if np.trace(found) >= 0.0 else -found
+        return FieldFound(None, size, bias)
+    return FieldFound(found if np.trace(found) >= 0.0 else -found, size, bias)
 
 
 # Coils.
@@ -410,8 +534,11 @@ class CoilTest:
         current: increase of the supply current (n, 2), A, for both directions; NaN without a monitor.
         idle: supply current (A) without a command; NaN without a monitor.
         noise: standard deviation of a field change per ampere, T/A.
+        absent: fraction of the samples (n, 2) in which the field of the driven coil was missing.
         fault: text of a failed command to the coils, or an empty text.
         clipped: whether a current exceeded the range of the monitor.
+        volts: supply voltages (V) without a command and the lowest one with a command; NaN without a monitor.
+        sensed: whether the magnetometer works; if not, only the currents of the coils are judged.
     """
 
     commanded: FloatArray
@@ -420,8 +547,11 @@ class CoilTest:
     current: FloatArray
     idle: float
     noise: float
+    absent: FloatArray
     fault: str = ""
     clipped: bool = False
+    volts: tuple[float, float] = (math.nan, math.nan)
+    sensed: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -437,6 +567,8 @@ class CoilsFound:
         live: mask of the commands (n,) that make a field.
         drawn: supply current (n,) relative to the command, corrected for a wrong shunt; NaN if unknown.
         shunt: factor by which the shunt differs from the configured one, or 1.
+        joined: commands (j, k) whose coils are connected, so that command j also drives coil k.
+        askew: largest angle (rad) between the measured and the expected field of a sound coil.
         findings: the faults.
     """
 
@@ -448,6 +580,8 @@ class CoilsFound:
     live: BoolArray
     drawn: FloatArray
     shunt: float
+    joined: dict[int, int]
+    askew: float
     findings: list[Finding]
 
 
@@ -469,23 +603,60 @@ def diagnose_coils(
     response = 0.5 * (plus + minus)
     size = np.linalg.norm(response, axis=1)
     if not size_known:
-        expected = expected * float(np.median(size[size >= 0.2 * size.max()]) or 1.0)
+        expected = expected * _usual_size(response, expected)
     live = size > np.maximum(0.12 * np.linalg.norm(expected, axis=1), 6.0 * test.noise)
+    live &= test.sensed
     serves, strength, misfit = _match(response, expected, live)
     sign, found = _common_sign(strength, misfit, live)
     drawn = np.mean(test.current, axis=1) / test.commanded
-    state = CoilsFound(response, expected, serves, sign * strength, misfit, live, drawn, 1.0, found)
+    joined, askew = _joined(response, expected, live), ASKEW if _exact(axes) else RECOGNISED
+    state = CoilsFound(
+        response, expected, serves, sign * strength, misfit, live, drawn, 1.0, joined, askew, found
+    )
     shared, shunt = _shared_fault(test, state, size_known)
     state = replace(state, drawn=drawn / shunt, shunt=shunt)
     found += shared
     if not any(one.part in {"coils", "inertial_unit.magnetometer"} and one.kind in _ALL for one in shared):
         legs = np.linalg.norm(np.stack([plus, minus], axis=1), axis=2)
         for j in range(len(names)):
-            found += _coil_findings(state, j, names, legs[j])
+            found += _coil_findings(state, j, names, legs[j], float(test.absent[j].max()))
     return state
 
 
-_ALL = frozenset({"no field", "no supply", "no response", "wrong supply voltage"})
+def _usual_size(response: FloatArray, expected: FloatArray) -> float:
+    """Return the median field (T/A) of the commands (n, 3) whose field has an expected direction."""
+    size = np.linalg.norm(response, axis=1)
+    unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
+    along = np.abs(response @ unit.T).max(axis=1) > math.cos(RECOGNISED) * size
+    usual = along & (size >= 0.2 * size.max())
+    return float(np.median(size[usual] if usual.any() else size[size >= 0.2 * size.max()]) or 1.0)
+
+
+def _exact(axes: FloatArray) -> bool:
+    """Return whether each axis of the magnetometer is a body axis, so that no turn by hand limits it."""
+    return bool(np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6))
+
+
+def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict[int, int]:
+    """Return the pairs (j, k) of which command j makes the fields of the coils j and k together.
+
+    Command k then makes no field, or the same field as command j.
+    """
+    found, size = {}, np.linalg.norm(response, axis=1)
+    for j in np.flatnonzero(live).tolist():
+        for k in range(len(response)):
+            alike = abs(float(response[j] @ response[k])) > math.cos(ASKEW) * size[j] * size[k]
+            if k == j or (live[k] and not alike):
+                continue
+            pair = expected[[j, k]].T
+            shares, *_ = np.linalg.lstsq(pair, response[j], rcond=None)
+            fits = np.linalg.norm(pair @ shares - response[j]) < math.sin(ASKEW) * size[j]
+            if fits and np.abs(shares).min() > 0.25:
+                found[j] = k
+    return found
+
+
+_ALL = frozenset({"no field", "no supply", "no response", "wrong supply voltage", "sagging supply"})
 """Kinds of faults that concern all coils, after which single coils are not judged."""
 
 
@@ -524,6 +695,11 @@ def _shared_fault(test: CoilTest, state: CoilsFound, size_known: bool) -> tuple[
     live, drawn, count = state.live, state.drawn, len(state.live)
     flowing = drawn > 0.12
     found = []
+    idle_volts, driven_volts = test.volts
+    if driven_volts < 0.95 * idle_volts:
+        text = f"the supply falls from {idle_volts:.2f} to {driven_volts:.2f} V while a coil is driven"
+        cure = "use a stronger supply or shorter, thicker wires; check its plug, and charge the battery"
+        return [Finding("coils", "sagging supply", text, cure)], 1.0
     if abs(test.idle) > max(0.1 * float(np.median(test.commanded)), 0.008):
         text = f"the supply delivers {1e3 * test.idle:.0f} mA with all coils at zero"
         cure = "switch the coils' supply off, and look for a bridge leg that is stuck high"
@@ -564,14 +740,28 @@ def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known:
     return [Finding("power_monitor", "wrong current", text, cure)]
 
 
-def _coil_findings(state: CoilsFound, j: int, names: Sequence[str], legs: FloatArray) -> list[Finding]:
-    """Return the faults of the command to coil `j`, given its field (2,), T/A, in both directions."""
+def _coil_findings(
+    state: CoilsFound, j: int, names: Sequence[str], legs: FloatArray, absent: float
+) -> list[Finding]:
+    """Return the faults of the command to coil `j`, given its field (2,), T/A, in both directions.
+
+    The field is missing in the fraction `absent` of the samples.
+    """
     part, name, k = f"coils.windings[{j}]", names[j], state.serves[j]
     if not state.live[j]:
         return [_without_field(part, name, float(state.drawn[j]))]
-    if state.misfit[j] >= RECOGNISED:
-        text = f"coil {name}: its field is {math.degrees(state.misfit[j]):.0f} deg off, {UNRECOGNISED}"
-        return [Finding(part, "wrong direction", text, "check the coil's axis, and remove iron and magnets")]
+    if j in state.joined:
+        return [_several_coils(part, name, names[state.joined[j]], float(state.drawn[j]))]
+    if absent > 0.04:
+        text = f"coil {name}: its field is missing in {100.0 * absent:.0f} % of the samples"
+        return [
+            Finding(part, "intermittent", text, "check the coil's plug and solder joints for loose contact")
+        ]
+    if state.misfit[j] >= state.askew:
+        shown = ", ".join(f"{value:.2f}" for value in state.response[j] / np.linalg.norm(state.response[j]))
+        text = f"coil {name}: its field is {math.degrees(state.misfit[j]):.0f} deg off, along ({shown})"
+        cure = "mount the coil as configured, or set its `axis`; remove iron and magnets"
+        return [Finding(part, "wrong direction", text, cure)]
     found = []
     if k != j:
         reversed_too = ", reversed" if state.strength[j] < 0 else ""
@@ -585,6 +775,15 @@ def _coil_findings(state: CoilsFound, j: int, names: Sequence[str], legs: FloatA
         text, cure = f"coil {name}: a {way} current makes no field", f"check input {leg} of its bridge"
         return [*found, Finding(part, "half bridge", text, f"{cure}, and the PWM channel")]
     return found + _wrong_size(part, name, abs(float(state.strength[j])), float(state.drawn[j]))
+
+
+def _several_coils(part: str, name: str, other: str, drawn: float) -> Finding:
+    """Return the finding about a command that drives two coils and `drawn` times the commanded current."""
+    way = "in parallel, " if drawn > 1.5 else "in series, " if drawn < 0.7 else ""
+    shown = "" if math.isnan(drawn) else f" with {drawn:.2f} times the commanded current"
+    text = f"the command of coil {name} drives coils {name} and {other}{shown}"
+    cure = f"separate the coils, which are connected {way}and connect coil {other} to its own bridge"
+    return Finding(part, "several coils", text, cure)
 
 
 def _without_field(part: str, name: str, drawn: float) -> Finding:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ground.bringup.session import Outcome
+from ground.bringup.bench import Outcome
 from ground.report.figures import save
 from ground.report.panels import AXIS_COLOURS, BLACK, BLUE, GREY, SKY, VERMILLION, style
 from hal.interfaces.devices import COIL_NAMES

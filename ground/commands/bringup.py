@@ -26,8 +26,9 @@ from flight.app.service import requested_config, start_guardian
 from flight.schema.devices import coil_fields
 from flight.schema.document import config_path, to_yaml
 from flight.schema.sections import Config
+from ground.bringup.bench import Outcome, Session, StepSkipped
 from ground.bringup.diagnosis import Finding
-from ground.bringup.session import STEPS, Outcome, Session, StepSkipped
+from ground.bringup.session import STEPS, steps_of
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import write_picture
 
@@ -83,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     kept = {} if options.again else _kept(options.out / REPORT, key)
     say = _silent if options.json else sys.stdout.write
-    wanted = options.only or [name for name in STEPS if name not in kept]
+    wanted = options.only or [name for name in steps_of(config) if name not in kept]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends with the coils at zero
     try:
         with _opened(options, text, config, emulated, say) as session:
@@ -259,32 +260,65 @@ def _step_text(name: str, outcome: Outcome) -> str:
 
 def _measured(name: str, values: Mapping[str, Any]) -> str:
     """Return the measured values of a step as one line."""
-    if name == "rest" and "noise" in values:
-        noise, expected = {key: max(one) for key, one in values["noise"].items()}, values["expected"]
-        return (
-            f"{values['rate_hz']:.2f} samples/s; noise (expected) "
-            f"{noise['gyro']:.2g} ({expected['gyro']:.2g}) rad/s, "
-            f"{1e9 * noise['field']:.0f} ({1e9 * expected['field']:.0f}) nT, "
-            f"{noise['acceleration']:.2g} ({expected['acceleration']:.2g}) m/s^2"
-        )
-    if name == "axes":
-        turns = [
-            f"{axis} {np.linalg.norm(turn):.0f}"
-            for axis, turn in zip("xyz", values["turns_deg"], strict=True)
-        ]
-        return f"turns of 90 deg measured by the gyro: {', '.join(turns)} deg"
-    if name == "coils":
-        fields = ", ".join(f"{value:+.2f}" for value in values["strength"])
-        drawn = ("-" if None in row else f"{500.0 * sum(row):.0f}" for row in values["current"])
-        return f"fields relative to the expected ones {fields}; supply current {', '.join(drawn)} mA"
-    text = {
-        "dark": "level {level:.0f} counts, read noise {read_noise:.1f} e-",
-        "light": "{sources} point sources, level {level:.0f} counts",
-        "focus": "PSF width {psf_sigma:.2f} px (standard deviation)",
-        "lens": "field of view {field_of_view_deg:.3f} deg, {stars} stars, residual {rms_px:.3f} px",
-        "rest": "{samples} samples",
-    }
-    return text[name].format(**values)
+    if name == "rest" and "noise" not in values:
+        return f"{values['samples']} samples"
+    return _TEXTS[name](values)
+
+
+def _rest_text(values: Mapping[str, Any]) -> str:
+    noise, expected = {key: max(one) for key, one in values["noise"].items()}, values["expected"]
+    return (
+        f"{values['rate_hz']:.2f} samples/s; noise (expected) "
+        f"{noise['gyro']:.2g} ({expected['gyro']:.2g}) rad/s, "
+        f"{1e9 * noise['field']:.0f} ({1e9 * expected['field']:.0f}) nT, "
+        f"{noise['acceleration']:.2g} ({expected['acceleration']:.2g}) m/s^2"
+    )
+
+
+def _axes_text(values: Mapping[str, Any]) -> str:
+    turns = [
+        f"{axis} {np.linalg.norm(turn):.0f}" for axis, turn in zip("xyz", values["turns_deg"], strict=True)
+    ]
+    return f"turns of 90 deg measured by the gyro: {', '.join(turns)} deg"
+
+
+def _coils_text(values: Mapping[str, Any]) -> str:
+    fields = ", ".join(f"{value:+.2f}" for value in values["strength"])
+    drawn = ("-" if None in row else f"{500.0 * sum(row):.0f}" for row in values["current"])
+    return f"fields relative to the expected ones {fields}; supply current {', '.join(drawn)} mA"
+
+
+def _power_text(values: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{key} {one['voltage']:.2f} V, {one['current']:.3f} A, with a coil {1e3 * one['rise']:+.0f} mA"
+        for key, one in values["monitors"].items()
+    )
+
+
+def _strings_text(values: Mapping[str, Any]) -> str:
+    lit = ", ".join(f"{1e3 * row[number]:.0f}" for number, row in enumerate(values["currents"]))
+    return f"currents in the light of a lamp {lit} mA"
+
+
+def _wide_text(values: Mapping[str, Any]) -> str:
+    return "mean levels " + ", ".join(f"{level:.0f}" for level in values["levels"].values()) + " counts"
+
+
+_TEXTS: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "rest": _rest_text,
+    "axes": _axes_text,
+    "coils": _coils_text,
+    "power": _power_text,
+    "gps": lambda values: "{fixes} fixes, {satellites} satellites".format(**values),
+    "strings": _strings_text,
+    "wide": _wide_text,
+    "dark": lambda values: "level {level:.0f} counts, read noise {read_noise:.1f} e-".format(**values),
+    "light": lambda values: "{sources} point sources, level {level:.0f} counts".format(**values),
+    "focus": lambda values: "PSF width {psf_sigma:.2f} px (standard deviation)".format(**values),
+    "lens": lambda values: (
+        "field of view {field_of_view_deg:.3f} deg, {stars} stars, residual {rms_px:.3f} px".format(**values)
+    ),
+}
 
 
 def _draw(folder: Path, outcomes: Mapping[str, Outcome]) -> None:

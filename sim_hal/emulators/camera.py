@@ -189,6 +189,7 @@ SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "saturated": lambda pixels, _: np.full_like(pixels, np.iinfo(pixels.dtype).max),
     "blinded": blinded,
     "capped": capped,
+    "covered": lambda pixels, seed: np.random.default_rng(seed).integers(0, 3, pixels.shape, pixels.dtype),
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }

@@ -31,6 +31,8 @@ from sim_hal.worlds.orbit import sun_position
 from sim_hal.worlds.world import OrbitingWorld, utc_date
 
 DEVICE = "solar strings"
+LAMP = 0.2
+"""Light of a halogen lamp at a short distance, relative to sunlight."""
 _RINGS, _SPOKES = 16, 32
 """Numbers of rings and spokes of the sampling points on the visible ground."""
 
@@ -80,6 +82,12 @@ class SolarCellsModel:
         light = light + self._earthlight(normals, position, sun)
         noise = self.noise * generator.standard_normal(len(self.peaks))
         # The diode of a solar string blocks reverse current.
+        return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
+
+    def in_lamplight(self, lamp: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return the currents (n,), A, while a lamp shines onto the panel with the normal `lamp` (3,)."""
+        light = LAMP * (self.normals @ lamp > math.cos(math.radians(5.0)))
+        noise = self.noise * generator.standard_normal(len(self.peaks))
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
@@ -197,6 +205,7 @@ class EmulatedSolarCells:
         dead: whether (n,) each string has failed and gives no current.
         frozen: whether a fault holds all currents constant.
         gain: gain of all amplifiers relative to the nominal gain.
+        lamp: outward normal (3,), body axes, of the panel in the light of a lamp on a bench; None in flight.
     """
 
     def __init__(
@@ -210,6 +219,7 @@ class EmulatedSolarCells:
         self.dead = np.zeros(len(wirings), dtype=bool)
         self.frozen = False
         self.gain = 1.0
+        self.lamp: FloatArray | None = None
         self._world, self._model, self._now_ns, self._generator = world, model, now_ns, generator
         self._strings = {(w.address, w.channel): (i, w.volt_per_ampere) for i, w in enumerate(wirings)}
         self._currents: FloatArray = np.zeros(len(wirings))
@@ -231,6 +241,8 @@ class EmulatedSolarCells:
         return volt_per_ampere * float(np.where(self.dead, 0.0, self.gain * self._currents)[index])
 
     def _light(self, now_ns: int) -> FloatArray:
+        if self.lamp is not None:
+            return self._model.in_lamplight(self.lamp, self._generator)
         body = quaternion.attitude_matrix(self._world.motion(now_ns).quaternion)
         around = self._world.surroundings()
         sun = sun_position(utc_date(self._world))

@@ -70,7 +70,7 @@ def test_exchanged_and_reversed_coils_are_found(size_known: bool) -> None:
         plus = expected[order] * signs[:, None] * (1.0 + 0.03 * generator.normal(size=(3, 1)))
         minus = plus + 1e-7 * generator.normal(size=(3, 3))
         current = 0.15 * (1.0 + 0.02 * generator.normal(size=(3, 2)))
-        test = CoilTest(np.full(3, 0.15), plus, minus, current, 0.0, 1e-7)
+        test = CoilTest(np.full(3, 0.15), plus, minus, current, 0.0, 1e-7, np.zeros((3, 2)))
         found = diagnose_coils(test, expected, "xyz", size_known=size_known)
         common = -1.0 if (signs < 0).all() else 1.0  # faults of the magnetometer, not of three coils
         assert found.serves == order.tolist()

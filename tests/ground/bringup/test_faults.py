@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -22,11 +23,16 @@ from flight.app.service import requested_config
 from flight.schema.devices import coil_fields
 from flight.schema.document import config_path, to_yaml
 from flight.schema.sections import Config
-from ground.bringup.diagnosis import UNRECOGNISED
-from ground.bringup.session import STEPS, Outcome, Session, StepSkipped
+from ground.bringup.bench import Outcome, Session, StepSkipped
+from ground.bringup.session import STEPS
 
 Change = dict[str, Any]
 FIELD = 5e-4
+
+
+@cache
+def configuration(name: str) -> tuple[str, Config]:
+    return requested_config(RunRequest(config_path(name), Path()))
 
 
 def windings(**changes: Change) -> Change:
@@ -67,8 +73,80 @@ class Case:
     alter: Callable[[Any], Any] | None = None
     says: str = ""
     base: str = "step_demo"
+    spoil: Callable[[Session], None] | None = None
 
 
+def held(sensor: str, axis: int) -> Callable[[Any], Any]:
+    """Return a fault of the IMU that keeps the first value of one axis of a sensor."""
+    kept: list[float] = []
+
+    def alter(sample: Any) -> Any:
+        values = np.array(getattr(sample, sensor))
+        kept.append(values[axis])
+        values[axis] = kept[0]
+        return replace(sample, **{sensor: values})
+
+    return alter
+
+
+def repeated(sensor: str) -> Callable[[Any], Any]:
+    """Return a fault of the IMU whose sensor has a new value in every second sample only."""
+    kept: list[Any] = []
+
+    def alter(sample: Any) -> Any:
+        kept.append(getattr(sample, sensor) if len(kept) % 2 == 0 else kept[-1])
+        return replace(sample, **{sensor: kept[-1]})
+
+    return alter
+
+
+def exchanged_strings() -> list[Any]:
+    """Return the solar strings of `orbit` with the first two channels exchanged."""
+    strings = [msgspec.to_builtins(one) for one in configuration("orbit")[1].solar_strings.strings]  # type: ignore[union-attr]
+    strings[0]["channel"], strings[1]["channel"] = strings[1]["channel"], strings[0]["channel"]
+    return strings
+
+
+def sagging(opened: Session) -> None:
+    """Make the supply fall by 2 V/A times its voltage."""
+    circuit = opened.hand.hardware.circuit
+    measure, currents = circuit.mean_supply, circuit.currents
+
+    def measured(start_ns: int, end_ns: int) -> tuple[float, float]:
+        volts, amperes = measure(start_ns, end_ns)
+        return volts * (1.0 - 2.0 * amperes), amperes * (1.0 - 2.0 * amperes)
+
+    opened.hand.hardware.monitor._measure = measured
+    circuit.currents = lambda: currents() * (1.0 - 2.0 * np.abs(currents()).sum())
+
+
+def loose_coil(opened: Session) -> None:
+    """Interrupt coil y for 0.1 s in every 0.4 s."""
+    circuit, clock = opened.hand.hardware.circuit, opened.rig.clock
+    currents = circuit.currents
+    circuit.currents = lambda: currents() * (1.0, float(clock.now_ns() % 400_000_000 > 100_000_000), 1.0)
+
+
+def pictured(change: Callable[[Any], Any]) -> Callable[[Session], None]:
+    """Return a fault of the star camera that changes its pixels."""
+
+    def spoil(opened: Session) -> None:
+        camera = opened.rig.cameras[0]  # type: ignore[index]
+        alter = camera._alter  # type: ignore[union-attr]
+        camera._alter = lambda frame: replace(  # type: ignore[union-attr]
+            alter(frame), pixels=np.ascontiguousarray(change(alter(frame).pixels))
+        )
+
+    return spoil
+
+
+def without_stars(pixels: Any) -> Any:
+    """Return a frame in which one pixel of a hundred is hot."""
+    hot = np.random.default_rng(1).random(pixels.shape) < 0.01
+    return np.where(hot, 3000, pixels).astype(pixels.dtype)
+
+
+BOTH = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
 X_AND_Y = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 MINUS_X = np.diag([-1.0, 1.0, 1.0])
 HALF = np.diag([1.0, 0.5, 1.0])
@@ -111,11 +189,50 @@ CASES = {
     "bridge leg stuck high": Case(
         fault("bridge-z: a-high"), "coils", ["coils current while off", "coils.windings[2] half bridge"]
     ),
-    "coil mounted askew": Case(
-        coil_field([[1.0, 0.0, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "coil tilted by 45 deg": Case(
+        coil_field([[0.7, 0.0, 0.0], [0.7, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         "coils",
         ["coils.windings[0] wrong direction"],
-        says=UNRECOGNISED,
+        says="45 deg off, along (0.71, 0.71",
+    ),
+    "coils x and y in parallel on one bridge": Case(
+        {
+            "simulation": {
+                "coil_field": (FIELD * np.array(BOTH)).tolist(),
+                "faults": [{"fault": "coil-y: open"}],
+            }
+        },
+        "coils",
+        ["coils.windings[0] several coils", "coils.windings[1] open"],
+        says="the command of coil x drives coils x and y",
+    ),
+    "coils x and z in series on one bridge": Case(
+        {
+            "simulation": {
+                "truth": {"resistance": [46.0, 23.0, 23.0]},
+                "coil_field": (
+                    FIELD * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+                ).tolist(),
+                "faults": [{"fault": "coil-z: open"}],
+            }
+        },
+        "coils",
+        ["coils.windings[0] several coils", "coils.windings[2] open"],
+        says="connected in series",
+    ),
+    "coils x and y connected": Case(
+        coil_field([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        "coils",
+        ["coils.windings[0] several coils", "coils.windings[1] several coils"],
+    ),
+    "loose plug of coil y": Case({}, "coils", ["coils.windings[1] intermittent"], spoil=loose_coil),
+    "supply that sags under load": Case(
+        {}, "coils", ["coils sagging supply"], says="falls from 5.00 to 3.5", spoil=sagging
+    ),
+    "magnetometer at its limit": Case(
+        fault("magnetometer: saturated"),
+        "rest coils",
+        ["inertial_unit.magnetometer stuck", "inertial_unit.magnetometer no response"],
     ),
     "magnetometer with the opposite sign": Case(
         {}, "coils", ["inertial_unit.magnetometer reversed sign"], sensed(mag=-np.eye(3))
@@ -165,6 +282,21 @@ CASES = {
         base="orbit",
     ),
     "inertial unit too slow": Case(fault("imu: slow (n=2)"), "rest", ["inertial_unit wrong rate"]),
+    "loose plug of the inertial unit": Case(
+        fault("imu: intermittent"), "find", ["inertial_unit intermittent"], says="stops for up to 0.2"
+    ),
+    "short interruptions of the inertial unit": Case(
+        fault("imu: intermittent (period=3, share=0.1)"), "rest", ["inertial_unit intermittent"], says="0.3"
+    ),
+    "gyro at half of the rate": Case(
+        {}, "rest", ["inertial_unit.gyro wrong rate"], repeated("rate"), says="20 are new per second"
+    ),
+    "magnetometer at half of the rate": Case(
+        {}, "rest", ["inertial_unit.magnetometer wrong rate"], repeated("mag")
+    ),
+    "gyro with one stuck axis": Case(
+        {}, "rest axes", ["inertial_unit.gyro stuck", "inertial_unit.gyro dead"], held("rate", 1), "on y"
+    ),
     "noise on the line": Case(
         fault("imu: cut (chance=0.1)"), "rest", ["inertial_unit corrupted packets"], says="wrong checksum"
     ),
@@ -189,6 +321,24 @@ CASES = {
         {}, "axes coils", ["inertial_unit.gyro mirrored"], sensed(rate=X_AND_Y), "x shows y, y shows x"
     ),
     "gyro in other units": Case({}, "axes", ["inertial_unit.gyro wrong scale"], sensed(rate=2.0 * np.eye(3))),
+    "unit upside down": Case(
+        {"inertial_unit": {"mounting": [1.0, 0.0, 0.0, 0.0]}},
+        "axes coils",
+        ["inertial_unit rotated"],
+        says="y shows -y, z shows -z",
+    ),
+    "gyro with a scale of 1.2": Case(
+        {}, "axes", ["inertial_unit.gyro wrong scale"], sensed(rate=1.2 * np.eye(3)), "x 1.20, y 1.20"
+    ),
+    "accelerometer with a wrong scale of one axis": Case(
+        {}, "axes", ["inertial_unit.accelerometer wrong scale"], sensed(accel=HALF), "x 1.00, y 0.50"
+    ),
+    "magnetometer with a wrong scale of one axis": Case(
+        {}, "axes coils", ["inertial_unit.magnetometer wrong scale"], sensed(mag=HALF), "x 1.00, y 0.50"
+    ),
+    "magnet beside the magnetometer": Case(
+        fault("magnetometer: false"), "axes", ["inertial_unit.magnetometer biased"], says="20 uT beside 47 uT"
+    ),
     "magnetometer with one reversed axis": Case(
         {}, "axes coils", ["inertial_unit.magnetometer mirrored"], sensed(mag=MINUS_X), "x shows -x"
     ),
@@ -202,12 +352,56 @@ CASES = {
     "camera frozen": Case(fault("camera: frozen"), "light", ["camera frozen"]),
     "camera without trigger": Case(fault("camera: off"), "light", ["camera no frame"]),
     "camera out of focus": Case({"camera": {"psf_sigma": 3.5}}, "focus", ["camera out of focus"]),
+    "camera far out of focus": Case(
+        {"camera": {"psf_sigma": 10.0}}, "focus", ["camera out of focus"], says="width 9.9"
+    ),
+    "camera with loose contact": Case(
+        fault("camera: intermittent (period=7)"), "dark", ["camera intermittent"]
+    ),
+    "camera with late frames": Case(fault("camera: delayed"), "dark", ["camera late"]),
+    "camera mirrored": Case({}, "lens", ["camera mirrored"], spoil=pictured(lambda pixels: pixels[:, ::-1])),
+    "camera with hot pixels": Case(
+        {}, "dark", ["camera hot pixels"], says="1 % of the pixels", spoil=pictured(without_stars)
+    ),
+    "camera with half of its rows": Case(
+        {},
+        "dark",
+        ["camera dead lines"],
+        spoil=pictured(lambda pixels: pixels * (np.indices(pixels.shape)[0] < 200)),
+    ),
+    "camera without its lowest bits": Case(
+        {}, "dark", ["camera wrong gain"], spoil=pictured(lambda pixels: pixels >> 4)
+    ),
+    "camera with shifted bits": Case(
+        {},
+        "dark",
+        ["camera wrong pixel format"],
+        says="multiples of 16",
+        spoil=pictured(lambda pixels: pixels << 4),
+    ),
+    "GPS antenna unplugged": Case(fault("gps: no-fix"), "gps", ["gps no fix"], base="orbit"),
+    "GPS receiver stuck": Case(fault("gps: stuck"), "gps", ["gps stuck"], base="orbit"),
+    "GPS receiver with a loose plug": Case(
+        fault("gps: intermittent (period=8, share=0.5)"), "gps", ["gps intermittent"], base="orbit"
+    ),
+    "GPS receiver with a wrong time": Case(
+        fault("gps: clock"), "gps", ["gps wrong time"], says="180 s", base="orbit"
+    ),
+    "GPS receiver with late messages": Case(fault("gps: delayed"), "gps", ["gps late"], base="orbit"),
+    "noise on the line of the GPS receiver": Case(
+        fault("gps: bits"), "gps", ["gps corrupted messages"], base="orbit"
+    ),
+    "plugs of two solar strings exchanged": Case(
+        {"solar_strings": {"strings": exchanged_strings()}},
+        "strings",
+        ["solar_strings.strings[0] exchanged", "solar_strings.strings[1] exchanged"],
+        base="orbit",
+    ),
+    "solar string dead": Case(
+        fault("strings: dead (string=3)"), "strings", ["solar_strings.strings[2] dead"], base="orbit"
+    ),
+    "solar converters stuck": Case(fault("strings: stuck"), "strings", ["solar_strings stuck"], base="orbit"),
 }
-
-
-@cache
-def configuration(name: str) -> tuple[str, Config]:
-    return requested_config(RunRequest(config_path(name), Path()))
 
 
 def session(case: Case, folder: Path) -> Session:
@@ -217,7 +411,10 @@ def session(case: Case, folder: Path) -> Session:
     wired, config = requested_config(RunRequest(path, Path()))
     bench = emulated_bench(path, wired, config)
     bench.hardware.unit.alter = case.alter
-    return Session(configuration(case.base)[1], bench.rig, ExitStack(), lambda _: None, bench)
+    opened = Session(configuration(case.base)[1], bench.rig, ExitStack(), lambda _: None, bench)
+    if case.spoil is not None:
+        case.spoil(opened)
+    return opened
 
 
 def outcomes(opened: Session, steps: str) -> list[Outcome]:
@@ -271,10 +468,82 @@ def test_a_sound_bench_has_no_finding(tmp_path: Path) -> None:
     assert [outcome.values for outcome in found if "skipped" in outcome.values] == []
 
 
+POWER = {"power": {"battery": {"capacity": 2.0}}}
+
+
+def fitted(change: Change, folder: Path, *, fault_of: str = "") -> Session:
+    """Return a session with a change of `orbit` that drivers and emulated devices share."""
+    opened = session(Case(change | (fault(fault_of) if fault_of else {}), "", [], base="orbit"), folder)
+    opened.config = requested_config(RunRequest(folder / "wired.yaml", Path()))[1]
+    return opened
+
+
+@pytest.mark.parametrize(
+    ("fault_of", "expected"),
+    [
+        ("", []),
+        ("battery-monitor: stuck", ["power.battery_monitor stuck"]),
+        ("battery-monitor: wrong", ["power.battery_monitor wrong voltage"]),
+        ("bus-monitor: stuck", ["power.bus_monitor stuck"]),
+        ("battery: cell-lost", ["power.battery_monitor wrong voltage", "power.bus_monitor wrong voltage"]),
+    ],
+)
+def test_faults_of_the_power_system_are_named(fault_of: str, expected: list[str], tmp_path: Path) -> None:
+    (found,) = outcomes(fitted(POWER, tmp_path, fault_of=fault_of), "power")
+    assert [f"{one.part} {one.kind}" for one in found.findings] == expected
+
+
+def rail(gain: float) -> Callable[[Session], None]:
+    """Return a fault of the battery monitor whose current has a gain."""
+
+    def spoil(opened: Session) -> None:
+        battery = opened.hand.hardware.power.rails[0]
+        measure = battery.measure
+        battery.monitor._measure = lambda *window: (measure(*window)[0], gain * measure(*window)[1])
+
+    return spoil
+
+
+@pytest.mark.parametrize(("gain", "kind"), [(-1.0, "reversed"), (0.5, "wrong shunt"), (0.0, "no current")])
+def test_a_wrong_shunt_of_the_battery_monitor_is_named(gain: float, kind: str, tmp_path: Path) -> None:
+    opened = fitted(POWER, tmp_path)
+    rail(gain)(opened)
+    (found,) = outcomes(opened, "power")
+    assert [f"{one.part} {one.kind}" for one in found.findings] == [f"power.battery_monitor {kind}"]
+
+
+WIDE = {
+    "wide_cameras": [
+        {"mounting": mounting, "columns": 128, "rows": 128, "field_of_view_deg": 92.0}
+        for mounting in ([0.0, 0.70710678, 0.70710678, 0.0], [0.70710678, 0.0, 0.0, 0.70710678])
+    ]
+}
+
+
+@pytest.mark.parametrize(
+    ("fault_of", "swapped", "expected"),
+    [
+        ("", False, []),
+        ("wide: black (camera=2)", False, ["wide_cameras[1] lens cap on"]),
+        ("wide: garbage (camera=1)", False, ["wide_cameras[0] noisy"]),
+        ("wide: frozen (camera=1)", False, ["wide_cameras[0] frozen"]),
+        ("wide: off (camera=2)", False, ["wide_cameras[1] no frame"]),
+        ("wide: saturated (camera=1)", False, ["wide_cameras[0] too bright"]),
+        ("", True, ["wide_cameras[0] exchanged", "wide_cameras[1] exchanged"]),
+    ],
+)
+def test_faults_of_horizon_cameras_are_named(
+    fault_of: str, swapped: bool, expected: list[str], tmp_path: Path
+) -> None:
+    opened = fitted(WIDE, tmp_path, fault_of=fault_of)
+    if swapped:
+        star, first, second = opened.rig.cameras or ()
+        opened.rig = replace(opened.rig, cameras=(star, second, first))
+    (found,) = outcomes(opened, "wide")
+    assert [f"{one.part} {one.kind}" for one in found.findings] == expected
+
+
 def test_a_monitor_of_the_power_system_is_not_mistaken_for_the_coil_monitor(tmp_path: Path) -> None:
-    power = {"power": {"battery": {"capacity": 2.0}}}
-    opened = session(Case(power | fault("monitor: off"), "", [], base="orbit"), tmp_path)
-    opened.config = requested_config(RunRequest(tmp_path / "wired.yaml", Path()))[1]
-    (found,) = outcomes(opened, "find")
+    (found,) = outcomes(fitted(POWER, tmp_path, fault_of="monitor: off"), "find")
     assert [f"{one.part} {one.kind}" for one in found.findings] == ["power_monitor no answer"]
     assert {"power.battery_monitor", "power.bus_monitor"} <= found.values["answers"].keys()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flight.schema.reader import load
-from ground.bringup import session as sessions
-from ground.bringup.session import STEPS, Session
+from ground.bringup.bench import Outcome, Session
+from ground.bringup.session import STEPS
 from hal.drivers.coils import PwmTorqueCoils
 from tests.ground.commands.in_process import command
 
@@ -62,9 +62,9 @@ def test_a_repeated_session_does_only_the_missing_steps(bench: Path, monkeypatch
     def noted(name: str) -> None:
         step = STEPS[name]
 
-        def run(session: Session) -> sessions.Outcome:
+        def run(session: Session) -> Outcome:
             done.append(name)
-            return step(session) if name == "find" else sessions.Outcome(values={"skipped": "not tried"})
+            return step(session) if name == "find" else Outcome(values={"skipped": "not tried"})
 
         monkeypatch.setitem(STEPS, name, run)
 

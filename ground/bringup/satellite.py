@@ -1,0 +1,284 @@
+"""The steps of a bench session with the devices of a satellite: power system, GPS receiver, solar strings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flight.schema.devices import Power
+from ground.bringup.bench import Outcome, Session, StepSkipped
+from ground.bringup.diagnosis import Finding
+from hal.interfaces.devices import GpsReading, GpsReceiver, PowerMonitor, PowerReading, SolarStrings
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+
+_SETTLE_S = 1.6
+"""Time (s) after which the mean of a current monitor has the present value."""
+_MONITOR_S = 1.0
+_NEAR = 0.15
+"""Relative difference up to which two monitors agree about a change of the current."""
+
+
+# Power system.
+
+
+def step_power(session: Session) -> Outcome:
+    """Read the monitors of battery and bus, with and without the current of a coil."""
+    power = session.config.power
+    if power is None:
+        raise StepSkipped("the configuration has no power")
+    findings: list[Finding] = []
+    monitors: dict[str, PowerMonitor] = {}
+    for key in power.monitors():
+        try:
+            monitors[key] = session.device(key)
+        except StepSkipped as reason:
+            findings += [reason.finding] if reason.finding else []
+    session.ask("Disconnect charger and solar panels. One coil is driven now.")
+    coils = session.device("coils")
+    section = session.config.coils
+    command = np.zeros(len(section.slots))
+    command[0] = min(section.limits[0], section.supply_voltage / section.resistance[0])
+    rest = _readings(session, monitors, np.zeros_like(command))
+    driven = _readings(session, monitors, command)
+    coils.off()
+    values: dict[str, dict[str, float]] = {}
+    for key, monitor in monitors.items():
+        if rest[key] is None or driven[key] is None:
+            problem = monitor.error() or "no conversion arrives"
+            findings.append(Finding(key, "no reading", problem, "check its supply and wiring"))
+            continue
+        before, after = rest[key], driven[key]
+        assert before is not None, "checked above"
+        assert after is not None, "checked above"
+        values[key] = {"voltage": before.voltage, "current": before.current}
+        values[key]["rise"] = after.current - before.current
+        findings += _monitor_faults(key, power, before, after)
+    faulty = {one.part for one in findings}
+    return Outcome([*findings, *_disagreement(values, faulty)], {"monitors": values})
+
+
+def _readings(
+    session: Session, monitors: Mapping[str, PowerMonitor], command: FloatArray
+) -> dict[str, PowerReading | None]:
+    """Return the newest readings after the coils have carried the currents `command` (n,), A, for a while."""
+    coils = session.device("coils")
+
+    def repeat() -> None:
+        coils.command(command)
+        if session.guardian is not None:
+            session.guardian.beat()
+
+    begun_ns = session.rig.clock.now_ns()
+    session.wait(_SETTLE_S + _MONITOR_S, repeat)
+    found = {key: monitor.latest() for key, monitor in monitors.items()}
+    return {key: None if one is None or one.time_ns < begun_ns else one for key, one in found.items()}
+
+
+def _monitor_faults(key: str, power: Power, rest: PowerReading, driven: PowerReading) -> list[Finding]:
+    """Return the fault of a monitor that its readings without and with a driven coil show, if any."""
+    if rest.current == driven.current and rest.voltage == driven.voltage:
+        text = (
+            f"its readings do not change when a coil is driven ({rest.voltage:.2f} V, {rest.current:.3f} A)"
+        )
+        return [
+            Finding(
+                key,
+                "stuck",
+                text,
+                "switch it off and on, and check its wiring; replace it if the readings stay",
+            )
+        ]
+    low, high = 0.9 * power.battery.voltage(0.0), 1.05 * power.battery.voltage(1.0)
+    if not low <= rest.voltage <= high:
+        text = f"it measures {rest.voltage:.2f} V, but the battery has {low:.2f} to {high:.2f} V"
+        return [Finding(key, "wrong voltage", text, "check its wiring, fuse and plug, and `power.battery`")]
+    rise = driven.current - rest.current
+    if rise < -0.02:
+        text = f"its current falls by {-1e3 * rise:.0f} mA when a coil is driven"
+        return [Finding(key, "reversed", text, "exchange the two wires at its shunt")]
+    if rise < 0.01:
+        text = f"its current changes by {1e3 * rise:.0f} mA only when a coil is driven"
+        return [Finding(key, "no current", text, "wire its shunt into the line of the battery or of the bus")]
+    return []
+
+
+def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -> list[Finding]:
+    """Return the finding about two monitors that measure different voltages or changes of the current."""
+    if len(values) < 2 or faulty & values.keys():
+        return []
+    (first, a), (second, b) = values.items()
+    if abs(a["voltage"] - b["voltage"]) > 0.03 * max(a["voltage"], b["voltage"]):
+        text = f"{a['voltage']:.2f} V, but {second} measures {b['voltage']:.2f} V on the same line"
+        return [Finding(first, "wrong voltage", text, f"measure the voltage at {first} and {second}")]
+    if abs(a["rise"] / b["rise"] - 1.0) > _NEAR:
+        text = f"a coil adds {1e3 * a['rise']:.0f} mA, but {1e3 * b['rise']:.0f} mA at {second}"
+        return [Finding(first, "wrong shunt", text, f"check `shunt` of {first} and {second}")]
+    return []
+
+
+# GPS receiver.
+
+_FIX_PATIENCE_S = 120.0
+"""Longest time (s) to the first fix of a receiver under an open sky."""
+_SILENCE_S = 6.0
+_FIXES = 12
+_PERIOD_S = 1.0
+"""Interval (s) of the fixes that the drivers request."""
+_LATE_S = 0.7
+"""Largest age (s) of a fix at its arrival: receivers need up to 0.2 s, slow serial lines more."""
+_CLOCK_S = 5.0
+"""Difference (s) of GPS time and computer above which the time is wrong, and a fix is not merely late."""
+
+
+def step_gps(session: Session) -> Outcome:
+    """Receive fixes, and judge satellites, rate, time, position and velocity."""
+    receiver: GpsReceiver = session.device("gps")
+    session.ask("Place the GPS antenna under an open sky, and leave it there.")
+    clock, before, readings = session.rig.clock, receiver.link(), list[GpsReading]()
+    begun_ns = clock.now_ns()
+    receiver.poll()
+
+    def seconds() -> float:
+        return (clock.now_ns() - begun_ns) * 1e-9
+
+    while sum(one.valid for one in readings) < _FIXES and seconds() < _FIX_PATIENCE_S:
+        session.wait(1.0)
+        readings += receiver.poll()
+        if not readings and seconds() > _SILENCE_S and receiver.link().frames == before.frames:
+            break
+    link, span = receiver.link(), seconds()
+    bad, good = link.bad_checksum - before.bad_checksum, link.frames + link.sentences
+    fixes = [one for one in readings if one.valid]
+    offsets = [_offset(one, clock.now_ns(), clock.utc_ns()) for one in fixes]
+    values = {
+        "fixes": len(fixes),
+        "satellites": max((one.satellites for one in readings), default=0),
+        "offset_s": float(np.median(offsets)) if offsets else None,
+    }
+    findings = _gps_stream(readings, bad / max(good - before.frames - before.sentences + bad, 1))
+    if not fixes:
+        if not readings:
+            text = f"no navigation solution arrives in {span:.0f} s: {link.condition or 'check its output'}"
+            findings.append(Finding("gps", "no answer", text, "check power, baud rate and wires"))
+        else:
+            text = f"no fix in {span:.0f} s, with {values['satellites']} satellites"
+            cure = "check the antenna, its cable and its supply, and that it sees the open sky"
+            findings.append(Finding("gps", "no fix", text, cure))
+        return Outcome(findings, values)
+    return Outcome([*findings, *_gps_faults(fixes, float(np.median(offsets)))], values)
+
+
+def _offset(reading: GpsReading, now_ns: int, utc_ns: int) -> float:
+    """Return the computer's UTC at the arrival of a fix minus the UTC of the fix, s."""
+    return (utc_ns - (now_ns - reading.arrival_ns) - reading.utc_ns) * 1e-9
+
+
+def _gps_stream(readings: Sequence[GpsReading], bad: float) -> list[Finding]:
+    """Return the faults that the arrival of the readings shows, with the share `bad` of wrong checksums."""
+    findings = []
+    if bad > 0.02:
+        text = f"{100.0 * bad:.0f} % of the messages have a wrong checksum"
+        cure = "check the ground wire and the length of the cable, or lower the baud rate"
+        findings.append(Finding("gps", "corrupted messages", text, cure))
+    if len(readings) < 4:
+        return findings
+    gaps = np.diff([one.arrival_ns for one in readings]) * 1e-9
+    typical = float(np.median(gaps))
+    if gaps.max() > 2.5 * typical and bad <= 0.02:
+        text = f"the messages stop for up to {gaps.max():.1f} s"
+        cure = "check plugs and solder joints for loose contact, and its supply"
+        findings.append(Finding("gps", "intermittent", text, cure))
+    elif not 0.6 * _PERIOD_S < typical < 1.5 * _PERIOD_S and bad <= 0.02:
+        text = f"a message every {typical:.2f} s instead of every {_PERIOD_S:g} s"
+        findings.append(Finding("gps", "wrong rate", text, "check its rate and the baud rate"))
+    return findings
+
+
+def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
+    """Return the faults that time, position and velocity of valid fixes show."""
+    utc, positions = np.array([one.utc_ns for one in fixes]), np.array([one.position for one in fixes])
+    if len(fixes) > 2 and (np.diff(utc) == 0).mean() > 0.5:
+        text = f"it repeats the fix of one time, {len(fixes)} times"
+        return [Finding("gps", "stuck", text, "switch it off and on; replace it if the fix stays")]
+    findings = []
+    if abs(offset) > _CLOCK_S:
+        text = f"its time differs from that of this computer by {-offset:.0f} s"
+        cure = "set the computer's clock by a time server; if the difference stays, replace the receiver"
+        findings.append(Finding("gps", "wrong time", text, cure))
+    elif offset > _LATE_S:
+        text = f"a fix arrives {offset:.1f} s after its time"
+        findings.append(Finding("gps", "late", text, "raise `baud_rate`, and switch other messages off"))
+    if len(fixes) > 2:
+        spans = np.diff(utc)[:, None] * 1e-9
+        velocities = np.array([one.velocity for one in fixes])
+        jumps = np.diff(positions, axis=0) - 0.5 * spans * (velocities[1:] + velocities[:-1])
+        largest = float(np.linalg.norm(jumps, axis=1).max())
+        sigma = float(np.nanmax([one.sigma for one in fixes] + [0.0]))
+        if largest > 50.0 + 6.0 * sigma:
+            text = f"its position jumps by {largest:.0f} m beside its velocity"
+            cure = "check the antenna and its surroundings for reflections and radio transmitters"
+            findings.append(Finding("gps", "inconsistent", text, cure))
+    return findings
+
+
+# Solar strings.
+
+_STRINGS_S = 2.5
+"""Time (s) in which each string is measured at least twice."""
+
+
+def step_strings(session: Session) -> Outcome:
+    """Shine a lamp onto one panel after the other, whose string must give a current, and no other string."""
+    strings: SolarStrings = session.device("solar_strings")
+    section = session.config.solar_strings
+    assert section is not None, "the device is open"
+    session.ask("Cover all solar panels.")
+    dark = _currents(session, strings, np.zeros(3))
+    normals = np.array([one.normal for one in section.strings])
+    peaks = np.array([one.peak for one in section.strings])
+    findings: list[Finding] = []
+    lit = np.zeros((len(peaks), len(peaks)))
+    for number, normal in enumerate(normals):
+        session.ask(
+            f"Shine a lamp onto the panel of string {number + 1} only, normal {tuple(normal.tolist())}."
+        )
+        lit[number] = _currents(session, strings, normal) - dark
+    alike = normals @ normals.T > 0.99 * np.linalg.norm(normals, axis=1) ** 2
+    if (lit == 0.0).all():
+        text = f"no current changes, whichever panel is lit ({1e3 * float(dark.max()):.0f} mA)"
+        findings.append(Finding("solar_strings", "stuck", text, "switch the converters off and on"))
+        return Outcome(findings, {"currents": lit.tolist()})
+    for number, row in enumerate(lit):
+        part = f"solar_strings.strings[{number}]"
+        shown = int(np.argmax(row / peaks))
+        if dark[number] > 0.05 * peaks[number]:
+            text = f"{1e3 * float(dark[number]):.0f} mA in the dark"
+            cure = "cover the panel completely; check its amplifier"
+            findings.append(Finding(part, "current in the dark", text, cure))
+        if row[shown] < 0.03 * peaks[shown]:
+            text = f"a lamp on its panel gives {1e3 * float(row[number]):.0f} mA"
+            findings.append(Finding(part, "dead", text, "check cells, diode, plug and amplifier"))
+        elif not alike[number, shown]:
+            text = f"a lamp on its panel gives a current in string {shown + 1}"
+            cure = "exchange the plugs, or `address` and `channel` of the two strings"
+            findings.append(Finding(part, "exchanged", text, cure))
+    return Outcome(findings, {"currents": lit.round(4).tolist()})
+
+
+def _currents(session: Session, strings: SolarStrings, normal: FloatArray) -> FloatArray:
+    """Return the currents (n,), A, while a lamp shines onto the panel with the outward `normal` (3,).
+
+    Raises StepSkipped if no reading arrives.
+    """
+    if session.hand is not None:
+        session.hand.light(normal)
+    begun_ns = session.rig.clock.now_ns()
+    session.wait(_STRINGS_S)
+    reading = strings.latest()
+    if reading is None or reading.time_ns < begun_ns + round(0.5 * _STRINGS_S * SECOND_NS):
+        problem = strings.error() or "no conversion arrives"
+        finding = Finding("solar_strings", "no reading", problem, "check supply and wiring of the converters")
+        raise StepSkipped("the solar strings give no reading", finding)
+    return reading.currents
