@@ -23,6 +23,7 @@ from flight.app.service import requested_config
 from flight.schema.devices import coil_fields
 from flight.schema.document import config_path, to_yaml
 from flight.schema.sections import Config
+from ground.bringup import cameras
 from ground.bringup.bench import Outcome, Session, StepSkipped
 from ground.bringup.session import STEPS
 
@@ -359,7 +360,6 @@ CASES = {
         fault("camera: intermittent (period=7)"), "dark", ["camera intermittent"]
     ),
     "camera with late frames": Case(fault("camera: delayed"), "dark", ["camera late"]),
-    "camera mirrored": Case({}, "lens", ["camera mirrored"], spoil=pictured(lambda pixels: pixels[:, ::-1])),
     "camera with hot pixels": Case(
         {}, "dark", ["camera hot pixels"], says="1 % of the pixels", spoil=pictured(without_stars)
     ),
@@ -437,6 +437,13 @@ def test_a_wiring_fault_is_named_and_no_other(name: str, tmp_path: Path) -> None
     findings = [one for outcome in outcomes(session(case, tmp_path), case.steps) for one in outcome.findings]
     assert [f"{one.part} {one.kind}" for one in findings] == list(case.expected)
     assert case.says in "\n".join(one.line() for one in findings)
+
+
+def test_a_mirrored_camera_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cameras, "_LENS_FRAMES", 2)
+    opened = session(Case({}, "", [], spoil=pictured(lambda pixels: pixels[:, ::-1])), tmp_path)
+    (found,) = outcomes(opened, "lens")
+    assert [f"{one.part} {one.kind}" for one in found.findings] == ["camera mirrored"]
 
 
 PLACES = {"x": [0.03, 0.02, -0.01], "y": [0.02, 0.05, 0.03], "z": [-0.02, 0.03, 0.06]}
