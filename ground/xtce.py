@@ -5,23 +5,34 @@
 The document uses only features that the known clients read. The document has one flat space system, one
 parameter per array element (`rate_1`) and per bit of a bit field (`health_facts_gyro_lost`), names without
 `. / : [ ]`, zero-terminated texts, and a header of fixed values in each telecommand. A parameter is named
-`<packet>_<field>`. Yamcs counts mission time from the epoch in the document.
+`<packet>_<field>`. The command `point` has one form for each pointing goal, such as `point-ground`. Its
+arguments have names, and its angles are in degrees. Yamcs counts mission time from the epoch in the document.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import struct
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from flight.link.commands import LAYOUTS as COMMANDS
+from flight.link.commands import POINT
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
 from flight.link.process.directives import NEW_KEY, PORTION
 from flight.link.telemetry.definitions import STAGES
 from flight.link.telemetry.fields import NO_YES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
+from knightcube.gnc.guidance.three_axes.pointing_target import (
+    ARGUMENTS,
+    NUMBERS,
+    ROLLS,
+    Goal,
+)
 
 SPACE = "KnightCube"
 _OF_THE_LINK = (NEW_KEY.name, PORTION.name)
@@ -35,6 +46,10 @@ EPOCH = "2000-01-01T00:00:00"
 _BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
 UNUSED = "_spare"
 """End of the name of a parameter for the unused bits of a bit field."""
+_DEGREES = "deg"
+"""Unit of an argument that is encoded in rad."""
+_NAN = struct.pack(">d", math.nan).hex()
+"""Code of an unused number of the command `point`."""
 _PRIMARY = (
     ("VERSION", 3),
     ("TYPE", 1),
@@ -78,9 +93,10 @@ def document(
     meta = SubElement(root, "CommandMetaData")
     arguments, listed = SubElement(meta, "ArgumentTypeSet"), SubElement(meta, "MetaCommandSet")
     for layout in commands.values():
-        command = _add_command(layout, arguments, listed)
-        if verified:
-            _add_verifiers(command, layout)
+        for name, entries in _forms(layout):
+            command = _add_command(name, layout, entries, arguments, listed)
+            if verified:
+                _add_verifiers(command, layout)
     indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
 
@@ -174,7 +190,11 @@ def _add_type(types: Element, name: str, field: Field, role: str) -> None:
         bits = str(_size(kind))
         number = SubElement(types, f"Float{role}Type", {"name": name, "sizeInBits": bits})
         _add_unit(number, field.unit)
-        SubElement(number, "FloatDataEncoding", {"sizeInBits": bits, "encoding": "IEEE754_1985"})
+        encoding = SubElement(number, "FloatDataEncoding", {"sizeInBits": bits, "encoding": "IEEE754_1985"})
+        if role == "Argument" and field.unit == _DEGREES:
+            polynomial = SubElement(SubElement(encoding, "DefaultCalibrator"), "PolynomialCalibrator")
+            factor = repr(math.radians(1.0))
+            SubElement(polynomial, "Term", {"coefficient": factor, "exponent": "1"})
         _add_ranges(number, field, role)
     else:
         number = _add_integer(types, name, kind[0], _size(kind), role, field.unit)
@@ -238,27 +258,65 @@ def _add_range(parent: Element, name: str, bounds: tuple[float, float]) -> None:
     SubElement(parent, name, {"minInclusive": f"{low:g}", "maxInclusive": f"{high:g}"})
 
 
-def _add_command(layout: Layout, types: Element, listed: Element) -> Element:
+class _Omissible(Field):
+    """Argument that is NaN if it is omitted."""
+
+
+_Entry = Field | str
+"""Entry of a telecommand: a field, which is an argument, or fixed bytes in hexadecimal digits."""
+
+
+def _forms(layout: Layout) -> Iterator[tuple[str, list[_Entry]]]:
+    """Yield the name and the entries of each form of a command.
+
+    The command `point` has one form for each goal, in which unused numbers are NaN. Each other command has
+    one form.
+    """
     packet = layout.packet
-    command = SubElement(listed, "MetaCommand", {"name": packet.name})
+    if packet is not POINT:
+        prefix = f"{packet.name}_"
+        yield packet.name, [replace(field, name=name.removeprefix(prefix)) for name, field in spread(layout)]
+        return
+    kind, numbers, roll = packet.fields
+    free_roll = _Omissible(roll.name, roll.kind, _DEGREES, roll.meaning)
+    for goal in Goal:
+        named = [_argument(goal, *one) for one in ARGUMENTS.get(goal, ())]
+        unused = [_NAN] * (numbers.count - len(named))
+        code = f"{goal:0{_size(kind.kind) // 4}x}"
+        yield f"{packet.name}-{goal.label}", [code, *named, *unused, _NAN if goal in ROLLS else free_roll]
+
+
+def _argument(goal: Goal, name: str, unit: str, low: float, high: float) -> Field:
+    """Return the field of one argument of a pointing goal, with angles in degrees."""
+    factor, unit = (math.degrees(1.0), _DEGREES) if unit == "rad" else (1.0, unit)
+    kind = _Omissible if 0 in NUMBERS[goal] else Field
+    meaning = f"{name} of the goal {goal.label}"
+    return kind(name.replace(" ", "_"), "f8", unit, meaning, valid=(factor * low, factor * high))
+
+
+def _add_command(name: str, layout: Layout, form: list[_Entry], types: Element, listed: Element) -> Element:
+    packet = layout.packet
+    command = SubElement(listed, "MetaCommand", {"name": name})
     _describe(command, packet.meaning)
     arguments = Element("ArgumentList")
     if packet.fields:  # XTCE has no empty argument list
         command.append(arguments)
-    container = SubElement(command, "CommandContainer", {"name": f"{packet.name}_packet"})
+    container = SubElement(command, "CommandContainer", {"name": f"{name}_packet"})
     entries = SubElement(container, "EntryList")
     header = layout.identifier << 32 | 0xC000 << 16 | layout.length - HEADER_BYTES - 1
     _add_fixed(entries, "primary_header", f"{header:012x}")
     _add_fixed(entries, "secondary_header", f"{packet.version:02x}" + "00" * 8)
-    typed: set[str] = set()
-    for name, field in spread(layout):
-        type_name, short = f"{packet.name}_{field.name}_Argument", name.removeprefix(f"{packet.name}_")
-        if type_name not in typed:
-            _add_type(types, type_name, field, "Argument")
-            typed.add(type_name)
-        argument = SubElement(arguments, "Argument", {"name": short, "argumentTypeRef": type_name})
+    for number, field in enumerate(form):
+        if isinstance(field, str):
+            _add_fixed(entries, f"fixed_{number}", field)
+            continue
+        type_name = f"{name}_{field.name}_Argument"
+        _add_type(types, type_name, field, "Argument")
+        argument = SubElement(arguments, "Argument", {"name": field.name, "argumentTypeRef": type_name})
         _describe(argument, field.meaning)
-        SubElement(entries, "ArgumentRefEntry", {"argumentRef": short})
+        if isinstance(field, _Omissible):
+            argument.set("initialValue", "NaN")
+        SubElement(entries, "ArgumentRefEntry", {"argumentRef": field.name})
     _add_fixed(entries, "error_control", "00" * CRC_BYTES)
     if packet.hazard:
         significance = {"consequenceLevel": "critical", "reasonForWarning": packet.hazard}

@@ -28,9 +28,10 @@ from flight.link.files.transfer import FOREIGN, SATELLITE
 from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UNIT_OVERHEAD_BYTES, UP
 from flight.link.process.station import host_port
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
+from ground.console.description import layouts_for
 from ground.link.gateway import ADDRESS, token_path
 from ground.link.terminal import DEFAULTS, FRAME_OVERHEAD_BYTES
-from ground.xtce import EPOCH, SPACE, document
+from ground.xtce import EPOCH, SPACE, TELECOMMANDS, document
 from ground.yamcs_operations import DISPLAYS, STACKS, stacks_and_displays
 from knightcube.errors import FlightError, UsageError
 
@@ -251,7 +252,7 @@ def files(
         f"etc/yamcs.{INSTANCE}.yaml": instance,
         "etc/processor.yaml": _PROCESSORS,
         LINK_SOURCE: _LINK,
-        f"{INSTANCE}.xml": document(epoch=epoch, verified=True),
+        f"{INSTANCE}.xml": document(commands=layouts_for(body, TELECOMMANDS), epoch=epoch, verified=True),
         **stacks_and_displays(body),
     }
 

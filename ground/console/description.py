@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -16,24 +15,17 @@ from flight.link.telemetry.packets import LAYOUTS, Layout
 from flight.loop.facts import FACTS
 from ground.documentation import command_table
 from hal.interfaces.devices import COIL_NAMES
-from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, ROLLS, Goal
+from knightcube.gnc.guidance.three_axes.pointing_target import ARGUMENTS, NUMBERS, ROLLS, Goal
 
 Object = dict[str, Any]
 Body = Literal["testbed", "orbit"]
 """Kind of body that flies: a body on a thread, or a satellite in orbit."""
-_RIGHT = 0.5 * math.pi
 _FOREIGN = {"testbed": (POINT.name, ORBITAL), "orbit": (SLEW.name, TESTBED)}
 """Command and modes that a kind of body refuses."""
 _TENSOR = re.compile(r"(?:[xyz]{2} ){5}[xyz]{2}")
 """Pattern of the components of a symmetric matrix in the meaning of a field."""
 _COMPONENTS = {3: list("xyz"), 4: list("xyzw"), 9: [a + b for a in "xyz" for b in "xyz"]}
 """Names of the components of an array by its length."""
-_NUMBERS: Mapping[Goal, tuple[tuple[str, str, float, float], ...]] = {
-    Goal.INERTIAL: tuple((f"quaternion {axis}", "-", -1.0, 1.0) for axis in "xyzw"),
-    Goal.GROUND: (("latitude", "rad", -_RIGHT, _RIGHT), ("longitude", "rad", -math.pi, 2.0 * math.pi)),
-    Goal.OBJECT: (("right ascension", "rad", 0.0, 2.0 * math.pi), ("declination", "rad", -_RIGHT, _RIGHT)),
-}
-"""Name, unit and range of each number of a pointing goal."""
 _LIMITED_BY: Mapping[str, tuple[tuple[str, str, str], ...]] = {
     "health.cpu_share": (("health_cpu_share", "above", "warning"),),
     "health.proportional": (("health_memory", "above", "fault"),),
@@ -98,7 +90,7 @@ def _target_inputs(field: str) -> list[Object]:
             "only": ["goal", [int(goal)]],
             "meaning": f"{name} of the goal {goal.label}",
         }
-        for goal, numbers in _NUMBERS.items()
+        for goal, numbers in ARGUMENTS.items()
         for index, (name, unit, low, high) in enumerate(numbers)
     ]
 

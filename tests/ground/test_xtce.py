@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring
 
@@ -11,18 +12,19 @@ import space_packet_parser
 from lxml import etree
 
 from flight.bodies.orbit.body import LEVELS
-from flight.link.commands import COMMANDS
+from flight.link.commands import COMMANDS, POINT, unpack, words_of
 from flight.link.events import Severity
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import DIRECTIVES, NEW_KEY, PORTION
 from flight.link.telemetry import definitions
 from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.fields import Field, Limits, Packet
-from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, Packer, compile_layouts, crc16
 from flight.loop.body import SteeringState
 from flight.loop.facts import FACTS, StreamState
 from ground import documentation
 from ground.xtce import document, main, spread
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.support.xtce_fields import compare, definition_of, shifted
 
@@ -125,12 +127,58 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
     assert not [name for name in names if set(name) & set("./:[] ")]
     commands = found(root, "x:CommandMetaData/x:MetaCommandSet")
     assert [command.get("name") for command in commands] == [
-        packet.name for packet in (*COMMANDS, *DIRECTIVES) if packet not in (NEW_KEY, PORTION)
+        name
+        for packet in (*COMMANDS, *DIRECTIVES)
+        if packet not in (NEW_KEY, PORTION)
+        for name in ([f"point-{goal.label}" for goal in Goal] if packet is POINT else [packet.name])
     ]
     arguments = found(root, "x:CommandMetaData/x:ArgumentTypeSet")
     assert found(arguments, ".//x:ValidRange").attrib == {"minInclusive": "-0.68", "maxInclusive": "0.68"}
     significance = found(commands, "x:MetaCommand[@name='slew']/x:DefaultSignificance")
     assert significance.get("reasonForWarning") == "moves the body"
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "words"),
+    [
+        ("point-sun", {"roll": 90.0}, "point sun roll 90deg"),
+        ("point-nadir", {}, "point nadir"),
+        (
+            "point-ground",
+            {"latitude": -52.5, "longitude": 13.4, "roll": 30.0},
+            "point ground -52.5deg 13.4deg roll 30deg",
+        ),
+        ("point-ground", {"latitude": 52.5, "longitude": 13.4}, "point ground 52.5deg 13.4deg"),
+        (
+            "point-inertial",
+            {f"quaternion_{axis}": value for axis, value in zip("xyzw", (0.6, 0.0, 0.0, 0.8), strict=True)},
+            "point inertial 0.6 0 0 0.8",
+        ),
+        ("point-object", {"right_ascension": 120.0, "declination": -5.0}, "point object 120deg -5deg"),
+        ("point-object", {}, "point object"),
+    ],
+)
+def test_each_form_of_point_takes_degrees_and_is_the_command_in_words(
+    name: str, values: dict[str, float], words: str
+) -> None:
+    """The packet that the document describes is read as the flight software reads it."""
+    root = found(fromstring(document()), "x:CommandMetaData")
+    command = found(root, f"x:MetaCommandSet/x:MetaCommand[@name='{name}']")
+    arguments = {one.get("name"): one for one in command.iter(f"{{{SPACE['x']}}}Argument")}
+    assert set(values) <= set(arguments)
+    data = b""
+    for entry in found(command, "x:CommandContainer/x:EntryList"):
+        if fixed := entry.get("binaryValue"):
+            data += bytes.fromhex(fixed)
+            continue
+        argument = arguments[entry.get("argumentRef")]
+        kind = found(root, f"x:ArgumentTypeSet/*[@name='{argument.get('argumentTypeRef')}']")
+        value = values.get(str(argument.get("name")), float(argument.get("initialValue", "inf")))
+        term = kind.find(".//x:Term", SPACE)
+        assert (term is None) is (kind.findtext(".//x:Unit", None, SPACE) is None)
+        data += struct.pack(">d", value if term is None else value * float(term.get("coefficient", "")))
+    data = data[:-CRC_BYTES]
+    assert words_of(unpack(data + crc16(data).to_bytes(CRC_BYTES, "big"))) == words
 
 
 def test_the_states_of_the_table_are_those_of_the_code() -> None:

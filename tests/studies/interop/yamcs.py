@@ -77,7 +77,7 @@ _BRIEF: list[tuple[str, dict[str, Any]]] = [
     ("dump-parameters", {}),
     ("load-parameters", _same_table("step_demo.yaml")),
 ]
-_POINT = ("point", {"goal": "sun", **{f"numbers_{i}": 0 for i in range(1, 5)}, "roll": 0.0})
+_POINT = ("point-sun", {"roll": 0.0})
 
 
 @dataclass(frozen=True, slots=True)

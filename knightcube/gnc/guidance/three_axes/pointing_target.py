@@ -7,6 +7,7 @@ computes the attitude law of a target.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -48,6 +49,13 @@ class Goal(IntEnum):
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
 """Permitted numbers of arguments for goals that have arguments, the largest number last."""
+_RIGHT = 0.5 * math.pi
+ARGUMENTS: Mapping[Goal, tuple[tuple[str, str, float, float], ...]] = {
+    Goal.INERTIAL: tuple((f"quaternion {axis}", "-", -1.0, 1.0) for axis in "xyzw"),
+    Goal.GROUND: (("latitude", "rad", -_RIGHT, _RIGHT), ("longitude", "rad", -math.pi, 2.0 * math.pi)),
+    Goal.OBJECT: (("right ascension", "rad", 0.0, 2.0 * math.pi), ("declination", "rad", -_RIGHT, _RIGHT)),
+}
+"""Name, unit and range of each argument of the goals that have arguments, for forms and documents."""
 ROLLS = {
     Goal.INERTIAL: "an inertial attitude includes its roll: omit the roll",
     Goal.OBJECT: "an object is tracked with a free roll: omit the roll",
@@ -87,9 +95,9 @@ class PointingTarget:
                 raise UsageError(f"the quaternion has length {length:.6g}: it must have length 1")
         if self.roll is not None and self.goal in ROLLS:
             raise UsageError(ROLLS[self.goal])
-        if self.goal is Goal.GROUND and not abs(self.numbers[0]) <= 0.5 * math.pi:
+        if self.goal is Goal.GROUND and not abs(self.numbers[0]) <= _RIGHT:
             raise UsageError(f"latitude {math.degrees(self.numbers[0]):g} deg is beyond a pole")
-        if self.goal is Goal.OBJECT and self.numbers and not abs(self.numbers[1]) <= 0.5 * math.pi:
+        if self.goal is Goal.OBJECT and self.numbers and not abs(self.numbers[1]) <= _RIGHT:
             raise UsageError(f"declination {math.degrees(self.numbers[1]):g} deg is beyond a pole")
 
     @property
