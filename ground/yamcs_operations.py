@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
+from flight.link.commands import Point, words_of
 from flight.link.telemetry.packets import LAYOUTS
 from ground.console.description import foreign_modes, layouts_for
 from ground.xtce import SPACE, TELECOMMANDS, UNUSED, spread
@@ -148,8 +149,19 @@ def _shown(session: Session, timeline: str, prediction: OrbitPrediction) -> Iter
 
 
 def _item(one: Pass) -> dict[str, Any]:
+    """Return a pass as an item of the timeline, with its light and the arguments of `schedule` for it."""
+    from ground.passes import scheduled_targets  # noqa: PLC0415 - Skyfield is large
+
     begin = one.rise.replace(microsecond=0)
     azimuths = " to ".join(f"{azimuth:.0f}" for azimuth in one.azimuths_deg)
+    light = "sunlight" if one.sunlit > 0.5 else "shadow"
+    words = [f"{at:%Y-%m-%dT%H:%M:%S} {words_of(Point(target))}" for at, target in scheduled_targets(one)]
+    facts = [
+        f"azimuths {azimuths} deg",
+        f"satellite in {light}",
+        f"Sun {one.sun_elevation_deg:.0f} deg high",
+        *(f"schedule {line}" for line in words),
+    ]
     return {
         "source": "rdb",
         "type": "EVENT",
@@ -157,5 +169,5 @@ def _item(one: Pass) -> dict[str, Any]:
         "start": begin.isoformat(),
         "duration": f"{(one.set - begin).total_seconds():.0f}s",
         "tags": [PASS],
-        "description": f"azimuths {azimuths} deg",
+        "description": "; ".join(facts),
     }

@@ -82,7 +82,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("mission-control"), metavar="FOLDER", help=text)
     text = "port of Yamcs's page (default %(default)s)"
     parser.add_argument("--port", type=count, default=HTTP_PORT, metavar="PORT", help=text)
-    text = f"UTC of mission time zero (default that of the recorded run, otherwise {EPOCH})"
+    text = f"UTC of mission time zero (default that of the flown or recorded run, otherwise {EPOCH})"
     parser.add_argument("--epoch", metavar="UTC", help=text)
     text = "file of two-line elements or OMM that predicts the passes (default `elements` of CONFIG)"
     parser.add_argument("--elements", type=Path, metavar="FILE", help=text)
@@ -97,17 +97,20 @@ def run(options: argparse.Namespace) -> int:
     if options.speed is not None and options.recorded is None:
         raise UsageError("--speed: replays a recorded run: give --recorded RUN")
     packets = None if options.recorded is None else _packets(options.recorded)
-    epoch = options.epoch or (EPOCH if packets is None else _epoch(packets))
     config = load(options.config)
     section = config.link
     body = cast("Body", config.body) if config.body in ("testbed", "orbit") else None
     frame_bytes = DEFAULTS.command_frame_bytes if section is None else section.command_frame_bytes
     if packets is None:
         options.link = options.link or _address(options.config, section)
-    forecast, folder = _forecast(options), options.out.absolute()
+    folder = options.out.absolute()
     with ExitStack() as stack:
         signals = stack.enter_context(EndingSignals())
-        running = _flown(options.config, folder, stack) if options.fly else {}
+        running, first = _flown(options.config, folder, stack) if options.fly else ({}, packets or ())
+        zero = _mission_zero(first)
+        options.begin = options.begin or zero
+        forecast = _forecast(options)
+        epoch = options.epoch or (EPOCH if zero is None else zero.replace(tzinfo=None).isoformat())
         gateway = None if packets is not None else _gateway(options, stack)
         served = None if gateway is None else f"127.0.0.1:{gateway.port}"
         write(folder, served, options.port, epoch, options.keys, frame_bytes, body)
@@ -136,10 +139,16 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess.Popen[bytes]]:
-    """Start link and flight of a configuration in real time. Return their processes, which `stack` ends."""
+def _flown(
+    config: Path, folder: Path, stack: ExitStack
+) -> tuple[dict[str, subprocess.Popen[bytes]], list[bytes]]:
+    """Start link and flight of a configuration in real time.
+
+    Return their processes, which `stack` ends, and the first packets of the flight. Raises FlightError.
+    """
     runs = folder / "runs"
     runs.mkdir(parents=True, exist_ok=True)
+    earlier = set(runs.iterdir())
     command = [sys.executable, "-m", "flight"]
     link = _process([*command, "link", str(config), "--log", str(runs)], folder / "link.log", stack)
     until = time.monotonic() + _START_S
@@ -148,7 +157,14 @@ def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess
             raise FlightError(f"the link could not be opened: see {folder / 'link.log'}")
         time.sleep(_ASK_S)
     words = ["run", str(config), "--realtime", "--archive", str(runs)]
-    return {"the link": link, "the flight": _process([*command, *words], folder / "flight.log", stack)}
+    flight = _process([*command, *words], folder / "flight.log", stack)
+    until = time.monotonic() + _START_S
+    while time.monotonic() < until and flight.poll() is None:
+        for run in set(runs.iterdir()) - earlier:
+            if find_segments(run, "flight") and (packets := _packets(run)):
+                return {"the link": link, "the flight": flight}, packets
+        time.sleep(_ASK_S)
+    raise FlightError(f"the flight did not begin: see {folder / 'flight.log'}")
 
 
 def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
@@ -173,13 +189,12 @@ def _packets(run: Path) -> list[bytes]:
     return [data[begin:end] for _, begin, end in walk(data)]
 
 
-def _epoch(packets: Sequence[bytes]) -> str:
-    """Return the UTC of mission time zero that the packets state at last, or EPOCH if no packet states it."""
+def _mission_zero(packets: Sequence[bytes]) -> datetime | None:
+    """Return the UTC of mission time zero that the packets state at last, or None if no packet states it."""
     rows = decode(b"".join(packets))[RUN.name]
     if not len(rows) or not rows[-1]["utc_ns"]:
-        return EPOCH
-    utc = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=int(rows[-1]["utc_ns"]) // 1000)
-    return utc.replace(tzinfo=None).isoformat(timespec="milliseconds")
+        return None
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=int(rows[-1]["utc_ns"]) // 10**6)
 
 
 class Replay:

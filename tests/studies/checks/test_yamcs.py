@@ -186,9 +186,17 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
         )
         assert operator.passes() == passes, "a second prediction replaces the first"
     foreseen = prediction.passes([station])
-    assert [start for start, _ in passes] == [one.rise.replace(microsecond=0) for one in foreseen]
+    assert [start for start, *_ in passes] == [one.rise.replace(microsecond=0) for one in foreseen]
     lengths = [(one.set - one.rise).total_seconds() for one in foreseen]
-    assert [seconds for _, seconds in passes] == pytest.approx(lengths, abs=1.5)
+    assert [seconds for _, seconds, _ in passes] == pytest.approx(lengths, abs=1.5)
+    for one, (_, _, description) in zip(foreseen, passes, strict=True):
+        _, _, light, sun, *schedule = description.split("; ")
+        assert light == f"satellite in {'sunlight' if one.sunlit > 0.5 else 'shadow'}"
+        assert sun == f"Sun {one.sun_elevation_deg:.0f} deg high"
+        assert [line.split(maxsplit=2)[::2] for line in schedule] == [
+            ["schedule", "point ground 52.5deg 13.4deg"],
+            ["schedule", "point nadir"],
+        ]
     assert "connection closed" not in (tmp_path / "said").read_text(encoding="utf-8")
     words = ["mission-control", config, "--recorded", run, "--out", tmp_path / "replay", "--port", http]
     with service(tmp_path / "replay.log", "Yamcs on", *words):
