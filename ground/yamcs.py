@@ -315,7 +315,15 @@ def class_path() -> str:
 
 
 def compile_link(folder: Path) -> None:
-    """Compile the data link of the configuration in a folder. Raises FlightError with the compiler's text."""
+    """Write the source of the data link into a folder and compile it.
+
+    Raises UsageError if the folder cannot be written, and FlightError with the compiler's text.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / LINK_SOURCE).write_text(_LINK, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
     compiler = ["java", *_FRUGAL, "-cp", class_path()]
     compiler += ["-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
     command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from itertools import accumulate
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, cast
 
 from flight.app.service import EndingSignals
 from flight.link.telemetry.definitions import RUN
-from flight.link.telemetry.log import SUFFIX, find_segments
+from flight.link.telemetry.log import SUFFIX, find_runs, find_segments
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES, walk
 from flight.schema.document import config_path
 from flight.schema.reader import load
@@ -52,7 +52,9 @@ if TYPE_CHECKING:
 _ASK_S = 0.2
 """Interval (s) between two questions whether Yamcs runs."""
 _START_S = 60.0
-"""Longest time (s) to wait for the link."""
+"""Longest time (s) to wait for the link, and for the flight."""
+_RUNS, _FLIGHT = "runs", "the flight"
+"""Folder of the runs of a simulated flight, and the name of its process in messages."""
 _END_S = 30.0
 """Longest time (s) to wait for the end of Yamcs."""
 
@@ -106,15 +108,16 @@ def run(options: argparse.Namespace) -> int:
     folder = options.out.absolute()
     with ExitStack() as stack:
         signals = stack.enter_context(EndingSignals())
-        running, first = _flown(options.config, folder, stack) if options.fly else ({}, packets or ())
-        zero = _mission_zero(first)
+        earlier = find_runs(folder / _RUNS) if options.fly else []
+        running = _flown(options.config, folder, stack) if options.fly else {}
+        gateway = None if packets is not None else _gateway(options, stack)
+        served = None if gateway is None else f"127.0.0.1:{gateway.port}"
+        compile_link(folder)  # while the flight starts
+        zero = _mission_zero(_first_packets(folder, earlier, running) if running else packets or ())
         options.begin = options.begin or zero
         forecast = _forecast(options)
         epoch = options.epoch or (EPOCH if zero is None else zero.replace(tzinfo=None).isoformat())
-        gateway = None if packets is not None else _gateway(options, stack)
-        served = None if gateway is None else f"127.0.0.1:{gateway.port}"
         write(folder, served, options.port, epoch, options.keys, frame_bytes, body)
-        compile_link(folder)
         yamcs = running["Yamcs"] = _process(command_line(folder), folder / "log", stack)
 
         def ended() -> bool:
@@ -139,16 +142,10 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _flown(
-    config: Path, folder: Path, stack: ExitStack
-) -> tuple[dict[str, subprocess.Popen[bytes]], list[bytes]]:
-    """Start link and flight of a configuration in real time.
-
-    Return their processes, which `stack` ends, and the first packets of the flight. Raises FlightError.
-    """
-    runs = folder / "runs"
+def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess.Popen[bytes]]:
+    """Start link and flight of a configuration in real time. Return their processes, which `stack` ends."""
+    runs = folder / _RUNS
     runs.mkdir(parents=True, exist_ok=True)
-    earlier = set(runs.iterdir())
     command = [sys.executable, "-m", "flight"]
     link = _process([*command, "link", str(config), "--log", str(runs)], folder / "link.log", stack)
     until = time.monotonic() + _START_S
@@ -157,12 +154,18 @@ def _flown(
             raise FlightError(f"the link could not be opened: see {folder / 'link.log'}")
         time.sleep(_ASK_S)
     words = ["run", str(config), "--realtime", "--archive", str(runs)]
-    flight = _process([*command, *words], folder / "flight.log", stack)
+    return {"the link": link, _FLIGHT: _process([*command, *words], folder / "flight.log", stack)}
+
+
+def _first_packets(
+    folder: Path, earlier: Sequence[Path], running: Mapping[str, subprocess.Popen[bytes]]
+) -> list[bytes]:
+    """Wait for the first packets of the flight and return them. Raises FlightError if there are none."""
     until = time.monotonic() + _START_S
-    while time.monotonic() < until and flight.poll() is None:
-        for run in set(runs.iterdir()) - earlier:
-            if find_segments(run, "flight") and (packets := _packets(run)):
-                return {"the link": link, "the flight": flight}, packets
+    while time.monotonic() < until and running[_FLIGHT].poll() is None:
+        new = [run for run in find_runs(folder / _RUNS) if run not in earlier]
+        if new and find_segments(new[0], "flight") and (packets := _packets(new[0])):
+            return packets
         time.sleep(_ASK_S)
     raise FlightError(f"the flight did not begin: see {folder / 'flight.log'}")
 

@@ -522,11 +522,20 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run_files)
 
 
+_LOCAL = {
+    "put": "`files put` sends a local file",
+    "use": "`files use` needs the local copy of the file on board, whose SHA-256 it sends",
+}
+"""Reason by the file command for which the command needs a local file."""
+
+
 def run_files(options: argparse.Namespace) -> int:
     """Carry out the file command and print its result."""
     for name in ("rate", "timeout"):
         if not 0.0 < getattr(options, name) < float("inf"):
             raise UsageError(f"--{name} {getattr(options, name)}: must be a positive number")
+    if options.what in _LOCAL and not options.path.is_file():
+        raise UsageError(f"{options.path}: no such file on the ground: {_LOCAL[options.what]}")
     terminal = terminal_of(options)
     try:
         store = Store(options.folder or ground_files_folder(options.keys))
@@ -656,5 +665,7 @@ class _FileWork:
         if name and now_ns * 1e-9 - self._shown_s >= _SHOW_S:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():
+                if one.name not in {"", name}:  # an earlier transfer that continues
+                    continue
                 part = f"{one.done} of {one.size} bytes" if one.size else "started"
                 sys.stderr.write(f"knightcube: {shown(one.name or name)}: {part}\n")

@@ -299,6 +299,9 @@ def _power(power: Object, thesis: bool) -> list[str]:
 
 def _loop(summary: Object) -> list[str]:
     lines, cycles = [], summary["cycles"]
+    clock = (
+        "" if summary["run"].get("realtime", True) else ", in times of the host; the flight was in lock-step"
+    )
     if summary["rate_groups"]:
         rows = [
             [
@@ -311,7 +314,7 @@ def _loop(summary: Object) -> list[str]:
             for group in summary["rate_groups"]
         ]
         head = ["rate group", "period s", "cycles", "slips", "overruns", "mean ms", "max ms"]
-        lines += ["Rate groups", *table(head, rows)]
+        lines += [f"Rate groups{clock}", *table(head, rows)]
     timed = {
         "lateness of a control cycle": cycles["lateness_s"],
         "execution of a control cycle": cycles["execution_s"],
@@ -326,7 +329,7 @@ def _loop(summary: Object) -> list[str]:
         if times is not None
     ]
     if rows:
-        lines += ["Times", *table(["", "median ms", "99 % ms", "max ms"], rows)]
+        lines += [f"Times{clock}", *table(["", "median ms", "99 % ms", "max ms"], rows)]
     if cycles["count"]:
         lines.append(f"Control cycles in the log: {cycles['count']}, skipped slots: {cycles['skipped']}")
     return lines

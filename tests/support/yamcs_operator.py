@@ -103,10 +103,11 @@ class Operator:
         transfer.await_complete(_LONGEST_S)
         assert transfer.is_success(), transfer.error
 
-    def passes(self) -> list[tuple[datetime, float, str]]:
-        """Return start, duration (s) and description of the passes on the timeline."""
-        items = [one for one in self._client.get_timeline_client(INSTANCE).list_items() if PASS in one.tags]
-        return sorted((item.start, item.duration.total_seconds(), item.description) for item in items)
+    def passes(self) -> list[tuple[datetime, float]]:
+        """Return start and duration (s) of the passes on the timeline."""
+        items = self._client.get_timeline_client(INSTANCE).list_items()
+        found = [(item.start, item.duration.total_seconds()) for item in items if PASS in item.tags]
+        return sorted(found)
 
 
 def _until(done: Callable[[], bool]) -> None:

@@ -52,6 +52,7 @@ def blocks(**changes: Any) -> list[str]:
     return found[1:-2]
 
 
+HOST = ", in times of the host; the flight was in lock-step"
 CYCLES = "Control cycles in the log: 7, skipped slots: 2"
 
 
@@ -236,6 +237,9 @@ def test_times_of_the_loop_are_in_milliseconds() -> None:
     jobs = [{"name": "vision", "count": 3, "outcomes": {"done": 2, "died": 1}, "execution_s": times}]
     cycles = {**EMPTY["cycles"], "lateness_s": times}
     [text] = blocks(rate_groups=[group], jobs=jobs, cycles=cycles)
+    run = {**EMPTY["run"], "realtime": False}
+    [of_host] = blocks(rate_groups=[group], jobs=jobs, cycles=cycles, run=run)
+    assert of_host == text.replace("Rate groups", f"Rate groups{HOST}").replace("Times", f"Times{HOST}")
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines == [
         "Rate groups",

@@ -181,16 +181,16 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
         received = tmp_path / "keys" / "files" / "received" / "elements" / "new.txt"
         assert received.read_bytes() == b"new elements"
         passes = operator.passes()
-        add_passes(
-            Session(f"http://127.0.0.1:{http}/api", USER, password_in(out)), INSTANCE, prediction, [station]
-        )
+        session = Session(f"http://127.0.0.1:{http}/api", USER, password_in(out))
+        add_passes(session, INSTANCE, prediction, [station])
+        items = session.ask(f"/timeline/{INSTANCE}/items?limit=500&details=true")["items"]
         assert operator.passes() == passes, "a second prediction replaces the first"
     foreseen = prediction.passes([station])
-    assert [start for start, *_ in passes] == [one.rise.replace(microsecond=0) for one in foreseen]
+    assert [start for start, _ in passes] == [one.rise.replace(microsecond=0) for one in foreseen]
     lengths = [(one.set - one.rise).total_seconds() for one in foreseen]
-    assert [seconds for _, seconds, _ in passes] == pytest.approx(lengths, abs=1.5)
-    for one, (_, _, description) in zip(foreseen, passes, strict=True):
-        _, _, light, sun, *schedule = description.split("; ")
+    assert [seconds for _, seconds in passes] == pytest.approx(lengths, abs=1.5)
+    for one, item in zip(foreseen, sorted(items, key=lambda item: str(item["start"])), strict=True):
+        _, light, sun, *schedule = item["description"].split("; ")
         assert light == f"satellite in {'sunlight' if one.sunlit > 0.5 else 'shadow'}"
         assert sun == f"Sun {one.sun_elevation_deg:.0f} deg high"
         assert [line.split(maxsplit=2)[::2] for line in schedule] == [

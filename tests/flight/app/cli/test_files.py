@@ -88,5 +88,6 @@ def test_ctrl_c_keeps_what_came_and_a_second_call_has_the_folder_to_itself(
 
 def test_wrong_values_are_refused(way: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*way, "--rate", "0", "list"]) == 2
-    assert main([*way, "put", "configuration", "/none"]) == 1
-    assert "No such file" in capsys.readouterr().err
+    for word in ("put", "use"):
+        assert main([*way, word, "configuration", "/none"]) == 2
+        assert f"/none: no such file on the ground: `files {word}`" in capsys.readouterr().err
