@@ -9,18 +9,20 @@ import os
 import select
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from flight.app.cli import PROGRAM
 from flight.app.run import utc_ns
 from flight.app.service import EndingSignals
 from flight.link.commands import (
     COMMANDS,
     LAYOUTS,
+    LOAD_PARAMETERS,
     PING,
     POINT,
     Command,
@@ -168,20 +170,22 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run_command)
 
 
-def _add_commands(words: _Words) -> None:
-    """Add a subparser for each telecommand."""
-    for packet in COMMANDS:
+def _add_commands(words: _Words, packets: Sequence[Packet] = COMMANDS) -> None:
+    """Add a subparser for each of the telecommands."""
+    for packet in packets:
         _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
 
 
 def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
     """Return the options, with the scheduled command as one line and the options after its words.
 
+    A table of parameters is longer than a scheduled command can be.
+
     Raises UsageError for values that the command forbids; wrong words end the program with status 2.
     """
-    parser = argparse.ArgumentParser(prog="schedule UTC")
+    parser = argparse.ArgumentParser(prog=f"{PROGRAM} command schedule UTC")
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
-    _add_commands(words)
+    _add_commands(words, [packet for packet in COMMANDS if packet is not LOAD_PARAMETERS])
     _allow_behind(words)
     typed = parser.parse_args(options.words)
     behind = {name: getattr(typed, name) for name in ("timeout", "json") if hasattr(typed, name)}

@@ -175,6 +175,12 @@ def test_a_scheduled_command_is_the_command_as_typed(typed: str) -> None:
         assert flown == meant
 
 
+def test_a_table_of_parameters_cannot_be_scheduled(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        satellite._with_scheduled(words("schedule", "2026-11-23T21:00:00", "load-parameters", "1", "2"))
+    assert "knightcube command schedule UTC: error: argument WHAT" in capsys.readouterr().err
+
+
 def test_options_may_stand_behind_the_command() -> None:
     assert words("slew", "0.2", "--json", "--timeout", "7").timeout == 7.0
     assert words("slew", "0.2").timeout == 2.0
