@@ -41,9 +41,9 @@ def modes_of(run: Run) -> list[Mode]:
     return [mode for mode, _ in path_of_modes(run)]
 
 
-def entered(run: Run, mode: Mode) -> float:
-    """Return the mission time (s) at which a mode was last entered."""
-    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][-1]) * 1e-9
+def entered(run: Run, mode: Mode, occurrence: int = -1) -> float:
+    """Return the mission time (s) at which a mode was entered, by default the last time."""
+    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][occurrence]) * 1e-9
 
 
 def currents(run: Run, since: float, until: float) -> FloatArray:

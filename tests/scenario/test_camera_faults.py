@@ -11,7 +11,7 @@ from flight.schema.reader import replace
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FaultEntry
-from tests.support.flights import config_for, demo_world, event_names, fly
+from tests.support.flights import config_for, demo_world, event_names, event_time, fly
 
 AT, SPAN = 3.0, 4.0
 ABOUT_VISION = {"camera-late", "camera-lost", "camera-strange", "camera-torn", "vision-slow", "vision-failed"}
@@ -21,10 +21,6 @@ def flown(folder: Path, mode: str, fault: str = "") -> Run:
     faults = (FaultEntry(fault=fault, at=AT, span=SPAN),) if fault else ()
     config = replace(config_for(mode, camera=True), duration=8.0)
     return fly(config, folder, section=replace(demo_world(), faults=faults))
-
-
-def first_event(run: Run, name: str) -> float:
-    return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
 
 def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
@@ -46,7 +42,7 @@ def test_what_is_late_is_reported_with_the_next_frame(
 ) -> None:
     """A frame is exposed every 2 s."""
     run = flown(tmp_path, "hold", fault)
-    assert AT < first_event(run, event) < AT + within
+    assert AT < event_time(run, event) < AT + within
     assert "task-failed" not in event_names(run)
 
 
@@ -57,7 +53,7 @@ def test_a_frame_that_is_not_in_order_is_reported_and_not_believed(
     fault: str, event: str, tmp_path: Path
 ) -> None:
     run = flown(tmp_path, "safe", fault)
-    assert AT < first_event(run, event) < AT + 2.0
+    assert AT < event_time(run, event) < AT + 2.0
     streak = run["streak"]
     time = streak["time_ns"] * 1e-9
     spoiled = (time > AT) & (time < AT + 2.0)

@@ -18,7 +18,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry
 from tests.scenario.mode_flights import modes_of
-from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
+from tests.support.flights import Rigged, demo_config, demo_world, event_names, event_time, fly
 
 AT = 4.0
 SECOND = 1_000_000_000
@@ -58,10 +58,6 @@ def torque(currents: FloatArray, quaternions: FloatArray) -> FloatArray:
     fields = np.array([attitude_matrix(quaternion) @ FIELD for quaternion in quaternions])
     made: FloatArray = np.cross(DIPOLE * currents, fields)[:, 1]
     return made
-
-
-def event_time(run: Run, name: str) -> float:
-    return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
 
 @pytest.mark.parametrize(("fault", "within"), [("coil-x: open", 6.0), ("bridge-x: a-high", 6.0)])

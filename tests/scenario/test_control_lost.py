@@ -17,12 +17,11 @@ import pytest
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground import report
-from ground.telemetry import Run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Vn100Sample
 from tests.scenario.mode_flights import commanded, currents, released
-from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_config
+from tests.support.flights import Rigged, demo_config, event_names, event_time, fly, thesis_config
 
 SILENT_AT = 3.0
 WITHIN = 0.1
@@ -31,11 +30,6 @@ ZERO = 1e-3
 """A."""
 
 Break = Callable[[Rigged], None]
-
-
-def event_time(run: Run, name: str) -> float:
-    """Return the mission time, s, of the first event of a name."""
-    return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
 
 def silence(rigged: Rigged, seconds: float = 60.0) -> None:

@@ -73,14 +73,10 @@ def test_the_coils_are_at_zero_while_the_unit_is_silent(flown: Run) -> None:
 def test_the_coils_pause_while_the_magnetometer_measures(flown: Run) -> None:
     """The magnetometer is read in the last 0.1 s of each pause of 0.2 s, after the decay of the current."""
     time = flown["truth"]["time_ns"] * 1e-9
-    began = entered_first(flown, Mode.DETUMBLE)
+    began = entered(flown, Mode.DETUMBLE, 0)
     phase = (time - began) % 4.0
     measuring = (time > began + 2.0) & (time < SILENT) & (phase > 0.1) & (phase < 0.2)
     assert np.abs(flown["truth"]["current"][measuring]).max() < 1e-3
-
-
-def entered_first(run: Run, mode: Mode) -> float:
-    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][0]) * 1e-9
 
 
 def test_modes_that_need_an_attitude_are_refused(flown: Run) -> None:

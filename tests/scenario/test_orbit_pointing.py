@@ -12,7 +12,7 @@ from flight.schema.orbit import TargetStep
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between
-from tests.scenario.mode_flights import modes_of
+from tests.scenario.mode_flights import entered, modes_of
 from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
@@ -43,13 +43,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return fly(config, tmp_path_factory.mktemp("pointing"), section=section)
 
 
-def entered(run: Run, mode: Mode) -> float:
-    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][0]) * 1e-9
-
-
 def test_it_points_as_soon_as_its_attitude_is_known(flown: Run) -> None:
     assert modes_of(flown) == [Mode.BOOT, Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT, Mode.SUN]
-    assert entered(flown, Mode.POINT) < 30.0
+    assert entered(flown, Mode.POINT, 0) < 30.0
     assert not {"planner-failed", "control-lost", "tumbling"} & set(event_names(flown))
     targets = [to_text(e["text"]) for e in flown["event"] if to_text(e["name"]) == "target"]
     assert targets[0].startswith("inertial")
@@ -68,7 +64,7 @@ def test_the_coils_act_and_pause_for_the_magnetometer(flown: Run) -> None:
     """The coils pause for a tenth of the time."""
     truth = flown["truth"]
     time = truth["time_ns"] * 1e-9
-    inside = (time > entered(flown, Mode.POINT) + 4.0) & (time < DURATION)
+    inside = (time > entered(flown, Mode.POINT, 0) + 4.0) & (time < DURATION)
     currents = np.abs(truth["current"][inside]).max(axis=1)
     assert np.mean(currents < 1e-3) == pytest.approx(0.1, abs=0.06)
 
@@ -78,7 +74,7 @@ def test_no_step_of_the_coils_falls_into_an_exposure_while_it_points(flown: Run)
     times, dipoles = packets["time_ns"].astype(np.int64), packets["dipole"]
     changed = np.abs(np.diff(dipoles, axis=0)).max(axis=1) > 0.0
     after = times[1:][changed]  # first packets after target steps; packets are 0.1 s apart
-    frames = flown["streak"][flown["streak"]["exposure_start_ns"] > entered(flown, Mode.POINT) * 1e9]
+    frames = flown["streak"][flown["streak"]["exposure_start_ns"] > entered(flown, Mode.POINT, 0) * 1e9]
     assert len(frames) >= 3
     assert len(after) > 30
     for frame in frames:

@@ -14,16 +14,12 @@ from flight.schema.devices import Battery, LowBattery, Power
 from ground.telemetry import Run
 from sim_hal.settings import PowerTruth, SolarPanel
 from tests.scenario.orbit_flights import orbit_config, world
-from tests.support.flights import demo_config, demo_world, fly
+from tests.support.flights import demo_config, demo_world, event_names, fly
 
 FACES = [tuple(sign * float(k == axis) for k in range(3)) for axis in range(3) for sign in (1.0, -1.0)]
 ANOMALY_DEG = 242.0
 """True anomaly at the start, about 14 s before the sunrise."""
 CAMERA_PERIOD = 3.0
-
-
-def names(run: Run) -> list[str]:
-    return [to_text(name) for name in run["event"]["name"]]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +38,7 @@ def orbit(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_the_loads_are_shed_in_order_and_the_flight_goes_on_after_sunrise(orbit: Run) -> None:
-    assert [name for name in names(orbit) if name.startswith("battery")] == [
+    assert [name for name in event_names(orbit) if name.startswith("battery")] == [
         "battery-low", "battery-very-low", "battery-critical",
         "battery-charged", "battery-recovered", "battery-recovered",
     ]  # fmt: skip
@@ -83,6 +79,6 @@ def test_a_testbed_takes_fewer_frames_and_then_rests_with_a_reason(tmp_path: Pat
     frames = run["streak"]["exposure_start_ns"] * 1e-9
     assert np.diff(frames[frames < slower]).max() < 1.5
     assert np.diff(frames[frames > slower]).min() > CAMERA_PERIOD - 1.0
-    assert "camera-lost" not in names(run)
+    assert "camera-lost" not in event_names(run)
     assert to_text(run["mode"][-1]["reason"]) == "battery-critical"
     assert not run["truth"]["current"][run["truth"]["time_ns"] * 1e-9 > safe + 1.0].any()

@@ -126,6 +126,11 @@ def event_names(run: Run) -> list[str]:
     return [to_text(name) for name in run["event"]["name"]]
 
 
+def event_time(run: Run, name: str) -> float:
+    """Return the mission time (s) of the first event of a name."""
+    return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
+
+
 def config_for(mode: str, camera: bool, duration: float = DURATION) -> Config:
     """Return half a minute of the demonstration in a mode, optionally with a small and fast camera."""
     config = demo_config(duration)

@@ -12,6 +12,12 @@ from ground.telemetry import Run, scan
 Rows = Sequence[tuple[float, Mapping[str, Any]]]
 
 
+class WritablePackets(dict[str, Any]):
+    """Writable packets that replace those of a run."""
+
+    logs: Any
+
+
 def packed_run(folder: Path = Path("run"), **packets: Rows) -> Run:
     """Return a run from rows (mission time in s, values by field) for each packet type."""
     packer, raw = Packer(), []

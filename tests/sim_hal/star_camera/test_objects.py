@@ -43,6 +43,7 @@ from sim_hal.star_camera.objects import (
 from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.orbit import KeplerianElements, propagate, sun_position
 from sim_hal.worlds.world import OrbitingWorld
+from tests.sim_hal.star_camera.scenes import centroid
 from tests.support.opportunities import (
     Scenario,
     constant_slew,
@@ -347,11 +348,6 @@ def test_a_wider_exclusion_leaves_fewer_opportunities() -> None:
     assert counts[0] > counts[1] > counts[2] == 0
 
 
-def _centre_of_light(image: FloatArray) -> FloatArray:
-    rows, columns = np.indices(image.shape)
-    return np.asarray(np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum())
-
-
 def test_the_object_is_in_the_frame_where_the_opportunity_has_it() -> None:
     scenario = _table_4_3()
     item = opportunities(scenario, cadence=1.0, exposure=0.5)[3]
@@ -360,7 +356,7 @@ def test_the_object_is_in_the_frame_where_the_opportunity_has_it() -> None:
     image = expected_electrons(StarCameraModel(), NO_STARS, [], times, attitudes, extra=tracks)
     assert image.sum() == pytest.approx(float(StarCameraModel().electrons(4.0, 0.5)), rel=1e-3)
     middle = 0.5 * (np.array(item.first) + np.array(item.last))
-    assert _centre_of_light(image) == pytest.approx(middle, abs=0.3)
+    assert centroid(image) == pytest.approx(middle, abs=0.3)
     # A rotation of 0.025 rad moves stars by 73 px, and the object itself moves by a few px.
     assert np.hypot(*(np.array(item.last) - np.array(item.first))) == pytest.approx(73.0, abs=15.0)
 

@@ -16,6 +16,7 @@ from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
 from tests.support.flights import config_for, demo_world, event_names, fly
+from tests.support.packed_run import WritablePackets
 
 AT = 5.0
 BRIEF = 14.0
@@ -79,12 +80,6 @@ def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch
     assert result["exercised"]
 
 
-class Doctored(dict[str, Any]):
-    """Writable packets that replace those of a run."""
-
-    logs: Any
-
-
 @pytest.mark.usefixtures("brief")
 def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any) -> None:
     """The log of a flight with a silent unit is changed as if the loop had continued.
@@ -97,7 +92,7 @@ def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any
     kind = CATALOGUE["imu: silent"]
     sound = fault_judgement.judge(run, kind, entry)
     assert (sound["reaction_right"], sound["blind_current_a"]) == (True, 0.0)
-    doctored = Doctored(
+    doctored = WritablePackets(
         {name: run[name].copy() for name in ("control", "imu", "truth", "event", "housekeeping")}
     )
     doctored.logs = run.logs

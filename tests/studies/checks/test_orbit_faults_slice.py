@@ -25,6 +25,7 @@ from tests.studies.campaigns.orbit_fault_flights import (
     world_for,
 )
 from tests.support.flights import fly
+from tests.support.packed_run import WritablePackets
 
 BRIEF, LAST = 34.0, 6.0
 """Durations (s) of a flight, and of its end in which the body must fulfil the purpose of its mode again."""
@@ -53,12 +54,6 @@ def test_a_receiver_that_repeats_its_fix_is_reported_and_the_body_points_on(tmp_
     assert found["log_intact"]
 
 
-class Doctored(dict[str, Any]):
-    """Writable packets that replace those of a run."""
-
-    logs: Any
-
-
 def test_a_stuck_magnetometer_ends_the_braking_and_current_in_spite_of_it_is_found_out(
     tmp_path: Path,
 ) -> None:
@@ -69,7 +64,7 @@ def test_a_stuck_magnetometer_ends_the_braking_and_current_in_spite_of_it_is_fou
     assert found["blind_current_a"] < 1e-3
     assert found["works"]
     names = ("truth", "imu", "navigation", "mode", "attitude")
-    doctored = Doctored({name: run[name].copy() for name in names})
+    doctored = WritablePackets({name: run[name].copy() for name in names})
     late = np.abs(run["truth"]["time_ns"] * 1e-9 - (AT + 8.0)) < 0.1
     doctored["truth"]["current"][late] = 0.05
     blind = judgement.blind_current(cast("Run", doctored), kind, "detumble", AT, AT + SPAN)

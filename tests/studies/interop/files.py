@@ -16,7 +16,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ import numpy as np
 from ground.link.terminal import make_keys
 from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, UP_BUCKET, write
 from tests.studies.interop.lossy_relay import lossy_relay
+from tests.studies.interop.yamcs import until
 from tests.support.flooded_flight import free_port as free_udp_port
 from tests.support.linked_flight import free_port, service
 from tests.support.yamcs_server import Yamcs, missing, serving
@@ -49,7 +50,7 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
         folder = place / "yamcs"
         write(folder, gateway, http, keys=place / "keys" / "ground")
         with serving(folder, http) as server:
-            _until(server.link_up, 60.0)
+            until(server.link_up, 60.0)
             down = _down(server, place, hashlib.sha256(data).digest())
             up = _up(server, place, data)
             states = sorted(one["state"] for one in _transfers(server))
@@ -70,7 +71,7 @@ def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str
         write(folder, gateway, http, keys=place / "keys" / "ground")
         (folder / UP_BUCKET / "release.whl").write_bytes(np.random.default_rng(seed).bytes(size))
         with serving(folder, http) as server:
-            _until(server.link_up, 60.0)
+            until(server.link_up, 60.0)
             for way in ("down", "up"):
                 for by in ("yamcs", "satellite"):
                     one = _begun(server, way)
@@ -109,8 +110,8 @@ def _begun(server: Yamcs, way: str) -> dict[str, Any]:
 def _ended(server: Yamcs, place: Path, transfer: str, wanted: str) -> dict[str, Any]:
     """Wait until both ends close a transfer; return its state and the satellite's open transfers."""
     stored = place / "keys" / "files" / "transfers"
-    _until(lambda: _transfer(server, transfer)["state"] in {"COMPLETED", "FAILED"}, _LONGEST_S)
-    _until(lambda: not list(stored.glob("*-*.json")), 120.0)
+    until(lambda: _transfer(server, transfer)["state"] in {"COMPLETED", "FAILED"}, _LONGEST_S)
+    until(lambda: not list(stored.glob("*-*.json")), 120.0)
     state, left = _transfer(server, transfer)["state"], sorted(path.name for path in stored.glob("*-*.json"))
     return {"state": state, "open": left, "sound": state == wanted and not left}
 
@@ -130,11 +131,11 @@ def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
     begun = time.monotonic()
     while time.monotonic() - begun < _LONGEST_S and not any(map(_is_download, _transfers(server))):
         server.command("send-file", {"entity": "another-ground-station", "name": f"log/{_RUN}/{_NAME}"})
-        _until(lambda: any(map(_is_download, _transfers(server))), _ASK_S)
-    _until(lambda: all(one["state"] == "COMPLETED" for one in _transfers(server)), _LONGEST_S)
+        until(lambda: any(map(_is_download, _transfers(server))), _ASK_S)
+    until(lambda: all(one["state"] == "COMPLETED" for one in _transfers(server)), _LONGEST_S)
     seconds = round(time.monotonic() - begun, 1)
     came = place / "yamcs" / DOWN_BUCKET
-    _until(lambda: bool(list(came.iterdir())), _ASK_S)  # Yamcs stores a completed file beside
+    until(lambda: bool(list(came.iterdir())), _ASK_S)  # Yamcs stores a completed file beside
     sums = [hashlib.sha256(path.read_bytes()).digest() for path in came.iterdir()]
     return {"down_whole": sums == [wanted], "down_seconds": seconds}
 
@@ -144,10 +145,10 @@ def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
     begun = time.monotonic()
     (place / "yamcs" / UP_BUCKET / "release.whl").write_bytes(data)
     _send_up(server)
-    _until(lambda: all(one["state"] in {"COMPLETED", "FAILED"} for one in _transfers(server)), _LONGEST_S)
+    until(lambda: all(one["state"] in {"COMPLETED", "FAILED"} for one in _transfers(server)), _LONGEST_S)
     arrived = place / "keys" / "files" / "received" / "release" / "release.whl"
     whole = arrived.exists() and arrived.read_bytes() == data
-    _until(lambda: not list((place / "keys" / "files" / "transfers").glob("in-*.json")), 120.0)
+    until(lambda: not list((place / "keys" / "files" / "transfers").glob("in-*.json")), 120.0)
     return {"up_whole": whole, "up_seconds": round(time.monotonic() - begun, 1)}
 
 
@@ -182,12 +183,6 @@ def _opened(place: Path, loss: float, seed: int) -> Iterator[str]:
         words = ["gateway", "--link", way, "--keys", ground, "--serve", gateway]
         stack.enter_context(service(log, "packets on", *words))
         yield gateway
-
-
-def _until(done: Callable[[], bool], seconds: float) -> None:
-    until = time.monotonic() + seconds
-    while not done() and time.monotonic() < until:
-        time.sleep(0.3)
 
 
 def main() -> int:

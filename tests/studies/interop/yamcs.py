@@ -122,14 +122,14 @@ def fly(place: Path, plan: Plan) -> bool:
         folder = place / plan.config / "yamcs"
         write(folder, flight.gateway, http, _EPOCH, flight.keys)
         with serving(folder, http) as server:
-            _until(server.link_up, _DEADLINE_S)
+            until(server.link_up, _DEADLINE_S)
             flight.start()
             sound = [_command(server, flight, plan), _sockets(server, flight)]
             flight.end()
             logged = set(_packets(_log(flight.run)))
-            _until(lambda: logged <= set(_packets(server.packets())), _DEADLINE_S)
+            until(lambda: logged <= set(_packets(server.packets())), _DEADLINE_S)
             flight.stop()
-            _until(lambda: not server.link_up(), _DEADLINE_S)
+            until(lambda: not server.link_up(), _DEADLINE_S)
             sound += [_archive(server, logged), _values(server)]
         lines = [
             line for line in troubles(server.log.read_text()) if not any(words in line for words in _ENDED)
@@ -141,11 +141,11 @@ def fly(place: Path, plan: Plan) -> bool:
 
 def _command(server: Yamcs, flight: LinkedFlight, plan: Plan) -> bool:
     """Issue each kind of command, and one that the flight refuses; return whether all end as expected."""
-    _until(lambda: _STEADY in {packet[:2] for packet in _packets(_log(flight.run))}, _DEADLINE_S)
+    until(lambda: _STEADY in {packet[:2] for packet in _packets(_log(flight.run))}, _DEADLINE_S)
     ends = {}
     for name, arguments in plan.commands:
         if name == "clear":
-            _until(lambda: _BROKEN.encode() in _log(flight.run), plan.patience)
+            until(lambda: _BROKEN.encode() in _log(flight.run), plan.patience)
         history = _followed(server, name, arguments, plan.patience)
         ends[name] = history.get("CommandComplete_Status", "none")
         stages = [history.get(f"Verifier_{stage}_Status") for stage in ("Accepted", "Execution", "Complete")]
@@ -170,10 +170,10 @@ def _followed(server: Yamcs, name: str, arguments: dict[str, Any], seconds: floa
     def is_completed() -> bool:
         return "CommandComplete_Status" in server.history(command)
 
-    _until(lambda: is_completed() or is_lost(), seconds)
+    until(lambda: is_completed() or is_lost(), seconds)
     if not is_completed() and is_lost():
         command = server.command(name, arguments)
-        _until(is_completed, seconds)
+        until(is_completed, seconds)
     return server.history(command)
 
 
@@ -261,10 +261,10 @@ def _packets(data: bytes) -> Iterator[bytes]:
     return (data[begin:end] for _, begin, end in walk(data))
 
 
-def _until(done: Callable[[], bool], seconds: float) -> None:
+def until(done: Callable[[], bool], seconds: float) -> None:
     """Wait until a condition holds, with a timeout."""
-    until = time.monotonic() + seconds
-    while not done() and time.monotonic() < until:
+    end = time.monotonic() + seconds
+    while not done() and time.monotonic() < end:
         time.sleep(0.3)
 
 

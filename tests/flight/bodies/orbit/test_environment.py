@@ -29,6 +29,7 @@ from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terre
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from sim_hal.clock import SimClock
 from tests.support.flights import CONFIG
+from tests.support.orbit_elements import summed
 
 INPUT = Path(__file__).resolve().parents[5] / "shared/data/inputs/tle-bstar0-drag.txt"
 UTC_NS = round(datetime.fromisoformat("2026-03-20T12:00:00Z").timestamp()) * SECOND_NS
@@ -118,10 +119,6 @@ def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements,
 DAYS_NS = 86_400 * SECOND_NS
 FIRST = "1 99001U 26001A   26079.50000000  .00000000  00000-0  00000+0 0  9996"
 SECOND = "2 99001  97.4640 337.4170 0011973 295.7805  64.3547 15.30000000000102"
-
-
-def summed(line: str) -> str:
-    return line[:68] + str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
 
 
 def dragged(drag: str) -> TwoLineElements:

@@ -20,27 +20,24 @@ from knightcube.astro.quaternion import (
     normalise,
     to_rotation_vector,
 )
+from tests.knightcube.astro.attitude.sights import unit
 
 _solve = SOLVERS["esoq2"]
 _NARROW = 0.17  # half of a 20 deg field of view, rad
 
 
-def _unit(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-
-
 def _reference(rng: np.random.Generator, n: int, half_field: float | None) -> FloatArray:
     drawn = rng.normal(size=(n, 3))
     if half_field is None:
-        return _unit(drawn)
-    return _unit(np.array([0.0, 0.0, 1.0]) + half_field * drawn * np.array([1.0, 1.0, 0.0]))
+        return unit(drawn)
+    return unit(np.array([0.0, 0.0, 1.0]) + half_field * drawn * np.array([1.0, 1.0, 0.0]))
 
 
 def _observed(
     rng: np.random.Generator, q: FloatArray, reference: FloatArray, sigma: FloatArray
 ) -> FloatArray:
     noise = sigma[:, None] * rng.normal(size=reference.shape)
-    return _unit(reference @ attitude_matrix(q).T + noise)
+    return unit(reference @ attitude_matrix(q).T + noise)
 
 
 def _by_singular_values(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -96,7 +93,7 @@ def test_no_angle_and_no_axis_is_singular(angle: float, axis: tuple[float, float
 
     Sequential rotations solve both cases.
     """
-    q = from_rotation_vector(angle * _unit(np.array(axis)))
+    q = from_rotation_vector(angle * unit(np.array(axis)))
     reference = _reference(np.random.default_rng(44), n, _NARROW)
     found = _solve(reference @ attitude_matrix(q).T, reference, np.full(n, 1e-5))
     assert angle_between(found.quaternion, q) < 1e-11
@@ -132,7 +129,7 @@ def test_the_covariance_and_the_loss_are_those_of_the_errors() -> None:
 
 
 def test_directions_on_one_line_fix_no_attitude() -> None:
-    star, other = _unit(np.array([0.1, 0.2, 1.0])), _unit(np.array([0.3, 0.0, 1.0]))
+    star, other = unit(np.array([0.1, 0.2, 1.0])), unit(np.array([0.3, 0.0, 1.0]))
     apart = np.array([star, other])
     for line in ([star, star], [star, -star], [star]):
         n = len(line)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from knightcube.astro.earth.omm import read_elements
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.errors import UsageError
+from tests.support.orbit_elements import summed
 
 INPUTS = Path(__file__).resolve().parents[5] / "shared/data/inputs"
 LINES = (
@@ -46,11 +47,6 @@ METADATA = {
     "TIME_SYSTEM": "UTC",
     "MEAN_ELEMENT_THEORY": "SGP4",
 }
-
-
-def summed(line: str) -> str:
-    """Return a line whose last column is its checksum."""
-    return line[:68] + str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
 
 
 def with_columns(line: str, first: int, text: str) -> str:

@@ -17,6 +17,7 @@ from knightcube.astro.earth.orientation import (
 )
 from knightcube.errors import UsageError
 from sim_hal.worlds.orbit import KeplerianElements, propagate
+from tests.support.orbit_elements import summed
 
 DATE = 2_461_365.8
 # Vallado et al., AIAA 2006-6753, the verification set: satellite 00005.
@@ -121,12 +122,7 @@ def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
     first = FIRST[:20] + day + FIRST[32:]
     high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
     with pytest.raises(UsageError, match="day of the year of the epoch"):
-        TwoLineElements(_summed(first), _summed(high))
-
-
-def _summed(line: str) -> str:
-    """Return a line whose last column is its checksum."""
-    return line[:68] + str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
+        TwoLineElements(summed(first), summed(high))
 
 
 def test_a_decayed_orbit_is_reported() -> None:

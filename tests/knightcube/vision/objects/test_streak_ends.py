@@ -27,7 +27,7 @@ from knightcube.vision.objects.streak_ends import (
     threshold_mean,
 )
 from tests.support.compiled_forms import assert_forms_agree
-from tests.support.streak_frames import rate_at, rotate, star_camera, star_frame
+from tests.support.streak_frames import rate_at, star_camera, star_frame
 
 
 def test_the_box_sum_is_nine_times_the_uniform_filter() -> None:
@@ -203,28 +203,6 @@ def test_extension_moves_both_ends_outward() -> None:
     ends = np.array([[[10.0, 10.0], [13.0, 14.0]]])
     moved = extend(ends, chord_outward(ends), 5.0)
     np.testing.assert_allclose(moved, [[[7.0, 6.0], [16.0, 18.0]]])
-
-
-_ROLLS = [0.0, 0.4, 0.8, 1.6, 2.5]
-
-
-# With four neighbours, a streak near the diagonals looks like a row of corners and is rejected.
-_TOO_SLANTED = [0.8, 2.5]
-
-
-_PINHOLE = star_camera().pinhole
-
-
-def _streaks(theta: float, angle: float, n: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return starts and ends (n, 3) of streaks with 0.1 px of error, and the unit rotation axis."""
-    rng = np.random.default_rng(seed)
-    axis = rate_at(theta, 1.0, rng.uniform(0.0, 2.0 * np.pi))
-    starts = _PINHOLE.unit_vectors(rng.uniform(50.0, 970.0, (n, 2)))
-    ends = rotate(starts, angle * axis)
-    noisy = [
-        _PINHOLE.unit_vectors(_PINHOLE.project(v) + rng.normal(0.0, 0.1, (n, 2))) for v in (starts, ends)
-    ]
-    return noisy[0], noisy[1], axis
 
 
 def test_the_centre_of_rotation_is_the_axis_projected() -> None:
