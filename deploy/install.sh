@@ -135,7 +135,7 @@ check_inputs() {
         fail "$flown is not what was accepted: was it edited? Then: install.sh --accept"
 }
 
-# systemd and udev are reloaded only where they run; an image has neither.
+# systemd and udev are reloaded only if they run, which is not so in an image.
 systemd_runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
 
 in_root() { systemctl ${root:+--root="$root"} "$@"; }
@@ -185,7 +185,7 @@ build_release() {
     release=$prefix/releases/$("$builder" "$deploy/build_release.py" "$prefix" build "$@")
 }
 
-# Have the new release fly from the next start on. What starts it is placed first, and serves both releases.
+# The new release flies from the next start on. Its launcher is installed first, and can start both releases.
 switch_release() {
     programs='coils-off fly releases.py safe_state.py renewal.py open_bundle.py board_dropin.py'
     for folder in "$prefix/bin" "$prefix/spare"; do
@@ -206,7 +206,7 @@ switch_release() {
     run "$release/venv/bin/python" "$deploy/build_release.py" "$prefix" switch "$(basename "$release")"
 }
 
-# A board of before had its software here, and flies it until its units are replaced.
+# Older boards have their software here, and fly it until their units are replaced.
 link_venv() {
     [ "$(readlink "$prefix/venv")" != current/venv ] || return 0
     run rm -rf "$prefix/venv"
@@ -245,7 +245,7 @@ install_settings() {
     fi
 }
 
-# The link's unit is there only where the configuration has a link.
+# The link's unit is installed only if the configuration has a link.
 remove_link() {
     [ -e "$units/knightcube-link.service" ] || return 0
     if systemd_runs; then
@@ -289,7 +289,7 @@ install_units() {
         run in_root enable --quiet knightcube.service
 }
 
-# What a person accepted on the ground is the last resort of the command-loss timer.
+# The configuration accepted on the ground is the last one to which the command-loss timer returns.
 keep_accepted() {
     [ ! -x "$prefix/bin/renewal.py" ] || [ -n "$dry" ] ||
         python3 -I -S "$prefix/bin/renewal.py" --root "${root:-/}" --accepted
