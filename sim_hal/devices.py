@@ -160,7 +160,7 @@ def emulate_sensors(emulation: Emulation, unit: SensorsSection) -> tuple[Any, ..
             quantity: axis_matrix(names).T @ to_unit for quantity, names in sensor.measures.items()
         }
         measured = Measurements(emulation.sense, axes, emulation.generator, emulation.now_ns)
-        part = _emulator(sensor, f"inertial_unit.sensors[{number}]", measured)
+        part = _emulator(sensor, f"{emulation.kind}.sensors[{number}]", measured)
         made.append(part)
         if sensor.spi is not None:
             emulation.wires.spi_devices[sensor.spi] = part

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import os
 import re
 import sys
+from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flight.__main__ import main
 from flight.schema import reader
 from flight.schema.document import MODULES, ConfigError
+from ground.telemetry import read_run
+from hal.interfaces import devices, wires
 from tests.docs.blocks import ROOT, blocks_of
 
 PAGE = (ROOT / "docs" / "extending" / "device.md").read_text(encoding="utf-8")
@@ -32,7 +37,7 @@ def snippet(name: str) -> str:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a folder with the files as a reader writes them who has only the page."""
-    blocks = [block for block in blocks_of(PAGE) if "--8<--" in block.text]
+    blocks = [block for block in blocks_of(PAGE) if "--8<--" in block.text and "ina226" in block.text]
     shown = {language: "" for language in ("python", "yaml")}
     for block in blocks:
         shown[block.language] += "".join(snippet(name) for name in re.findall(r'--8<-- "(.+)"', block.text))
@@ -44,14 +49,53 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_driver_of_the_page_flies_by_the_commands_of_the_page(folder: Path) -> None:
-    block = next(block for block in blocks_of(PAGE) if block.reason == "tests/docs/test_add_a_device.py")
+def run_commands(name: str) -> None:
+    """Run the commands of the page that name a file."""
+    (block,) = (block for block in blocks_of(PAGE) if block.mark == "run by" and name in block.text)
     first, *commands = block.commands
     assert first == "export PYTHONPATH=."
     for line in commands:
         program, *words = line.split()
         assert program == "knightcube"
         assert main(words) == 0, line
+
+
+def test_a_sensor_of_the_page_flies_by_the_commands_of_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("qmc5883.py", "qmc5883.yaml"):
+        (tmp_path / name).write_text(snippet(f"examples/{name}"), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "qmc5883", raising=False)
+    run_commands("qmc5883")
+    imu = read_run(tmp_path / "run")["imu"]
+    sizes = np.linalg.norm(imu["field"], axis=1)
+    assert len(imu) == pytest.approx(5 * 40, abs=3)
+    assert 1.5e-5 < sizes.min() < 7e-5, "T, in low Earth orbit while the coils rest"
+    assert np.std(np.diff(imu["field"][:, 0])[:3]) > 1e-9, "each reading is new"
+
+
+def test_the_interfaces_of_the_page_are_those_of_the_code() -> None:
+    for line in PAGE.splitlines():
+        if not (row := re.match(r"\| `(\w+)` \| (`\w+\(.*\)`) \|(.*)\|", line)):
+            continue
+        kind = getattr(wires if row[1] == "SerialPort" else devices, row[1])
+        for name, parameters in re.findall(r"`(\w+)\(([^`]*)\)`", row[2]):
+            assert [*inspect.signature(getattr(kind, name)).parameters] == ["self", *_words(parameters)], name
+        assert {name for name in vars(kind) if not name.startswith("_")} == set(
+            re.findall(r"`(\w+)\(", row[2])
+        ), row[1]
+        for name, parameters in re.findall(r"`([A-Z]\w+)\(([^`]*)\)`", row[3]):
+            assert [one.name for one in fields(getattr(devices, name))] == _words(parameters), name
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"\w+", text)
+
+
+def test_the_driver_of_the_page_flies_by_the_commands_of_the_page(folder: Path) -> None:
+    run_commands("ina226")
     with (folder / "run" / "csv" / "housekeeping.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [round(float(row["coil_voltage"]), 2) for row in rows[1:]] == [5.0] * 4
