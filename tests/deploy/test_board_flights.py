@@ -3,7 +3,8 @@
 The flight software uses its drivers of real devices: serial ports are pseudo-terminals, the I2C bus is
 /dev/i2c-N or a name made by udev, through the preload library, and cameras answer the ioctls of Video for
 Linux with rendered frames. No virtual camera of the kernel replaces the rendered frames: `vivid` and
-`v4l2loopback` have no control of the exposure time, and the driver refuses a camera without this control.
+`v4l2loopback` have no control of the exposure time, and the driver refuses a camera without this control
+(`tests/hal/cameras/test_v4l2_camera.py` reads frames of `vivid` where the kernel has this module).
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,38 @@ from tests.manual_clock import ManualClock
 
 SECOND_NS = 1_000_000_000
 MICROSECOND_NS = 1_000
+
+
+def virtual_camera() -> str | None:
+    """Return the device file of a virtual camera of the kernel (module `vivid`), or None."""
+    for name in sorted(Path("/sys/class/video4linux").glob("video*/name")):
+        if name.read_text(encoding="utf-8").strip().endswith("-vid-cap"):
+            return f"/dev/{name.parent.name}"
+    return None
+
+
+VIRTUAL = virtual_camera()
+
+
+@pytest.mark.skipif(VIRTUAL is None, reason="this kernel has no virtual camera: `modprobe vivid` makes one")
+def test_a_virtual_camera_of_the_kernel_delivers_frames_and_is_refused_for_its_missing_control() -> None:
+    assert VIRTUAL is not None
+    with VideoDevice(VIRTUAL) as device:
+        assert "GREY" in list(device.formats())
+        layout = device.set_format(640, 360, "GREY")
+        assert (layout.fourcc, layout.columns, layout.rows) == ("GREY", 640, 360)
+        device.start(3)
+        numbers: list[int] = []
+        until = time.monotonic() + 5.0
+        while len(numbers) < 4 and time.monotonic() < until:
+            time.sleep(0.02)
+            while (filled := device.dequeue()) is not None:
+                numbers.append(filled.sequence)
+                device.queue(filled.index)
+        assert numbers == sorted(set(numbers))
+        assert len(numbers) >= 4
+        with pytest.raises(Refused, match="no exposure control"):
+            v4l2.manual_exposures(VIRTUAL, device, "vivid")
 
 
 def test_the_first_whole_exposure_after_the_trigger_is_taken(kernel: IoctlCamera, clock: ManualClock) -> None:
