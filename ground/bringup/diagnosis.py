@@ -733,6 +733,9 @@ def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known:
     if size_known and abs(common / fields - 1.0) < _NEAR:
         cure = f"correct the supply; or multiply `supply_voltage` by {common:.3g}"
         return [Finding("coils", "wrong supply voltage", f"{text}, and so are the fields", cure)]
+    if common < 0.0:
+        cure = "exchange the two wires at its shunt"
+        return [Finding("power_monitor", "reversed", text, cure)]
     cure = f"set `shunt` to the fitted one, {bound}{common:.3g} times the configured one"
     if size_known or not 0.3 < common < 3.0:
         return [Finding("power_monitor", "wrong shunt", text, cure)]

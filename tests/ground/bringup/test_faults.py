@@ -121,6 +121,11 @@ def sagging(opened: Session) -> None:
     circuit.currents = lambda: currents() * (1.0 - 2.0 * np.abs(currents()).sum())
 
 
+def reverse(opened: Session) -> None:
+    """Reverse the current through the shunt of the coils' monitor."""
+    opened.hand.hardware.monitor.gain = -1.0
+
+
 def loose_coil(opened: Session) -> None:
     """Interrupt coil y for 0.1 s in every 0.4 s."""
     circuit, clock = opened.hand.hardware.circuit, opened.rig.clock
@@ -251,6 +256,9 @@ CASES = {
     ),
     "supply voltage too low": Case(
         {"simulation": {"truth": {"supply_voltage": 2.2}}}, "coils", ["power_monitor wrong current"]
+    ),
+    "wires at the shunt exchanged": Case(
+        {}, "coils", ["power_monitor reversed"], says="exchange the two wires", spoil=reverse
     ),
     "monitor without supply": Case(fault("monitor: off"), "find", ["power_monitor no answer"]),
     "monitor stuck": Case(fault("monitor: stuck"), "coils", ["power_monitor no reading"]),
