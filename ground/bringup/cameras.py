@@ -260,6 +260,8 @@ def step_lens(session: Session) -> Outcome:
 def step_wide(session: Session) -> Outcome:
     """Cover one horizon camera after the other, whose frame must change, and no other camera's frame."""
     cameras = session.config.wide_cameras
+    if not cameras:
+        raise StepSkipped("the configuration has no wide_cameras")
     keys = [f"wide_cameras[{number}]" for number in range(len(cameras))]
     findings: list[Finding] = []
     session.ask("Point all horizon cameras at lit surfaces.")
