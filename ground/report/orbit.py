@@ -13,7 +13,7 @@ from flight.link import events
 from flight.link.modes import POINTING, Mode
 from flight.link.telemetry.packets import PacketArray
 from flight.schema.orbit import OrbitConfig
-from ground.report.signals import PowerHistory, seconds, true_rows
+from ground.report.signals import PowerHistory, seconds, true_quaternions
 from ground.report.steps import judge
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
@@ -117,9 +117,8 @@ def attitude_errors(run: Run) -> AttitudeErrors:
     known = packets[np.isfinite(packets["quaternion"][:, 0])]
     if not len(known) or not len(truth):
         return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    place = true_rows(truth, known)
-    known, place = known[place >= 0], place[place >= 0]
-    true = truth["quaternion"][place].astype(float)
+    true = true_quaternions(truth, known)
+    known, true = known[np.isfinite(true[:, 0])], true[np.isfinite(true[:, 0])]
     error = to_rotation_vector(multiply(true, conjugate(known["quaternion"].astype(float))))
     return AttitudeErrors(seconds(known), error, known["angle_sigma"].astype(float))
 
@@ -261,9 +260,7 @@ def pointing_errors(run: Run) -> AttitudeErrors:
     packets = packets[in_mode & np.isfinite(packets["target"][:, 0])]
     flown, source = packets["quaternion"].astype(float), "estimate"
     if len(run["truth"]) and len(packets):
-        place = true_rows(run["truth"], packets)
-        packets = packets[place >= 0]
-        flown, source = run["truth"]["quaternion"][place[place >= 0]].astype(float), "truth"
+        flown, source = true_quaternions(run["truth"], packets), "truth"
     known = np.isfinite(flown[:, 0])
     error = to_rotation_vector(multiply(flown[known], conjugate(packets["target"][known].astype(float))))
     sigma = packets["angle_sigma"][known].astype(float)

@@ -29,7 +29,7 @@ from ground.report.orbit import (
     pointing_errors,
 )
 from ground.report.panels import RunSignals
-from ground.report.signals import PowerHistory, seconds, true_rows
+from ground.report.signals import PowerHistory, seconds, true_quaternions
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
@@ -185,10 +185,10 @@ def _mean_power(ax: Axes, found: PowerHistory) -> None:
 def _field(ax: Axes, run: Run) -> None:
     """Draw the Earth's magnetic field in the body frame, either the true or else the measured field."""
     packets = run["orbit_truth"]
-    place = true_rows(run["truth"], packets)
-    if (place >= 0).any():
-        packets, place = packets[place >= 0], place[place >= 0]
-        into_body = attitude_matrix(run["truth"]["quaternion"][place].astype(float))
+    true = true_quaternions(run["truth"], packets)
+    known = np.isfinite(true[:, 0])
+    if known.any():
+        packets, into_body = packets[known], attitude_matrix(true[known])
         values, times = np.einsum("nij,nj->ni", into_body, packets["field"].astype(float)), seconds(packets)
     else:
         values, times = run["imu"]["field"].astype(float), seconds(run["imu"])

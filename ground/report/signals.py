@@ -13,7 +13,7 @@ import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry import Run, text_of
-from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -26,6 +26,8 @@ from knightcube.gnc.guidance.one_axis.plant import steady_heat, supply_power
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 Object = dict[str, Any]
+_TRUTH_GAP_NS = 100_000_000
+"""Longest interval (ns) between two records across which the truth is interpolated."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +103,27 @@ def last_time(run: Run) -> float:
     return max((float(seconds(run[name])[-1]) for name in names if len(run[name])), default=0.0)
 
 
-def true_rows(truth: PacketArray, packets: PacketArray) -> IntArray:
-    """Return for each packet (n,) the index of the truth at the same time, or -1 if there is none."""
+def true_quaternions(truth: PacketArray, packets: PacketArray) -> FloatArray:
+    """Return the true quaternion (n, 4) at the time of each packet, NaN where the truth is not known.
+
+    The packets of a flight in real time lie between the records of the truth. The truth is interpolated
+    between two records that are at most `_TRUTH_GAP_NS` apart.
+    """
+    found = np.full((len(packets), 4), np.nan)
     if not len(truth):
-        return np.full(len(packets), -1)
-    place = np.minimum(np.searchsorted(truth["time_ns"], packets["time_ns"]), len(truth) - 1)
-    return np.where(truth["time_ns"][place] == packets["time_ns"], place, -1)
+        return found
+    times, at = truth["time_ns"], packets["time_ns"]
+    after = np.minimum(np.searchsorted(times, at), len(truth) - 1)
+    before = np.maximum(after - 1, 0)
+    same = times[after] == at
+    found[same] = truth["quaternion"][after[same]]
+    span = times[after] - times[before]
+    between = ~same & (times[before] < at) & (at < times[after]) & (span <= _TRUTH_GAP_NS)
+    first, second = (truth["quaternion"][place[between]].astype(float) for place in (before, after))
+    second *= np.where(np.sum(first * second, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    share = ((at - times[before])[between] / span[between])[:, None]
+    found[between] = normalise((1.0 - share) * first + share * second)
+    return found
 
 
 def true_attitude(run: Run) -> ThreadMotion | None:

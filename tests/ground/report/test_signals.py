@@ -28,12 +28,21 @@ def test_the_energy_and_averages_weigh_each_interval_by_its_length() -> None:
     np.testing.assert_allclose(POWER.running_average(POWER.supply), [2.0, 10.0 / 3.0, 18.0 / 4.0])
 
 
-def test_a_packet_has_the_truth_of_its_own_time_only() -> None:
-    run = packed_run(
-        truth=[(1.0, {}), (2.0, {}), (4.0, {})], imu=[(t, {}) for t in (0.0, 1.0, 2.5, 4.0, 5.0)]
-    )
-    np.testing.assert_array_equal(signals.true_rows(run["truth"], run["imu"]), [-1, 0, -1, 2, -1])
-    np.testing.assert_array_equal(signals.true_rows(run["truth"][:0], run["imu"]), [-1] * 5)
+def test_the_truth_is_interpolated_between_close_records_and_unknown_elsewhere() -> None:
+    """The body turns by 0.02 rad per 0.025 s; the second record has the other sign of the quaternion."""
+    times = (0.0, 1.0, 1.01, 1.025, 1.5, 2.0, 2.01)
+    half = {1.0: 0.0, 1.01: 0.004, 1.025: 0.01, 2.0: 0.05}
+    sign = {1.0: 1.0, 1.025: -1.0, 2.0: 1.0}
+    truth = [
+        (at, {"quaternion": [0.0, s * math.sin(half[at]), 0.0, s * math.cos(half[at])]})
+        for at, s in sign.items()
+    ]
+    run = packed_run(truth=truth, imu=[(at, {}) for at in times])
+    found = signals.true_quaternions(run["truth"], run["imu"])
+    found *= np.sign(found[:, 3:])
+    wanted = [math.sin(half[at]) if at in half else math.nan for at in times]
+    np.testing.assert_allclose(found[:, 1], wanted, atol=1e-7)
+    assert np.isnan(signals.true_quaternions(run["truth"][:0], run["imu"])).all()
 
 
 def test_both_signs_of_the_true_quaternion_are_the_same_angle() -> None:
