@@ -238,8 +238,8 @@ def test_the_form_offers_what_a_satellite_obeys_and_refuses_before_sending(
     satellite.fill("mode", mode="sun")
     assert "hold" not in satellite.text("#inputs")
     satellite.fill("point", goal="ground", latitude="95", longitude="13.4")
-    satellite.wait("document.getElementById('answer').className === 'error'")
-    assert satellite.text("#answer") == "latitude = 95: give -90 to 90 deg"
+    satellite.wait("document.getElementById('answer').textContent === 'latitude = 95: give -90 to 90 deg'")
+    assert satellite.page.get_attribute("#answer", "class") == "error"
     satellite.page.click("#send-form")
     satellite.page.wait_for_timeout(300)
     assert not satellite.page.is_visible("#confirm")
