@@ -29,7 +29,7 @@ import numpy as np
 from ground.campaigns.runner import show
 
 ROOT = Path(__file__).parents[3]
-VARIED = ("plant.inertia=10%", "plant.thread_stiffness=normal 5%", "guidance.cost=heat|supply")
+VARIED = ("plant.inertia=10%", "plant.thread_stiffness=normal 5%", "coils.current_limit=0.1|0.14")
 _END_S = 60.0
 """Longest time (s) to wait for the end of processes."""
 
