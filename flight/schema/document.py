@@ -187,8 +187,7 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
 def config_path(text: str) -> Path:
     """Return the file of a command line argument, which is the name of a packaged configuration or a path.
 
-    `step_demo` is a name; For example, `step_demo` is a name, whereas `step_demo.yaml` and `./step_demo` are
-    paths.
+    For example, `step_demo` is a name, whereas `step_demo.yaml` and `./step_demo` are paths.
     """
     packaged = FOLDER / f"{text}.yaml"
     return packaged if re.fullmatch(r"\w+", text) and packaged.is_file() else Path(text)
