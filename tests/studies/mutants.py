@@ -354,7 +354,7 @@ class _Copy:
         while True:
             self._write(mutant.path, "".join(lines))
             try:
-                failure = self._first_failure(tests)
+                failure = self._first_failure(tests[:1]) or self._first_failure(tests[1:])
             finally:
                 self._write(mutant.path, original)
             if failure is None or failure in self.deselected:
@@ -383,6 +383,8 @@ class _Copy:
         tests = [name for name in tests if name not in self.deselected]
         if self.stopped:
             return "stopped"
+        if not tests:
+            return None
         process = self._process = subprocess.Popen(
             ["nice", sys.executable, "-m", "pytest", *options, *tests],
             cwd=self.folder,
@@ -475,6 +477,7 @@ def _copied(root: Path, folder: Path) -> _Copy:
     with tarfile.open(archive) as tar:
         tar.extractall(folder, filter="data")
     archive.unlink()
+    (folder / "tests" / "order.txt").unlink(missing_ok=True)  # it would run the longest files first
     environment = {**os.environ, "PYTHONPATH": str(folder), "OPENBLAS_NUM_THREADS": "1"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return _Copy(folder, environment)
