@@ -655,8 +655,9 @@ def _model(values: FloatArray, shift: FloatArray, share: FloatArray, jacobian: F
     """
     flux, size, count = values[:, FLUX, None], math.isqrt(jacobian.shape[2]), jacobian.shape[1]
     total = jacobian.reshape(len(values), count, size, size)
-    out = total if len(share) == 1 else np.empty_like(total)
-    if len(share) > 1:
+    out = total
+    if len(share) != 1:
+        out = np.empty_like(total)
         total[:] = 0.0
     for moved, part in zip(shift, share, strict=True):
         across, across_x, across_w = profile(values[:, X] + moved[:, 0], values[:, WIDTH], size // 2)

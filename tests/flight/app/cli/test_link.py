@@ -18,11 +18,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+from flight.app.cli import link as link_process
 from flight.app.cli import main
 from flight.app.cli.link import self_test
+from flight.app.service import FlownRelease
 from flight.link.coding import LinkCodes
 from flight.link.commands import PING, CommandPacker, Ping, open_unix
 from flight.link.modes import Mode
@@ -258,3 +261,18 @@ def test_a_release_whose_link_obeys_nothing_fails_its_test(monkeypatch: pytest.M
     monkeypatch.setattr(SystemClock, "sleep_until_ns", lambda *_: None)
     with pytest.raises(FlightError, match="executed no command"):
         self_test()
+
+
+def test_a_link_that_runs_for_the_required_time_proves_its_release(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flight.app.service.PROVEN_NS", 10_000_000)
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    monkeypatch.setenv("KNIGHTCUBE_RELEASE", "newest")
+    proven = threading.Event()
+    monkeypatch.setattr(FlownRelease, "prove", lambda _: proven.set())
+    opened = Mock()
+    opened.station.run = lambda *_: proven.wait(60.0)
+    monkeypatch.setattr(link_process, "retried_start", lambda *_: opened)
+    link_process._run(tmp_path / "config.yaml", tmp_path, lambda: False)
+    assert proven.is_set()
