@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
 from ground.bringup.diagnosis import (
     GRAVITY,
     CoilTest,
+    Finding,
     Turns,
     diagnose_axes,
     diagnose_coils,
     signed_permutations,
 )
+from ground.bringup.session import _mounting
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 
@@ -75,3 +80,24 @@ def test_exchanged_and_reversed_coils_are_found(size_known: bool) -> None:
         common = -1.0 if (signs < 0).all() else 1.0  # faults of the magnetometer, not of three coils
         assert found.serves == order.tolist()
         assert np.array_equal(np.sign(found.strength), common * signs)
+
+
+@pytest.mark.parametrize(
+    ("axes", "kind", "changed"),
+    [
+        (np.diag([-1.0, -1.0, 1.0]), "rotated", True),
+        (np.roll(np.eye(3), 1, axis=0), "rotated", True),
+        (np.eye(3), "wrong scale", False),
+        (None, "rotated", False),
+    ],
+)
+def test_only_a_rotated_unit_changes_the_mounting_which_then_gives_body_axes(
+    axes: FloatArray | None, kind: str, changed: bool
+) -> None:
+    mounting = from_rotation_vector(np.array([0.3, -0.2, 0.1]))
+    config: Any = Mock(inertial_unit=Mock(mounting=mounting.tolist()))
+    found = _mounting(config, axes, [Finding("inertial_unit", kind, "", "")])
+    assert set(found) == ({"inertial_unit"} if changed else set())
+    if axes is not None and changed:
+        corrected = attitude_matrix(np.array(found["inertial_unit"]["mounting"]))
+        assert axes @ corrected == pytest.approx(attitude_matrix(mounting), abs=1e-7)
