@@ -21,7 +21,7 @@ def pixels() -> Image:
 
 @pytest.mark.parametrize("name", DETECTOR_NAMES)
 def test_the_rate_by_a_detector_is_as_recorded(pixels: Image, name: DetectorName) -> None:
-    settings = StreakSettings(detector=name)
+    settings = StreakSettings.of(name)
     check(__file__, f"rate {name}", estimate_rate(pixels, CAMERA.pinhole, 1.0, settings, RATE, 1e-3))
 
 
