@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import Mock
@@ -58,9 +59,9 @@ def _drive(resting: list[bool]) -> tuple[CoilDrive, Coils, SimpleNamespace]:
 def test_each_cycle_without_a_basis_for_control_sends_zero_current(
     estimate: Any, reference: Any, current: bool, has_rate: bool
 ) -> None:
-    drive, coils, _ = _drive([False, False, False])
+    drive, coils, watch = _drive([False, False, False])
     coils.state = lambda: Mock(error="")  # type: ignore[attr-defined]
-    drive._watch.test_wave = lambda _: None  # type: ignore[method-assign]
+    watch.test_wave = lambda _: None
     body = Mock()
     asked, control = np.array([0.02, 0.03, -0.01]), body.control
     body.estimation.rate_without_gyro.return_value = None
@@ -69,12 +70,13 @@ def test_each_cycle_without_a_basis_for_control_sends_zero_current(
         law.command.return_value.currents = asked
     steering = Steering(body, drive, Mock())
     reading = Mock(has_rate=has_rate)
-    for run, has_basis in (
+    runs: tuple[tuple[Callable[[], Any], bool], ...] = (
         (lambda: steering.run(estimate, 0, True), estimate is not None and reference is not None),
         (lambda: steering.detumble([reading], current, 0), current),
         (lambda: steering.acquire_sun([reading], current, 0), current and has_rate),
         (lambda: steering.rest(0), False),
-    ):
+    )
+    for run, has_basis in runs:
         coils.currents = np.full(3, 0.1)
         sent = run().currents
         assert coils.currents.tolist() == sent.tolist() == (asked.tolist() if has_basis else [0.0] * 3)
