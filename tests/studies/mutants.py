@@ -282,7 +282,7 @@ class _Finder(ast.NodeVisitor):
         if isinstance(value, bool):
             self._add(node, "constant", str(not value))
         elif isinstance(value, int):
-            self._add(node, "constant", str(value + max(1, value // 2)))  # 1 ns in 2 s is no fault
+            self._add(node, "constant", str(value + max(1, value // 2)))  # adding 1 ns to 2 s changes nothing
         elif isinstance(value, float):
             self._add(node, "constant", repr(1.5 * value if value else 1.0))
 
