@@ -12,10 +12,11 @@ with a prior from the calibration or from typical lenses. The covariance of the 
 remaining uncertainty of the lens. An error of the line time of a rolling shutter, which displaces each star
 along its motion in proportion to its row, is also fitted.
 
-The positions of streaks that do not fit the streak model have errors of some pixels, regardless of their
-brightness. If the residuals of streaks exceed the noise, a common variance is added to the noise, so that the
-sum of squares equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this
-common variance, the brightest stars would dominate the fit, and the covariance would be too small.
+The positions of stars that do not fit the model of their images, such as bent streaks or the rings of a
+defocused lens, have errors of some pixels, regardless of their brightness. If the residuals exceed the noise,
+a common variance is added to the noise, so that the sum of squares equals the degrees of freedom (Mandel &
+Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the brightest stars would dominate the
+fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -50,6 +51,8 @@ _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
 # Maximum number of Newton steps for the common variance, and the excess chi-square below which they end.
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
+# Maximum number of times that the stars which agree are selected again, with larger variances.
+_AGREEMENT_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +65,8 @@ class Unknowns:
             (8,) if the pixels may not be square; empty (0,) if the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
-        scatter: whether a variance common to all stars may be added to the variances of the positions.
+        scatter: whether a variance common to all stars is added to the variances of the positions for any
+            excess of the residuals, or only for a significant excess.
     """
 
     scale: bool = False
@@ -86,7 +90,8 @@ class ImageFit:
             fixed.
         bend: fitted lens errors (8,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
-        squares: chi-square of the residual of each star (n,), with two degrees of freedom.
+        excess: chi-square per degree of freedom of the stars that agree with each other, for the measured
+            variances of their positions; 1 unless it is significantly larger.
         agree: mask of the stars that were used for the attitude (n,).
     """
 
@@ -95,7 +100,7 @@ class ImageFit:
     scale_sigma: float
     bend: FloatArray
     delay: float
-    squares: FloatArray
+    excess: float
     agree: BoolArray
 
 
@@ -131,8 +136,9 @@ def fit_in_image(
     if squares.max() > _FARTHEST:
         pose, agree = _without_outliers(seen, pose, squares)
         squares = seen.squares(pose)
-    if unknowns.scatter:
-        seen, pose = _scattered(seen, pose, agree)
+    excess = inflation(squares[agree], seen.parameters(pose))
+    if unknowns.scatter or excess > 1.0:
+        seen, pose, agree = _with_scatter(seen, pose, agree)
         squares = seen.squares(pose)
     inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
@@ -142,7 +148,7 @@ def fit_in_image(
     if unknowns.scale and len(unknowns.bend) == BENDS:
         along[4 + ASPECT] = 1.0
     scale_sigma = float(np.sqrt(along @ inverse @ along))
-    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, squares, agree)
+    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, excess, agree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -327,6 +333,22 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
     return seen.fitted(pose, agree.astype(np.float64)), agree
+
+
+def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
+    """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
+
+    Bright stars that disagree with their measured variances may agree with the larger variances. The common
+    variance is then estimated again, with these stars.
+    """
+    own = seen
+    for _ in range(_AGREEMENT_ROUNDS):
+        seen, pose = _scattered(own, pose, agree)
+        within = seen.squares(pose) <= _FARTHEST
+        if np.array_equal(within, agree) or np.count_nonzero(within) < np.count_nonzero(agree):
+            break
+        agree = within
+    return seen, pose, agree
 
 
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:

@@ -25,7 +25,7 @@ from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, LensError, Pinhole
-from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch, inflation
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.detection import (
     Detections,
     DetectionSettings,
@@ -207,6 +207,11 @@ _UNCALIBRATED_LENS_PX = 0.25
 _LEAST_SIGNIFICANCE = 5.0
 # Standard deviation (px) above which a star position is not used, for instance of a truncated streak.
 _PLACELESS_PX = 5.0
+# Distance (px) below which a point may be a part of the same star as a matched point.
+_SPLIT_PX = 10.0
+# Excess of such points over chance above which stars are seen as several points each, in standard deviations
+# of their number by chance plus a share of the matched points.
+_SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference from the prior attitude (false rejection of one in 100,000 frames).
 _NEAR = 25.9
 # Number of guide stars that are searched near their predicted positions in tracking.
@@ -517,6 +522,7 @@ def _with_attitude(
         across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
         floor = np.diag((_UNCALIBRATED_LENS_PX * np.array([across, across, about])) ** 2)
         fix = replace(fix, covariance=fix.covariance + floor)
+    fix = replace(fix, covariance=fix.covariance + _split_doubt(seen, chosen))
     expected = np.full_like(seen.points, np.nan)
     expected[chosen] = SkyMap(camera, fix.quaternion, fit.bend).pixels(reference)
     if len(late):
@@ -542,14 +548,33 @@ def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
     within the gate. If they are the smaller part of all points, they were selected by the candidate attitude,
     and their scatter about it does not show its error.
     """
-    squares = fit.squares[fit.agree]
-    excess = inflation(squares, 4)
-    if seen.kind is not FrameKind.POINTS or 2 * len(squares) >= len(seen.points) or excess < _CONTRADICTED:
+    count, agreeing = len(seen.points), int(np.count_nonzero(fit.agree))
+    if seen.kind is not FrameKind.POINTS or 2 * agreeing >= count or fit.excess < _CONTRADICTED:
         return ""
     return (
-        f"{len(seen.points) - len(squares)} of {len(seen.points)} points match no star, and the others are "
-        f"{math.sqrt(excess):.1f} times as far off as their uncertainty allows: check the focus"
+        f"{count - agreeing} of {count} points match no star, and the others are "
+        f"{math.sqrt(fit.excess):.1f} times as far off as their uncertainty allows: check the focus"
     )
+
+
+def _split_doubt(seen: FrameSolution, chosen: IntArray) -> FloatArray:
+    """Return the attitude covariance (3, 3), rad^2, that is due to stars seen as several points each.
+
+    A defocused or shaken star appears as several points, of which one matches the star. If the same part of
+    each image matches, all positions have a common error, which the residuals do not show. The error is about
+    half of the distance to the other points. The stars `chosen` are the indices of the matched points.
+    """
+    doubt = np.zeros((3, 3))
+    if seen.kind is not FrameKind.POINTS:
+        return doubt
+    apart = np.delete(seen.points, chosen, axis=0) - seen.points[chosen, None]
+    parts = apart[np.einsum("nmi,nmi->nm", apart, apart) < _SPLIT_PX**2]
+    chance = apart[..., 0].size * math.pi * _SPLIT_PX**2 / (seen.camera.columns * seen.camera.rows)
+    if len(parts) > chance + _SPLIT_SIGMAS * math.sqrt(chance) + _SPLIT_SHARE * len(chosen):
+        half = np.einsum("ni,nj->ij", parts, parts) / (4.0 * len(parts) * seen.camera.focal_length**2)
+        # A shift of the image along x is a rotation about y, and a shift along y one about -x.
+        doubt[:2, :2] = ((half[1, 1], -half[0, 1]), (-half[0, 1], half[0, 0]))
+    return doubt
 
 
 def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
