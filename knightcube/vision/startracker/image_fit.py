@@ -13,7 +13,7 @@ remaining uncertainty of the lens. An error of the line time of a rolling shutte
 along its motion in proportion to its row, is also fitted.
 
 The positions of stars that do not fit the model of their images, such as bent streaks or the rings of a
-defocused lens, have errors of some pixels, regardless of their brightness. If the residuals exceed the noise,
+defocused lens, have errors of some pixels, regardless of their brightness. If the residuals show such errors,
 a common variance is added to the noise, so that the sum of squares equals the degrees of freedom (Mandel &
 Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the brightest stars would dominate the
 fit, and the covariance would be too small.
@@ -66,7 +66,8 @@ class Unknowns:
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
         scatter: whether a variance common to all stars is added to the variances of the positions for any
-            excess of the residuals, or only for a significant excess.
+            excess of the residuals. Otherwise it is added only for a significant excess that it explains
+            better than a factor common to all variances.
     """
 
     scale: bool = False
@@ -138,8 +139,11 @@ def fit_in_image(
         squares = seen.squares(pose)
     excess = inflation(squares[agree], seen.parameters(pose))
     if unknowns.scatter or excess > 1.0:
-        seen, pose, agree = _with_scatter(seen, pose, agree)
-        squares = seen.squares(pose)
+        other, moved, more = _with_scatter(seen, pose, agree)
+        # The residuals of points show whether their noise has a common factor, or a common variance.
+        if unknowns.scatter or _surprise(other, moved, more, 1.0) < _surprise(seen, pose, more, excess):
+            seen, pose, agree = other, moved, more
+            squares = seen.squares(pose)
     inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
@@ -333,6 +337,12 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
     return seen.fitted(pose, agree.astype(np.float64)), agree
+
+
+def _surprise(seen: _Seen, pose: _FittedPose, agree: BoolArray, factor: float) -> float:
+    """Return -2 ln of the likelihood of the stars `agree` (n,), with variances multiplied by `factor`."""
+    spread = np.linalg.slogdet(factor * seen.covariance[agree])[1]
+    return float(np.sum(spread + seen.squares(pose)[agree] / factor))
 
 
 def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
