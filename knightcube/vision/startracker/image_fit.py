@@ -348,14 +348,18 @@ def _surprise(seen: _Seen, pose: _FittedPose, agree: BoolArray, factor: float) -
 def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
-    Bright stars that disagree with their measured variances may agree with the larger variances. The common
-    variance is then estimated again, with these stars.
+    Bright points that disagree with their measured variances may agree with the larger variances. The common
+    variance is then estimated again, with these points. Streaks are not added again.
     """
     own = seen
     for _ in range(_AGREEMENT_ROUNDS):
         seen, pose = _scattered(own, pose, agree)
         within = seen.squares(pose) <= _FARTHEST
-        if np.array_equal(within, agree) or np.count_nonzero(within) < np.count_nonzero(agree):
+        if (
+            seen.unknowns.scatter
+            or np.array_equal(within, agree)
+            or np.count_nonzero(within) < np.count_nonzero(agree)
+        ):
             break
         agree = within
     return seen, pose, agree
