@@ -9,6 +9,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking
 from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import LineOfSight, SkyObject
 from tests.support.flights import demo_config, demo_world, fly
@@ -54,3 +55,18 @@ def two_objects() -> tuple[SkyObject, ...]:
     """Return an object on either side of the boresight."""
     pairs = zip(_BRIGHTNESS, _LINES, strict=True)
     return tuple(SkyObject(magnitude=m, line_of_sight=line) for m, line in pairs)
+
+
+_PIXEL = np.radians(20.0) / 1024
+
+
+def _place(line: LineOfSight, time: FloatArray) -> FloatArray:
+    """Return the true directions (n, 3), by the definition of right ascension and position angle."""
+    ra, dec = np.radians([line.right_ascension_deg, line.declination_deg])
+    start = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.cross(start, east)
+    towards = np.radians(line.towards_deg)
+    ahead = np.cos(towards) * north + np.sin(towards) * east
+    angle = np.radians(line.rate_deg) * time[:, None]
+    return np.asarray(np.cos(angle) * start + np.sin(angle) * ahead)

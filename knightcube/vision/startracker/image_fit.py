@@ -139,10 +139,10 @@ def fit_in_image(
         squares = seen.squares(pose)
     excess = inflation(squares[agree], seen.parameters(pose))
     if unknowns.scatter or excess > 1.0:
-        other, moved, more = _with_scatter(seen, pose, agree)
+        other, shifted, more = _with_scatter(seen, pose, agree)
         # The residuals of points show whether their noise has a common factor, or a common variance.
-        if unknowns.scatter or _surprise(other, moved, more, 1.0) < _surprise(seen, pose, more, excess):
-            seen, pose, agree = other, moved, more
+        if unknowns.scatter or _surprise(other, shifted, more, 1.0) < _surprise(seen, pose, more, excess):
+            seen, pose, agree = other, shifted, more
             squares = seen.squares(pose)
     inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
