@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
@@ -32,6 +32,7 @@ from knightcube.gnc.control.pointing_job import (
     SlewRequest,
     slew,
 )
+from knightcube.gnc.guidance.three_axes import slew_vmc
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath, SlewTask
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_task
@@ -46,6 +47,9 @@ from tests.support.recorded_slews import (
     task_of,
 )
 
+Planner = Callable[[SlewTask], SlewPlan]
+PLANNERS: dict[str, Planner] = {"collocation": plan_task, "vmc": slew_vmc.plan_task}
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the figures; return the exit status."""
@@ -55,13 +59,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--recorded", action="store_true", help="those with known optima instead")
     parser.add_argument("--cones", action="store_true", help="of Sun, Earth and Moon, for the star camera")
     parser.add_argument("--job", action="store_true", help="the planner's job as flown, in cones")
+    parser.add_argument("--planner", choices=PLANNERS, default="collocation", help="of slews, not of jobs")
     options = parser.parse_args(arguments)
     if options.job:
         return _jobs(options.runs, options.seed)
-    return _recorded() if options.recorded else _random(options.runs, options.seed, options.cones)
+    planner = PLANNERS[options.planner]
+    if options.recorded:
+        return _recorded(planner)
+    return _random(options.runs, options.seed, options.cones, planner)
 
 
-def _recorded() -> int:
+def _recorded(planner: Planner) -> int:
     """Compare with the recorded optima; return the exit status."""
     if not FILE.exists():
         sys.stdout.write(f"no optima of slews at {FILE.name}\n")
@@ -73,7 +81,7 @@ def _recorded() -> int:
         task = task_of(case, case["T"], time_cost=MINIMUM_TIME if least else None)
         begin = time.process_time()
         try:
-            plan = plan_task(task)
+            plan = planner(task)
         except PlanningError as error:
             sys.stdout.write(f"{case['name']:28} refused: {error}\n")
             continue
@@ -89,13 +97,13 @@ def _recorded() -> int:
     return 0
 
 
-def _random(runs: int, seed: int, with_cones: bool) -> int:
+def _random(runs: int, seed: int, with_cones: bool, planner: Planner) -> int:
     """Plan random slews; return the exit status."""
     taken, found, failed, nearest = [], list[SlewPlan](), 0, np.inf
     for name, task in slews(runs, seed, with_cones):
         begin = time.process_time()
         try:
-            found.append(plan_task(task))
+            found.append(planner(task))
         except PlanningError as error:
             failed += 1
             sys.stdout.write(f"{name}: {error}\n")

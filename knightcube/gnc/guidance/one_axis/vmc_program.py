@@ -199,9 +199,11 @@ IMPOSED_MARGIN = 2e-4
 """Relative margin by which an imposed limit is tightened, so that peaks between the imposed points keep the
 limit. Without this margin of the imposed limits, the exchange method converges slowly."""
 
-# NLopt 2.11 raises `nlopt.runtime_error`, and older versions raise Python's RuntimeError.
-_SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
-_CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
+SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
+"""Exceptions of a run of NLopt that ends without a result. NLopt 2.11 raises `nlopt.runtime_error`, and older
+versions raise Python's RuntimeError."""
+CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
+"""Results of converged runs of NLopt."""
 _EXCHANGES = 10
 _EVALUATIONS = 300
 _FREE_TOLERANCE = 1e-5
@@ -432,10 +434,10 @@ class PathProgram:
             self._impose(solver, limits, variables)
         try:
             found = np.asarray(solver.optimize(last))
-        except _SOLVER_STOPS:
+        except SOLVER_STOPS:
             # NLopt raises this error for trivial and infeasible problems, after a negligible line search.
             return variables.trial(last), False
-        return variables.trial(found), solver.last_optimize_result() in _CONVERGED
+        return variables.trial(found), solver.last_optimize_result() in CONVERGED
 
     def _impose(self, solver: nlopt.opt, limits: ImposedLimits, variables: _Variables) -> None:
         points = self.family.observed(self.family.grid.dense.take(limits.index))

@@ -190,7 +190,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
         if plan is not None:
             return plan
         tried += search.tried
-    raise PlanningError(_refusal(task, tried))
+    raise PlanningError(refusal(task, tried))
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
@@ -210,7 +210,7 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
     for path in paths:
         found: SolvedPath | None = path
         while found is not None:
-            plan = _plan(task, search, found)
+            plan = integrated(task, search, found)
             if plan is None:
                 found = search.eased(found, _ASTRAY)
                 continue
@@ -224,7 +224,12 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
     return None
 
 
-def _refusal(task: SlewTask, tried: int) -> str:
+def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
+    """Return whether an integrated plan keeps the dipole limit and stays outside the exclusion cones."""
+    return plan.peak <= _OVER and not _depths(task, plan.path).any()
+
+
+def refusal(task: SlewTask, tried: int) -> str:
     """Return the error message for a task without a path, with possible remedies."""
     text = f"no slew within the dipole limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
@@ -237,7 +242,7 @@ def _refusal(task: SlewTask, tried: int) -> str:
     return f"{text}: allow a longer time or another start"
 
 
-def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
+def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
     """Return the plan of a path, or None if the integration along the path fails."""
     equations, scale = found.equations, found.equations.scale
     with np.errstate(over="ignore", invalid="ignore"):  # a diverging integration may overflow
