@@ -182,8 +182,8 @@ class PointingSection(Section, frozen=True, kw_only=True):
     for the magnetometer, which last as long as those of detumbling. Plans are renewed every `replan_period`
     s. A coil that pointing hardly uses is tested by a short current every `coil_test` s; 0 switches the tests
     off. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
-    of the star camera. Without `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`,
-    `OrbitConfig.slew_duration`).
+    of the star camera. The `planner` of slews is `collocation` or `vmc` (virtual motion camouflage). Without
+    `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`, `OrbitConfig.slew_duration`).
     """
 
     axis: Vector = (0.0, 0.0, 1.0)
@@ -197,6 +197,7 @@ class PointingSection(Section, frozen=True, kw_only=True):
     coil_test: Annotated[float, Meta(ge=0.0, le=86400.0)] = 600.0
     slew: Annotated[float, Meta(ge=60.0, le=1500.0)] | None = None
     cones: ExclusionCones = ExclusionCones()
+    planner: Literal["collocation", "vmc"] = "collocation"
 
 
 class TargetStep(Aim, frozen=True, kw_only=True):

@@ -450,7 +450,9 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     camera = config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     angles, duty = section.cones.angles(), pauses.act_ns / pauses.period_ns
-    slew = SlewRequest(config.slew_duration(), coils.heat, np.zeros(3), np.array(boresight), angles)
+    slew = SlewRequest(
+        config.slew_duration(), coils.heat, np.zeros(3), np.array(boresight), angles, planner=section.planner
+    )
     return PlannedCraft(config.craft.inertia_matrix(), axes, weights, coils, duty, slew)
 
 

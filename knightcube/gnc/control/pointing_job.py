@@ -6,17 +6,18 @@ orbit. A passing object is near for minutes only, so tables for an object are sh
 recomputed after each sighting.
 
 From a distant attitude, the body can approach the commanded attitude by a slew of minimum heat. The module
-`slew_plan` plans the slew with the disturbance torques that the attitude filter estimates. The planned dipole
-moments of the slew are used as feedforward. During the slew, the rest of the slew is planned again from the
-newest estimate of motion, body and torques, with the running path as the initial guess (`rest_table`). The
-gains come from linear-quadratic tracking along the slew and the following attitude law, and errors at the end
-of the slew have the highest cost. The pointing table also
-contains the change of the dipole moment per change of the estimated torques.
+`slew_plan`, or `slew_vmc` on request, plans the slew with the disturbance torques that the attitude filter
+estimates. The planned dipole moments of the slew are used as feedforward. During the slew, the rest of the
+slew is planned again from the newest estimate of motion, body and torques, with the running path as the
+initial guess (`rest_table`). The gains come from linear-quadratic tracking along the slew and the following
+attitude law, and errors at the end of the slew have the highest cost. The pointing table also contains the
+change of the dipole moment per change of the estimated torques.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -66,7 +67,12 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
     along,
     cones,
 )
-from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_near, plan_task
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, end_law, plan_near, plan_task
+
+PlanTask = Callable[[SlewTask, SlewPath | None], SlewPlan]
+"""Function from a task, and from the path of a similar task, to a plan (`slew_plan.plan_task`)."""
+PlanNear = Callable[[SlewTask, SlewPath], SlewPlan | None]
+"""Function from a task and the path of a similar task to a plan near this path (`slew_plan.plan_near`)."""
 
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
@@ -104,6 +110,7 @@ class SlewRequest:
         camera: body axis (3,) of the camera.
         angles: half angles of the camera's exclusion cones for `sun`, `earth` and `moon`, rad.
         limit: mean dipole limit of slews along each body axis (3,), A m^2; None for that of the job.
+        planner: `collocation` (`slew_plan`) or `vmc`, virtual motion camouflage (`slew_vmc`).
     """
 
     seconds: float
@@ -112,6 +119,15 @@ class SlewRequest:
     camera: FloatArray
     angles: dict[str, float] = field(default_factory=dict)
     limit: FloatArray | None = None
+    planner: str = "collocation"
+
+    def planners(self) -> tuple[PlanTask, PlanNear]:
+        """Return the functions `plan_task` and `plan_near` of the planner."""
+        if self.planner == "vmc":
+            from knightcube.gnc.guidance.three_axes import slew_vmc  # noqa: PLC0415 - loads NLopt
+
+            return slew_vmc.plan_task, slew_vmc.plan_near
+        return plan_task, plan_near
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,15 +188,16 @@ def slew(
         if float(cone.clearance(start, np.zeros(1))[0]) >= 0.0
     )
     task = _task(begin, wish, target, axes, ahead, along(ahead, first), wish.seconds, avoided)
-    found = _slow_enough(task, fastest)
+    found = _slow_enough(wish, task, fastest)
     if found is None and task.cones:
         task = replace(task, cones=())
-        found = _slow_enough(task, fastest)
+        found = _slow_enough(wish, task, fastest)
     if found is None or not begin.sizes.any():
         return found
     # The areas on which air and sunlight act depend on the path, so the slew is planned again.
     pressed = along(ahead, first, begin.areas, found)
-    return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest, found) or found
+    again = replace(task, along=pressed, horizon=found.horizon)
+    return _slow_enough(wish, again, fastest, found) or found
 
 
 def _task(
@@ -202,14 +219,17 @@ def _task(
     )
 
 
-def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
+def _slow_enough(
+    wish: SlewRequest, task: SlewTask, fastest: float, near: SlewPath | None = None
+) -> SlewPath | None:
     """Return the path of a task, lengthened if the body would rotate too fast, or None if no path is found.
 
     The search is warm-started from `near`, the path of a similar task.
     """
+    plan, _ = wish.planners()
     for _ in range(_TRIALS):
         try:
-            path = plan_task(task, near).path
+            path = plan(task, near).path
         except PlanningError:
             return None
         speed = float(np.linalg.norm(path.rate, axis=1).max())
@@ -345,8 +365,9 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
     )
     around = along(ahead, LEAD, job.areas, near)
     task = _task(begin, wish, job.target, job.axes, ahead, around, near.horizon, avoided)
+    _, plan_rest = wish.planners()
     try:
-        plan = plan_near(task, near)
+        plan = plan_rest(task, near)
     except PlanningError:
         return None
     if plan is None or plan.horizon != near.horizon or plan.energy > HOTTER * near.heat(wish.heat):

@@ -141,6 +141,15 @@ def test_a_slew_with_an_isolated_coil_is_made_by_the_other_two_within_their_limi
     assert heat < 1.2 * path.heat(left.heat)
 
 
+def test_both_planners_of_slews_find_paths_of_equal_heat() -> None:
+    paths = [
+        slew(BEGIN, replace(WISH, planner=planner), NADIR, AXES, ORBIT, np.inf)
+        for planner in ("collocation", "vmc")
+    ]
+    heats = [path.heat(WISH.heat) for path in paths if path is not None]
+    assert heats[1] == pytest.approx(heats[0], rel=0.01)
+
+
 def test_a_body_within_a_cone_slews_out_of_it() -> None:
     q = BEGIN.quaternion
     sun = attitude_matrix(q) @ ORBIT.sun_at(TIMES[:1])[0]
