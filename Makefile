@@ -104,7 +104,7 @@ lock:           ## choose versions of all packages and write them down with thei
 	$(call COMPILE,requirements.lock,pyproject.toml --constraint requirements-test.lock --extra plots --extra watch --extra ground)
 	$(call COMPILE,deploy/requirements.lock,pyproject.toml --constraint requirements-test.lock)
 
-CHECKS  := images parquet test docs interop
+CHECKS  := images parquet circuitpython test docs interop
 # The library of this repository is installed from the clone: its entry goes.
 COMPILE = build/lock/bin/pip-compile --quiet --generate-hashes --all-build-deps --allow-unsafe --strip-extras \
   --no-annotate --no-header --no-emit-options --find-links build/lock/wheels --output-file $(1) $(2) && \
