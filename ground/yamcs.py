@@ -251,7 +251,6 @@ def files(
         "etc/files.sql": _STREAMS.format(before=before, down=DOWN, space=SPACE, header=header),
         f"etc/yamcs.{INSTANCE}.yaml": instance,
         "etc/processor.yaml": _PROCESSORS,
-        LINK_SOURCE: _LINK,
         f"{INSTANCE}.xml": document(commands=layouts_for(body, TELECOMMANDS), epoch=epoch, verified=True),
         **stacks_and_displays(body),
     }

@@ -51,6 +51,8 @@ _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
 # Maximum number of Newton steps for the common variance, and the excess chi-square below which they end.
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
+# Number of parameters of attitude and scale.
+_POSE = 4
 # Maximum number of times that the stars which agree are selected again, with larger variances.
 _AGREEMENT_ROUNDS = 3
 
@@ -92,7 +94,8 @@ class ImageFit:
         bend: fitted lens errors (8,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
         excess: chi-square per degree of freedom of the stars that agree with each other, for the measured
-            variances of their positions; 1 unless it is significantly larger.
+            variances of their positions; 1 unless it is significantly larger. Only attitude and scale count
+            as parameters, so that a fitted lens does not make few stars contradict each other.
         agree: mask of the stars that were used for the attitude (n,).
     """
 
@@ -138,6 +141,7 @@ def fit_in_image(
         pose, agree = _without_outliers(seen, pose, squares)
         squares = seen.squares(pose)
     excess = inflation(squares[agree], seen.parameters(pose))
+    disagreement = inflation(squares[agree], _POSE)
     if unknowns.scatter or excess > 1.0:
         other, shifted, more = _with_scatter(seen, pose, agree)
         # The residuals of points show whether their noise has a common factor, or a common variance.
@@ -152,7 +156,7 @@ def fit_in_image(
     if unknowns.scale and len(unknowns.bend) == BENDS:
         along[4 + ASPECT] = 1.0
     scale_sigma = float(np.sqrt(along @ inverse @ along))
-    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, excess, agree)
+    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, disagreement, agree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
