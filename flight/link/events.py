@@ -18,6 +18,7 @@ class Reaction(IntEnum):
     """Action of the flight software after an event, in addition to recording the event."""
 
     NOTE = 0
+    COILS_OFF = 1
     ISOLATE = 2
     HOLD = 3
     DETUMBLE = 4
@@ -81,7 +82,9 @@ IMU_REFUSED = _warning(
 IMU_UNUSABLE = _fault(16, "imu-unusable", "the inertial unit sends bytes that contain no reading")
 GYRO_LOST = _fault(155, "gyro-lost", "the inertial unit sends readings without a valid rate")
 GYRO_RECOVERED = _info(156, "gyro-recovered", "the inertial unit measures the rate again")
-CONTROL_LOST = _fault(20, "control-lost", "the coils are set to zero because there is no valid estimate")
+CONTROL_LOST = _fault(
+    20, "control-lost", "the coils are set to zero because there is no valid estimate", Reaction.COILS_OFF
+)
 CONTROL_REGAINED = _info(21, "control-regained", "the estimate is valid again")
 BLIND = _fault(22, "blind", "the estimate has been invalid or inaccurate for too long", Reaction.SAFE)
 TUMBLING = _warning(
@@ -95,7 +98,7 @@ HOLD_IMPOSSIBLE = _fault(
 )
 STREAM_POOR = _warning(25, "stream-poor", "a stream of readings is late, slow or out of range")
 STREAM_GOOD = _info(26, "stream-good", "a stream of readings is normal again")
-COIL_FAULT = _fault(30, "coil-fault", "the PWM chip does not accept commands")
+COIL_FAULT = _fault(30, "coil-fault", "the PWM chip does not accept commands", Reaction.COILS_OFF)
 COIL_RECOVERED = _info(31, "coil-recovered", "the PWM chip accepts commands again")
 COIL_BROKEN = _fault(
     34, "coil-broken", "a coil does not carry the commanded current and is isolated", Reaction.ISOLATE

@@ -552,7 +552,9 @@ class ModeControl:
     def react(self, kind: EventKind, time_ns: int, text: str) -> None:
         """Carry out the reaction of an event. The event log calls this method."""
         reaction = kind.reaction
-        if reaction is Reaction.ISOLATE:
+        if reaction is Reaction.COILS_OFF:
+            self._steering.zero()
+        elif reaction is Reaction.ISOLATE:
             self._steering.isolate()
         elif reaction is Reaction.RESTART:
             self.restart = f"{kind.name}: {text}"
@@ -613,7 +615,7 @@ class ModeControl:
             self._enter(change, reason, now_ns)
 
     def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
-        """Enter a mode: reset timers and discard an old path; the control cycle commands the coils."""
+        """Enter a mode: reset timers, discard an old path, and set the coils to zero without steering."""
         self._facts.enter(change.after)
         self._returns = None
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):
@@ -628,6 +630,8 @@ class ModeControl:
             self.wanted = self._pointed
         elif change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:
             self.wanted = None
+        if change.after not in STEERING:
+            self._steering.zero()
         self._record(change.before, change.trigger.value, reason, now_ns)
         if change.before is not Mode.BOOT:
             because = f": {reason}" if reason else ""

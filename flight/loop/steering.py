@@ -230,8 +230,6 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 class Steering:
     """Steers the body along its path, detumbles it, or keeps the coils at zero.
 
-    Each control cycle calls one of the methods `run`, `detumble`, `acquire_sun` and `rest`, which commands
-    the coils once. A cycle that raises an exception switches the coils off (`PerformanceObserver`).
     Control is lost when no recent reading agrees with the estimate, when without a gyro the estimate becomes
     too inaccurate or, in detumbling, without a recent reading. The estimate is propagated by the model
     during a silence of the inertial unit, so that control returns smoothly. The currents are zero within a
@@ -327,6 +325,10 @@ class Steering:
         self._release()
         return self._steered(SteeringState.OFF, now_ns, None, _NO_DIPOLE)
 
+    def zero(self) -> None:
+        """Command zero current."""
+        self._drive.zero()
+
     def isolate(self) -> None:
         """Exclude the coils that the coil monitor considers broken."""
         self._drive.isolate()
@@ -343,7 +345,7 @@ class Steering:
         dipole: FloatArray,
         saturated: bool = False,
     ) -> Steered:
-        """Report a fault of the PWM chip, and return the result of this cycle."""
+        """Check the PWM chip, whose fault switches the coils off, and return the result of this cycle."""
         error = self._drive.fault()
         text = error or "the PWM chip accepts commands again"
         self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)

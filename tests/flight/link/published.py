@@ -36,14 +36,16 @@ _PLAIN = {
     "fault": """
         4 task-failed  9 no-progress  10 imu-silent  13 imu-line-lost  16 imu-unusable  49 worker-rests
         60 log-fault  79 release-left  90 guardian-lost  93 guardian-blind  96 service-failing
-        110 record-lost  155 gyro-lost  20 control-lost  30 coil-fault
+        110 record-lost  155 gyro-lost
         """,
 }
 _WITH_REACTION = {
     8: ("task-failing", "fault", "safe"),
+    20: ("control-lost", "fault", "coils_off"),
     22: ("blind", "fault", "safe"),
     23: ("tumbling", "warning", "detumble"),
     24: ("hold-impossible", "fault", "safe"),
+    30: ("coil-fault", "fault", "coils_off"),
     34: ("coil-broken", "fault", "isolate"),
     46: ("slew-late", "warning", "hold"),
     73: ("memory-high", "fault", "restart"),

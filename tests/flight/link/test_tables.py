@@ -24,8 +24,9 @@ def test_every_event_has_its_published_code_severity_and_reaction() -> None:
 def test_the_numbers_of_severities_and_reactions_are_those_of_old_logs() -> None:
     assert [(kind.name, int(kind)) for kind in Severity] == [("INFORMATION", 0), ("WARNING", 1), ("FAULT", 2)]
     assert [kind.name for kind in sorted(Reaction)] == [
-        "NOTE", "ISOLATE", "HOLD", "DETUMBLE", "SAFE", "RESTART", "RETURN",
+        "NOTE", "COILS_OFF", "ISOLATE", "HOLD", "DETUMBLE", "SAFE", "RESTART", "RETURN",
     ]  # fmt: skip
+    assert [int(kind) for kind in Reaction] == list(range(8))
 
 
 def test_an_event_is_only_noted_unless_its_row_names_a_reaction() -> None:

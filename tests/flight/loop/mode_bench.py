@@ -77,6 +77,7 @@ class ModeBench:
         )
         view = SimpleNamespace(mode_fields=lambda wanted: {"target_q2": 0.0})
         steering = SimpleNamespace(
+            zero=self._note("zero"),
             isolate=self._note("isolate"),
             begin_detumbling=self._note("detumble"),
             begin_sun_acquisition=self._note("sun"),

@@ -185,10 +185,10 @@ def test_every_event_beyond_a_note_is_reacted_to_even_while_the_throttle_holds_i
     log = EventLog(lambda kind, *_: record.append(kind.name))
     log.react_by(lambda kind, _, text: reacted.append((kind, text)))
     for text in ("a", "b"):
-        log.report(events.COIL_BROKEN, 0, text)
+        log.report(events.CONTROL_LOST, 0, text)
         log.report(events.CYCLE_SLIP, 0, text)
-    assert record == ["coil-broken", "cycle-slip"]
-    assert reacted == [(events.COIL_BROKEN, "a"), (events.COIL_BROKEN, "b")]
+    assert record == ["control-lost", "cycle-slip"]
+    assert reacted == [(events.CONTROL_LOST, "a"), (events.CONTROL_LOST, "b")]
 
 
 @pytest.mark.parametrize(

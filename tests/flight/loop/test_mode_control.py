@@ -195,6 +195,7 @@ def test_a_hold_with_a_large_error_is_impossible_after_its_patience() -> None:
     assert bench.mode() is Mode.SAFE
     assert bench.events == ["hold-impossible", "mode"]
     assert bench.texts[1] == "hold -> safe, reaction safe: hold-impossible"
+    assert "zero" in bench.asked
 
 
 def test_in_the_demonstration_only_an_overdue_attitude_counts_as_an_error() -> None:
@@ -301,10 +302,10 @@ def test_reactions_without_a_mode_act_on_the_coils_or_stop_the_flight() -> None:
     bench.control.react(events.COIL_BROKEN, 0, "x")
     bench.control.react(events.COIL_FAULT, 0, "x")
     bench.control.react(events.CYCLE_SLIP, 0, "x")
-    assert bench.asked == ["isolate"]
+    assert bench.asked == ["isolate", "zero"]
     assert bench.control.restart == ""
     bench.control.react(events.MEMORY_HIGH, 0, "2 GB")
-    assert bench.asked[1:] == ["stop"]
+    assert bench.asked[2:] == ["stop"]
     assert bench.control.restart == "memory-high: 2 GB"
     assert bench.mode() is Mode.HOLD
 
@@ -333,7 +334,7 @@ def orbiting(**changes: Any) -> ModeBench:
 def test_a_satellite_boots_with_a_rate_alone_and_seeks_the_sun_in_safe() -> None:
     bench = orbiting()
     assert bench.mode() is Mode.SAFE
-    assert bench.asked == ["sun"]
+    assert bench.asked == ["zero", "sun"]
     assert bench.control.acquires_sun
     assert bench.control.target(0) is None
 
