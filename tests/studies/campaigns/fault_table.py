@@ -53,7 +53,7 @@ REACTION: Mapping[str, str] = {
     "coil": "coil-broken",
     "bridge": "coil-broken",
 }
-"""Fault event that must come with the reaction: zero coil current, or isolation of a coil."""
+"""Event whose reaction in the table of events must follow: coils off, or isolation."""
 
 
 def part_of(kind: FaultKind) -> str:
