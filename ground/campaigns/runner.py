@@ -40,6 +40,8 @@ _STOP_S = 5.0
 """Time (s) in which interrupted worker processes must end before they are killed."""
 _SCRATCH = "knightcube-campaign-"
 """First characters of the name of the folder that contains the temporary files of the workers."""
+_TEMPORARY = "temporary"
+"""Name of the link to this folder in the campaign's folder."""
 
 
 class Progress:
@@ -210,6 +212,7 @@ def fly(
     label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
     with _opened(out) as sink:
         done = _resume(label, out, sink)
+        _clear(out / _TEMPORARY)  # a kill after the last result also leaves it
         missing = [case for case in cases if case.key not in done]
         if missing:
             bar = Progress(len(cases), len(cases) - len(missing)) if progress else None
@@ -401,8 +404,7 @@ def _scratch(out: Path) -> Iterator[str]:
     A symbolic link in the campaign's folder points to it. After a kill, the next start deletes the folder by
     this link. The folder itself has a short path, because paths of sockets are limited to 107 characters.
     """
-    link = out / "temporary"
-    _clear(link)
+    link = out / _TEMPORARY
     folder = tempfile.mkdtemp(prefix=_SCRATCH)
     link.symlink_to(folder)
     try:
