@@ -96,7 +96,7 @@ class Steered:
         reference: reference motion at the time of the cycle, or None without a path.
         dipole: commanded dipole (3,), A m^2.
         currents: currents (3,), A, sent to the driver, after reallocation and with the coil monitor's probe
-            current.
+            current. The sent currents are zero if a fault in this cycle switched the coils off.
     """
 
     state: SteeringState

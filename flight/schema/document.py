@@ -79,10 +79,6 @@ MODULES = "KNIGHTCUBE_MODULES"
 """Environment variable of a board, which names the file of further permitted objects `module:object`."""
 
 
-_EXTRA_MODULES = ("adafruit_", "busio", "board")
-"""First characters of the modules that the extra `circuitpython` provides."""
-
-
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
     """Return an object that a configuration names as `module:object`, or by a key of `known`.
 
@@ -100,8 +96,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        missing = str(getattr(error, "name", None) or "")
-        cure = ": install the extra `circuitpython`" if missing.startswith(_EXTRA_MODULES) else ""
+        cure = ": install the package that provides it" if isinstance(error, ModuleNotFoundError) else ""
         raise ConfigError(key, f"is {named!r}, which cannot be imported: {error}{cure}") from error
 
 

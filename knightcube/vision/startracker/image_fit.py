@@ -140,12 +140,12 @@ def fit_in_image(
     if squares.max() > _FARTHEST:
         pose, agree = _without_outliers(seen, pose, squares)
         squares = seen.squares(pose)
-    excess = inflation(squares[agree], seen.parameters(pose))
-    disagreement = inflation(squares[agree], _POSE)
-    if unknowns.scatter or excess > 1.0:
+    excess = inflation(squares[agree], _POSE)
+    factor = inflation(squares[agree], seen.parameters(pose))
+    if unknowns.scatter or factor > 1.0:
         other, shifted, more = _with_scatter(seen, pose, agree)
         # The residuals of points show whether their noise has a common factor, or a common variance.
-        if unknowns.scatter or _surprise(other, shifted, more, 1.0) < _surprise(seen, pose, more, excess):
+        if unknowns.scatter or _surprise(other, shifted, more, 1.0) < _surprise(seen, pose, more, factor):
             seen, pose, agree = other, shifted, more
             squares = seen.squares(pose)
     inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
@@ -156,7 +156,7 @@ def fit_in_image(
     if unknowns.scale and len(unknowns.bend) == BENDS:
         along[4 + ASPECT] = 1.0
     scale_sigma = float(np.sqrt(along @ inverse @ along))
-    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, disagreement, agree)
+    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, excess, agree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

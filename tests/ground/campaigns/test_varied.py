@@ -234,3 +234,14 @@ def test_the_picture_needs_a_drawn_number(tmp_path: Path) -> None:
     for one in results:
         one["drawn"] = {"name": "x"}
     assert not draw_campaign(results, tmp_path / "none.png")
+
+
+def test_the_temporary_files_of_a_campaign_killed_after_its_last_result_are_deleted(tmp_path: Path) -> None:
+    campaign = varied_campaign(DEMO, [variation_of("plant.inertia=10%")], 0.1)
+    fly(campaign, 1, 1, tmp_path / "out", workers=1)
+    left = tmp_path / "knightcube-campaign-left"
+    left.mkdir()
+    (tmp_path / "out" / "temporary").symlink_to(left)
+    fly(campaign, 1, 1, tmp_path / "out", workers=1)
+    assert not left.exists()
+    assert not (tmp_path / "out" / "temporary").is_symlink()

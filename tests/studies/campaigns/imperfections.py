@@ -1,7 +1,7 @@
 """Camera imperfections of the campaign `mismatch`: how each changes optics, signal or counts.
 
-The estimator does not know an imperfection unless its name contains `told`: it assumes the ideal camera with
-a global shutter. For `rolling untold` the estimator treats the line time as unknown.
+The estimator does not know an imperfection unless its name contains `described`: it assumes the ideal camera
+with a global shutter. For `rolling, unknown line time` the estimator treats the line time as unknown.
 """
 
 from __future__ import annotations
@@ -225,9 +225,11 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "distortion 0.2 %": Imperfection(Optics(distortion=0.002)),
     "distortion 1 %": Imperfection(Optics(distortion=0.01)),
     "axis 5 px off": Imperfection(Optics(offset=(4.0, -3.0))),
-    "rolling untold": Imperfection(line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=UNSTATED)}),
-    "rolling told": Imperfection(line_time=20e-6, known={"line_time": 20e-6}),
-    "sigma 3 px told": Imperfection(Optics((gaussian(3.0),), radius=18.0), known={"psf_sigma": 3.0}),
+    "rolling, unknown line time": Imperfection(
+        line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=UNSTATED)}
+    ),
+    "rolling, described": Imperfection(line_time=20e-6, known={"line_time": 20e-6}),
+    "sigma 3 px, described": Imperfection(Optics((gaussian(3.0),), radius=18.0), known={"psf_sigma": 3.0}),
     "ring 8 px, hole 4 px": Imperfection(Optics((ring(8.0, 4.0),), radius=9.0)),
     "ring 8 px, hole 6 px": Imperfection(Optics((ring(8.0, 6.0),), radius=9.0)),
     "stray light, wide": Imperfection(electrons=_wide_light, gain=5.0, known={"gain": 5.0}),

@@ -60,7 +60,7 @@ class ObjectChase(PointingFlight):
     """A flight that follows an object.
 
     Attributes:
-        told: names of the events.
+        reported: names of the events, in order.
         refused: number of planner tables that were rejected because the body would rotate too fast.
         notes: for each cycle the time, the angle (rad) from the boresight to the object, the body's rate
         about the boresight and its whole rate (rad/s), the number of the followed track, and whether the
@@ -75,7 +75,7 @@ class ObjectChase(PointingFlight):
         """
         self._draw = np.random.default_rng([seed, 23])
         super().__init__({**wanted, "target": PointingTarget(Goal.OBJECT)}, seed)
-        self.told: list[str] = []
+        self.reported: list[str] = []
         self.refused = 0
         self.shown: list[FloatArray] = []
         self.directions: list[FloatArray] = []
@@ -213,4 +213,4 @@ class ObjectChase(PointingFlight):
         )
 
     def _tell(self, kind: EventKind, _time_ns: int, _held: int, _text: str) -> None:
-        self.told.append(kind.name)
+        self.reported.append(kind.name)

@@ -146,7 +146,12 @@ def run(case: Case) -> Result:
     chase = ObjectChase({**wanted, "rate_deg": math.exp(draw)}, (seed * 1_009 + number) * 11 + band)
     chase.fly()
     notes = np.array(chase.notes)
-    result: Result = {**wanted, "rate_deg": math.exp(draw), "events": chase.told, "refused": chase.refused}
+    result: Result = {
+        **wanted,
+        "rate_deg": math.exp(draw),
+        "events": chase.reported,
+        "refused": chase.refused,
+    }
     followed = np.flatnonzero(notes[:, 4] > 0)
     if not len(followed):
         return {**result, "found": None}

@@ -37,7 +37,7 @@ MEMORY_BYTES_PER_HOUR = 8 << 20
 BUDGET_BYTES = 4 << 20
 _SEGMENT_BYTES = 256 << 10
 _UNHEARD = ("camera", "vision", "disk")
-"""Parts without faults: there is no camera, and a full disk would lose the records of the other faults."""
+"""Parts without faults. The flight has no camera, and a full disk would lose the records of other faults."""
 
 
 def cases(hours: int, seed: int) -> list[Case]:

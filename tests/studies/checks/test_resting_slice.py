@@ -32,7 +32,11 @@ def test_attitudes_of_the_model_s_own_camera_are_known_as_well_as_they_claim(tmp
 
 def test_attitudes_of_unlike_cameras_are_within_their_claims(tmp_path: Path) -> None:
     """The cases are another distortion, and a rolling shutter with known and unknown line time."""
-    for row, trail in (("distortion 0.2 %", 0.0), ("rolling told", 3.0), ("rolling untold", 1.0)):
+    for row, trail in (
+        ("distortion 0.2 %", 0.0),
+        ("rolling, described", 3.0),
+        ("rolling, unknown line time", 1.0),
+    ):
         own = RESTING.summarise(_flown(row, trail, 2), tmp_path).facts["all"]
         assert own["attitudes"] == 2
         assert own["worst"] < 4.5

@@ -234,15 +234,11 @@ class ObservedPaths:
         """
         times, unit = 0.5 * scale * (samples.points + 1.0), float(np.mean(task.craft.limit))
         around = task.along(times)
-        self._motion, self._field = (
-            SlewDynamics(task.craft, scale, unit, around),
-            scale**2 * unit * around.field,
-        )
+        self._motion = SlewDynamics(task.craft, scale, unit, around)
+        self._field = scale**2 * unit * around.field
         self._craft, self._middle = task.craft, middle
-        self._weights, self._cones = (
-            heat_matrix(task.craft.weights),
-            ConeConstraints(task.cones, margin, times),
-        )
+        self._weights = heat_matrix(task.craft.weights)
+        self._cones = ConeConstraints(task.cones, margin, times)
         matrices = np.array([1.0, 2.0, 4.0])[:, None, None] * samples.matrices
         self._still = np.einsum("knj,ja->kna", matrices, nodes)
         self._basis = np.einsum("knj,jap->kanp", matrices, basis)
@@ -261,21 +257,22 @@ class ObservedPaths:
         key = y.tobytes()
         if self._last is None or self._last[0] != key:
             x = self.motion(y)
-            q, w, _ = self._turned(x)
+            q, w, _ = self.turned(x)
             at, none = np.concatenate([q, w], axis=1), np.zeros_like(w)
             drift, by_state = self._motion.flow(at, none)[:, 4:], self._motion.slopes(at, none)[:, 4:, :7]
             count = len(w)
             moved = np.tile(x, (1, 9, 1)) + 0.0j
             by_input = moved.reshape(3, 3, 3, count, 3)
             by_input[_AXES[:, None], _AXES[:, None], _AXES, :, _AXES] += 1j * _STEP
-            shift = np.concatenate(self._turned(moved)[:2], axis=1).imag.reshape(9, count, 7, 1)
+            shift = np.concatenate(self.turned(moved)[:2], axis=1).imag.reshape(9, count, 7, 1)
             drifted = drift + 1j * (by_state @ shift)[..., 0]
             slopes = self._needed(moved, drifted.reshape(-1, 3)).imag.reshape(9, count, -1) / _STEP
             basis = self._basis.transpose(2, 0, 1, 3).reshape(count, 9, -1)
             self._last = key, self._needed(x, drift), slopes.transpose(1, 2, 0) @ basis
         return self._last[1], self._last[2]
 
-    def _turned(self, x: Numbers) -> tuple[Numbers, Numbers, Numbers]:
+    def turned(self, x: Numbers) -> tuple[Numbers, Numbers, Numbers]:
+        """Return attitudes (n, 4), ICRS to body, rates and accelerations (n, 3) for a motion (3, n, 3)."""
         q, w, a = mrp_motion(x)
         return multiply(q, np.broadcast_to(self._middle, q.shape)), w, a
 
@@ -284,7 +281,7 @@ class ObservedPaths:
 
         The acceleration of a body without currents on these paths is `drift` (m n, 3).
         """
-        q, _, acceleration = self._turned(x)
+        q, _, acceleration = self.turned(x)
         count = len(self._field)
         b = shown(q, np.tile(self._field, (len(q) // count, 1)))
         torque = (acceleration - drift) @ self._craft.inertia
@@ -358,7 +355,7 @@ class VmcProgram:
     def trajectory(self, y: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return states (n, 7) and dipoles (n, 3) at shares (n,) of the duration, for parameters y (k,)."""
         paths = self._observed(SamplePoints.at(self._grid.rule, 2.0 * share - 1.0))
-        q, w, _ = paths._turned(paths.motion(y))
+        q, w, _ = paths.turned(paths.motion(y))
         return np.concatenate([q, w], axis=1), paths.values(y)[0][:, :3]
 
     def heat(self, y: FloatArray) -> tuple[float, FloatArray]:

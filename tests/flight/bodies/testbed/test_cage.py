@@ -88,7 +88,7 @@ class _Fixed:
         return CoilCommand(currents, currents, False)
 
     def reset(self) -> None:
-        """Do nothing, because there is no state."""
+        """Do nothing: the law has no state."""
 
 
 @pytest.mark.parametrize("direction", np.linspace(0.0, 2.0 * np.pi, 9))

@@ -173,6 +173,34 @@ def test_points_that_contradict_their_uncertainties_give_no_attitude_unless_most
     assert answered >= 6 if accepted else answered == 0
 
 
+def test_stars_seen_as_two_points_each_widen_the_attitude_by_their_distance() -> None:
+    """Each star appears 4 px beside its true position, and again as far on the other side."""
+    kind = ListKind(field_deg=20.0, faintest=5.5, noise_px=0.1, false_stars=0, known_deg=0.0)
+    part = np.array([3.2, -2.4])
+    single: list[FloatArray] = []
+    double: list[FloatArray] = []
+    for seed in range(6):
+        drawn = draw(kind, sky().stars, np.random.default_rng([29, seed]))
+        for points, covariances in (
+            (drawn.pixels, single),
+            (np.concatenate([drawn.pixels + part, drawn.pixels - part]), double),
+        ):
+            covariance = np.full(len(points), 0.1**2)[:, None, None] * np.eye(2)
+            found = solve_places(
+                points, covariance, FrameKind.POINTS, drawn.camera, (1.0, 1.0), sky(), SolveSettings()
+            )
+            if found.fix is None:
+                continue
+            assert _mismatch(found, drawn.attitude) < _CHI_SQUARE_3_DOF_1E_5
+            covariances.append(found.fix.covariance[:2, :2] * drawn.camera.focal_length**2)
+    assert len(single) == 6
+    assert len(double) >= 4
+    assert np.max(np.trace(single, axis1=1, axis2=2)) < 1.0
+    turn = np.array([-part[1], part[0]])  # a shift of the image along x is a rotation about y
+    for covariance in double:
+        np.testing.assert_allclose(covariance, np.outer(turn, turn), rtol=0.05)  # others are near by chance
+
+
 def test_noise_alone_shows_no_star() -> None:
     pixels = np.random.default_rng(16).normal(100.0, 10.0, (512, 512)).round().astype(np.uint16)
     found = solve_frame(pixels, NARROW.pinhole, (1.0, 1.0), 0.1, sky(), SolveSettings())
