@@ -71,6 +71,10 @@ class Background:
         """Return the counts of `pixels` (rows, columns) above the level, and the noise variances, float32."""
         return _subtracted(pixels, self.level, np.square(self.noise))
 
+    def subtracted_with_noise(self, pixels: Image) -> tuple[Image, Image]:
+        """Return the counts of `pixels` (rows, columns) above the level, and the noise (counts), float32."""
+        return _subtracted(pixels, self.level, self.noise)
+
 
 def _interpolated(grid: FloatArray, shape: tuple[int, int]) -> Image:
     """Return block values, interpolated bilinearly to all pixels of a frame of `shape`."""
@@ -460,13 +464,12 @@ def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
     return row, column
 
 
-def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
-    """Return the region (m,) of each of the ascending flat indices `pixel` (m,), and the number of regions.
+def _label_pixels_numpy(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
+    """Return the result of `label_pixels`.
 
-    Regions are 8-connected and numbered in the order of their first pixels. The algorithm connects runs of
-    adjacent pixels in a row, because there are far fewer runs than pixels. Each run of pixels is linked to an
-    earlier run of its region, and the links are shortened until all runs of a region share one root (Shiloach
-    and Vishkin 1982). The same connection of regions with scipy.sparse would need 12 MiB more memory.
+    Each run of pixels is linked to an earlier run of its region, and the links are shortened until all runs
+    of a region share one root (Shiloach and Vishkin 1982). The same connection of regions with scipy.sparse
+    would need 12 MiB more memory.
     """
     # An empty column is added, so that no run of pixels continues in the next row.
     pixel, columns = pixel + pixel // columns, columns + 1
@@ -491,6 +494,55 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
     is_first = root == np.arange(len(first))
     number = (np.cumsum(is_first) - 1)[root]
     return np.repeat(number, length), int(np.count_nonzero(is_first))
+
+
+@compiled_form_of(_label_pixels_numpy)
+def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
+    """Return the region (m,) of each of the ascending flat indices `pixel` (m,), and the number of regions.
+
+    Regions are 8-connected and numbered in the order of their first pixels. The algorithm connects runs of
+    adjacent pixels in a row, because there are far fewer runs than pixels.
+    """
+    number, root = np.empty(len(pixel), dtype=np.int64), np.empty(len(pixel), dtype=np.int64)
+    start, stop = np.empty(len(pixel), dtype=np.int64), np.empty(len(pixel), dtype=np.int64)
+    runs, row, end, low = 0, 0, 0, 0
+    for k in range(len(pixel)):
+        if k == 0 or pixel[k] != pixel[k - 1] + 1 or pixel[k] >= end:
+            row = pixel[k] // columns
+            end = (row + 1) * columns
+            # An empty column is added, so that no run of pixels continues in the next row.
+            start[runs], root[runs] = pixel[k] + row, runs
+            runs += 1
+        number[k], stop[runs - 1] = runs - 1, pixel[k] + row + 1
+    for run in range(runs):
+        # A run touches the runs of the row above from one column before to one column after the run.
+        while stop[low] + columns + 1 < start[run]:
+            low += 1
+        above = low
+        while start[above] + columns + 1 <= stop[run]:
+            one, other = _root_of(root, run), _root_of(root, above)
+            root[max(one, other)] = min(one, other)
+            above += 1
+    count = 0
+    for run in range(runs):
+        # The root of a region is its first run, whose number is already that of the region.
+        if root[run] == run:
+            start[run] = count
+            count += 1
+        else:
+            start[run] = start[_root_of(root, run)]
+    for k in range(len(pixel)):
+        number[k] = start[number[k]]
+    return number, count
+
+
+@loop_helper
+def _root_of(root: IntArray, run: int) -> int:
+    """Return the first run in a chain of links, and shorten the chain."""
+    while root[run] != run:
+        root[run] = root[root[run]]
+        run = root[run]
+    return run
 
 
 def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int) -> Moments:
@@ -547,15 +599,42 @@ _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
+def _repair_hot_pixels_numpy(signal: Image, noise: Image) -> int:
+    """See `repair_hot_pixels`."""
+    row, column = positions(signal > _REPAIR_SIGMAS * noise)
+    row, column, around = _hot(signal, row, column, noise[row, column])
+    signal[row, column] = np.median(around, axis=0)
+    return len(row)
+
+
+@compiled_form_of(_repair_hot_pixels_numpy)
 def repair_hot_pixels(signal: Image, noise: Image) -> int:
     """Replace hot pixels of `signal` (rows, columns) by their neighbours' median, and return their number.
 
     Only pixels well above the standard deviation `noise` (rows, columns) of the noise are tested.
     """
-    row, column = positions(signal > _REPAIR_SIGMAS * noise)
-    row, column, around = _hot(signal, row, column, noise[row, column])
-    signal[row, column] = np.median(around, axis=0)
-    return len(row)
+    rows, columns = signal.shape
+    hot, count = np.empty(signal.shape, dtype=np.bool_), 0
+    limit, around, scratch = np.float32(_REPAIR_SIGMAS), np.empty(8), np.empty(8)
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            bright = signal[row, column] > limit * noise[row, column]
+            hot[row, column] = bright and _is_hot(signal, row, column, noise[row, column])
+            count += hot[row, column]
+    repaired, place = np.empty((count, 3)), 0
+    for row in range(1, rows - 1):
+        for column in range(1, columns - 1):
+            if hot[row, column]:
+                for k in range(8):
+                    beside = k + (k > 3)
+                    around[k] = signal[row - 1 + beside // 3, column - 1 + beside % 3]
+                repaired[place, 0], repaired[place, 1] = row, column
+                repaired[place, 2] = _median(around, scratch)
+                place += 1
+    # The neighbours of a repaired pixel may be hot, too, so that pixels are replaced after all medians.
+    for place in range(count):
+        signal[int(repaired[place, 0]), int(repaired[place, 1])] = repaired[place, 2]
+    return count
 
 
 def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]:

@@ -25,6 +25,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, sele
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.frame import (
     Background,
+    at_least,
     box_sum,
     estimate_background,
     label_pixels,
@@ -122,14 +123,12 @@ class Streaks:
 def segment_frame(pixels: Image, settings: EndpointSettings) -> Segmented:
     """Return the bright regions of a frame (rows, columns), and those regions that may be streaks."""
     background = estimate_background(pixels)
-    noise = background.map(background.noise)
-    signal = pixels.astype(np.float32)
-    signal -= background.map(background.level)
+    signal, noise = background.subtracted_with_noise(pixels)
     hot = repair_hot_pixels(signal, noise)
     local = settings.threshold_sigmas > 0.0
     mask = threshold_local(signal, noise, settings.threshold_sigmas) if local else threshold_mean(pixels)
     regions = find_regions(mask, signal, settings.least_area)
-    row, column = positions(pixels >= saturation_level(pixels, settings.saturation))
+    row, column = positions(at_least(pixels, saturation_level(pixels, settings.saturation)))
     saturated = np.isin(regions.label, regions.labels[row, column])
     long = regions.length >= _LENGTH_MARGIN * settings.least_length
     candidates = regions.select(long & ~near_border(regions, pixels.shape, settings.border) & ~saturated)
@@ -138,13 +137,28 @@ def segment_frame(pixels: Image, settings: EndpointSettings) -> Segmented:
     return Segmented(signal, background, regions, candidates.select(strongest), hot)
 
 
+def _threshold_local_numpy(signal: Image, noise: Image, sigmas: float) -> BoolArray:
+    """See `threshold_local`."""
+    return np.asarray(box_sum(signal) > (3.0 * sigmas) * noise)
+
+
+@compiled_form_of(_threshold_local_numpy)
 def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
     """Return the pixels at which the 3 x 3 sum of `signal` exceeds `sigmas` times the noise of this sum.
 
-    The argument `signal` is the frame without background; The argument `noise` is the standard deviation of
-    each pixel, counts.
+    The argument `signal` is the frame (rows, columns) without background, and the argument `noise` is the
+    standard deviation of each pixel (rows, columns), counts. No border pixel is returned.
     """
-    return np.asarray(box_sum(signal) > (3.0 * sigmas) * noise)
+    rows, columns = signal.shape
+    limit, down = np.float32(3.0 * sigmas), np.empty_like(signal[0])
+    above = np.zeros(signal.shape, dtype=np.bool_)
+    for row in range(1, rows - 1):
+        for column in range(columns):
+            down[column] = signal[row - 1, column] + signal[row, column] + signal[row + 1, column]
+        for column in range(1, columns - 1):
+            total = down[column - 1] + down[column] + down[column + 1]
+            above[row, column] = total > limit * noise[row, column]
+    return above
 
 
 def threshold_mean(pixels: Image) -> BoolArray:
@@ -652,12 +666,16 @@ def find_corners(
 
 
 def extend(endpoints: FloatArray, outward: FloatArray, bias: float) -> FloatArray:
-    """Return streak ends (..., 2), px, moved by `bias` px along the unit vectors `outward` (..., 2)."""
-    return np.asarray(endpoints + bias * outward / np.linalg.norm(outward, axis=-1, keepdims=True))
+    """Return streak ends (..., 2), px, moved by `bias` px in the directions `outward` (..., 2).
+
+    An end with the direction zero, such as an end of a point, is not moved.
+    """
+    length = np.linalg.norm(outward, axis=-1, keepdims=True)
+    return np.asarray(endpoints + bias * outward / np.where(length > 0.0, length, 1.0))
 
 
 def chord_outward(endpoints: FloatArray) -> FloatArray:
-    """Return unit vectors outwards along the chord at both ends of each streak (n, 2, 2)."""
+    """Return vectors outwards along the chord at both ends of each streak (n, 2, 2), px."""
     chord = endpoints[:, 1] - endpoints[:, 0]
     return np.stack([-chord, chord], axis=1)
 
