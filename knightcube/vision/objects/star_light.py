@@ -26,10 +26,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import ndimage
+from scipy.linalg import lapack
 from scipy.optimize import nnls
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
@@ -160,9 +161,10 @@ class StarLight:
         signal = segmented.signal[self._near[:, 1], self._near[:, 0]].astype(np.float64)
         self._weight = _pixel_weights(signal, segmented.background, gain, saturation)
         self._target = signal * self._weight
-        images = streak_images(self._near, stars, psf_sigma, False)[:, 0] * self._weight
+        images = streak_images(self._near, stars, psf_sigma, False)[:, 0]
+        images *= self._weight
         others = [self._weighted_image(path)[None] for path in known]
-        self._stars = np.concatenate([images, *others]).T
+        self._stars = np.concatenate([images, *others]).T if others else images.T
         self._normal, self._right = self._stars.T @ self._stars, self._stars.T @ self._target
         self._power = float(self._target @ self._target)
         self.pixels = len(self._near)
@@ -471,9 +473,10 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
     scaled = normal / scale / scale[:, None]
     # The ridge permits images that are equal or empty.
     scaled.reshape(-1)[:: len(scale) + 1] += _RIDGE
-    factor = np.linalg.cholesky(scaled)
+    # The routines of LAPACK are called directly, because the checks of numpy take longer than they do.
+    factor, _ = lapack.dpotrf(scaled, lower=1)
     # A triangular system of k rows has the same solutions as the system of all pixels.
-    reduced = np.linalg.solve(factor, right / scale)
+    reduced, _ = lapack.dtrtrs(factor, right / scale, lower=1)
     try:
         brightness, residual = nnls(factor.T, reduced, maxiter=30 * len(scale))
     except RuntimeError as error:
@@ -510,6 +513,8 @@ _WIDE_REACH = 5.0
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
 # Minimum length (px) of an object's line of light; a shorter remainder of light counts as a point.
 _LEAST_LINE_PX = 4.0
+# Distance at which the Gaussian that smooths an image is truncated, in standard deviations.
+_FARTHEST = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -586,7 +591,42 @@ def cut_patch(
 
 
 def _smoothed(light: FloatArray, psf_sigma: float) -> FloatArray:
-    return np.asarray(ndimage.gaussian_filter(light, psf_sigma, mode="constant"))
+    radius = int(_FARTHEST * psf_sigma + 0.5)
+    profile = np.exp(-0.5 * (np.arange(radius + 1) / psf_sigma) ** 2)
+    return _convolved(light, profile / (2.0 * profile.sum() - 1.0))
+
+
+def _convolved_numpy(light: FloatArray, profile: FloatArray) -> FloatArray:
+    """Return an image as `_convolved` does."""
+    whole = np.concatenate([profile[:0:-1], profile])
+    down = ndimage.correlate1d(light, whole, axis=0, mode="constant")
+    return np.asarray(ndimage.correlate1d(down, whole, axis=1, mode="constant"))
+
+
+@compiled_form_of(_convolved_numpy)
+def _convolved(light: FloatArray, profile: FloatArray) -> FloatArray:
+    """Return an image (rows, columns) convolved along both axes with a symmetric profile; zero beyond.
+
+    The array `profile` (k,) begins with the middle of the profile.
+    """
+    rows, columns = light.shape
+    out, line = np.zeros((rows, columns)), np.empty(columns)
+    for row in range(rows):
+        line[:] = 0.0
+        for k in range(1 - len(profile), len(profile)):
+            if 0 <= row + k < rows:
+                _add_scaled(light[row + k], profile[abs(k)], line)
+        for k in range(min(len(profile), columns)):
+            _add_scaled(line[: columns - k], profile[k], out[row, k:])
+            if k > 0:
+                _add_scaled(line[k:], profile[k], out[row, : columns - k])
+    return out
+
+
+@loop_helper
+def _add_scaled(values: FloatArray, factor: float, total: FloatArray) -> None:
+    for k in range(len(total)):
+        total[k] += factor * values[k]
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:

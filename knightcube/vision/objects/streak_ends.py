@@ -354,10 +354,17 @@ def _corners_of_regions(
         top, bottom = max(box[0] - _PADDING, 0), min(box[1] + _PADDING, signal.shape[0])
         left, right = max(box[2] - _PADDING, 0), min(box[3] + _PADDING, signal.shape[1])
         light, around = signal[top:bottom, left:right], labels[top:bottom, left:right]
-        spans = _spans_of(around, label[number])
-        wanted = _widened(spans, max(half_width, 1), right - left)
-        response = _response(light, around, label[number], wanted, smooth, slope, window, k, scratch)
-        found = _peaks(response, around, label[number], spans, relative, half_width, corners[total:])
+        own, spans, margin = label[number], _spans_of(around, label[number]), max(half_width, 1)
+        if bottom - top <= right - left:
+            wanted = _widened(spans, margin, right - left)
+            response = _response(light, around, own, wanted, smooth, slope, window, k, scratch)
+            found = _peaks(response, around, own, spans, relative, half_width, corners[total:])
+        else:
+            # The response of an upright streak is computed from its transpose, because long rows take less
+            # time than many short ones.
+            wanted = _widened(_spans_across(around, own, spans), margin, bottom - top)
+            response = _response(light.T, around.T, own, wanted, smooth, slope, window, k, scratch)
+            found = _peaks(response.T, around, own, spans, relative, half_width, corners[total:])
         corners[total : total + found] += np.array([left, top])
         counts[number] = found
         total += found
@@ -377,6 +384,19 @@ def _spans_of(labels: Image, label: int) -> IntArray:
             last -= 1
         spans[row, 0], spans[row, 1] = first, last if first < columns else -1
     return spans
+
+
+@loop_helper
+def _spans_across(labels: Image, label: int, spans: IntArray) -> IntArray:
+    """Return the first and last row of a region in each column (columns, 2), from its `spans` (rows, 2)."""
+    rows, columns = labels.shape
+    across = np.empty((columns, 2), dtype=np.int64)
+    across[:, 0], across[:, 1] = rows, -1
+    for row in range(rows):
+        for column in range(max(spans[row, 0], 0), spans[row, 1] + 1):
+            if labels[row, column] == label:
+                across[column, 0], across[column, 1] = min(across[column, 0], row), row
+    return across
 
 
 @loop_helper

@@ -109,15 +109,18 @@ def _set_circle(
     x, y, z = star[0], star[1], star[2]
     share = x * a + y * b + z * c
     u, v, w = share * a, share * b, share * c
+    cosine, sine = math.cos(first * angle), math.sin(first * angle)
+    next_cosine, next_sine = math.cos(step * angle), math.sin(step * angle)
     for k in range(len(points)):
-        turned = (first + k * step) * angle
-        cosine, sine = math.cos(turned), math.sin(turned)
         ahead = cosine * (z - w) + sine * (x * b - y * a) + w
         if ahead > 0.0:
             points[k, 0] = focal * (cosine * (x - u) + sine * (y * c - z * b) + u) / ahead
             points[k, 1] = focal * (cosine * (y - v) + sine * (z * a - x * c) + v) / ahead
         else:
             points[k, 0] = points[k, 1] = math.nan
+        # The addition theorem replaces sine and cosine of each step.
+        before = cosine
+        cosine, sine = before * next_cosine - sine * next_sine, sine * next_cosine + before * next_sine
 
 
 def straight_path(ends: FloatArray, parts: FloatArray | None = None) -> FloatArray:
@@ -138,21 +141,72 @@ def path_among_stars(
 
     The ends are passed in the order in time that gives the slower motion relative to the stars. The points
     are those after the given fractions `parts` (m,) of the motion from the first end to the second, or evenly
-    spaced points between the ends.
+    spaced points from the first end to the second.
     """
-    vectors = pinhole.unit_vectors(ends)
+    if parts is None:
+        steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
+        parts = (np.arange(steps) + 0.5) / steps
+    return _path_among_stars(ends, rotation, parts, float(pinhole.focal_length), *pinhole.centre)
+
+
+def _path_among_stars_numpy(
+    ends: FloatArray, rotation: FloatArray, parts: FloatArray, focal: float, centre_x: float, centre_y: float
+) -> FloatArray:
+    """Return the points of `path_among_stars` for a focal length, px, and a centre of the image, px."""
+    centre = np.array([centre_x, centre_y])
+    vectors = np.concatenate([(ends - centre) / focal, np.ones((2, 1))], axis=1)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     # Both ends are rotated to mid-exposure from the start and from the end of the exposure.
     middle = _rotated(vectors, rotation, np.array([[0.5, -0.5], [0.5, -0.5]]))
     apart = middle[1, 1] - middle[0, 0], middle[0, 1] - middle[1, 0]
     slower = int(apart[1] @ apart[1] < apart[0] @ apart[0])
     first, last = middle[slower, 0], middle[1 - slower, 1]
-    if parts is None:
-        steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
-        parts = (np.arange(steps) + 0.5) / steps
-    elif slower:
-        parts = 1.0 - parts
+    parts = 1.0 - parts if slower else parts
     at = first + parts[:, None] * (last - first)
-    return pinhole.project(_rotated(at, rotation, (parts - 0.5)[:, None])[:, 0])
+    at = _rotated(at, rotation, (parts - 0.5)[:, None])[:, 0]
+    points = focal * at[:, :2] / np.where(at[:, 2:] > 0.0, at[:, 2:], np.nan) + centre
+    return np.asarray(points)
+
+
+@compiled_form_of(_path_among_stars_numpy)
+def _path_among_stars(
+    ends: FloatArray, rotation: FloatArray, parts: FloatArray, focal: float, centre_x: float, centre_y: float
+) -> FloatArray:
+    """Return the points of `path_among_stars` for a focal length, px, and a centre of the image, px."""
+    angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
+    axis = rotation / (angle if angle > 0.0 else 1.0)
+    middle, apart = np.empty((2, 2, 3)), np.zeros(2)
+    for end in range(2):
+        x, y = (ends[end, 0] - centre_x) / focal, (ends[end, 1] - centre_y) / focal
+        size = math.sqrt(x * x + y * y + 1.0)
+        for time in range(2):
+            middle[end, time] = _turned(x / size, y / size, 1.0 / size, axis, (0.5 - time) * angle)
+    for k in range(3):
+        apart[0] += (middle[1, 1, k] - middle[0, 0, k]) ** 2
+        apart[1] += (middle[0, 1, k] - middle[1, 0, k]) ** 2
+    slower = int(apart[1] < apart[0])
+    first, step = middle[slower, 0], middle[1 - slower, 1] - middle[slower, 0]
+    points = np.empty((len(parts), 2))
+    for k in range(len(parts)):
+        part = 1.0 - parts[k] if slower else parts[k]
+        x, y, z = first[0] + part * step[0], first[1] + part * step[1], first[2] + part * step[2]
+        x, y, z = _turned(x, y, z, axis, (part - 0.5) * angle)
+        points[k, 0] = centre_x + focal * x / z if z > 0.0 else math.nan
+        points[k, 1] = centre_y + focal * y / z if z > 0.0 else math.nan
+    return points
+
+
+@loop_helper
+def _turned(x: float, y: float, z: float, axis: FloatArray, angle: float) -> tuple[float, float, float]:
+    """Return a direction after the rotation of the camera by `angle` (rad) about `axis` (3,)."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    a, b, c = axis[0], axis[1], axis[2]
+    share = (x * a + y * b + z * c) * (1.0 - cosine)
+    return (
+        cosine * x + sine * (y * c - z * b) + share * a,
+        cosine * y + sine * (z * a - x * c) + share * b,
+        cosine * z + sine * (x * b - y * a) + share * c,
+    )
 
 
 def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -257,13 +311,16 @@ def _mark_discs(
     rows, columns = marked.shape
     r, total = len(half) // 2, 0
     spans[:, 0], spans[:, 1] = columns, -1
+    # Neighbouring paths have many points on the same pixels.
+    drawn = np.zeros((rows + 2 * r, columns + 2 * r), dtype=np.bool_)
     for k in range(len(centres)):
-        x = centres[k, 0] - low_x
-        for step in range(2 * r + 1):
-            row = centres[k, 1] - low_y + step - r
-            if row < 0 or row >= rows:
-                continue
-            first, last = max(x - half[step], 0), min(x + half[step], columns - 1)
+        x, y = centres[k, 0] - low_x, centres[k, 1] - low_y
+        if drawn[y + r, x + r]:
+            continue
+        drawn[y + r, x + r] = True
+        for row in range(max(y - r, 0), min(y + r + 1, rows)):
+            width = half[row - y + r]
+            first, last = max(x - width, 0), min(x + width, columns - 1)
             for column in range(first, last + 1):
                 if not marked[row, column]:
                     marked[row, column] = True
@@ -527,10 +584,11 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
         if abs(off) > _DARK * width * (1.0 + abs(bend)):
             continue
         root = math.sqrt(1.0 + bend * bend)
-        cosine = 1.0 / root
+        inverse = 1.0 / (root * pace)
+        cosine = pace * inverse
         n = off * cosine
         s = nodes[2, k] + nodes[6, k] * step + beyond * root + off * bend * cosine
-        whole = _bell(n * narrow) * share / pace
+        whole = _bell(n * narrow) * share * root * inverse
         covered, sloping = 1.0, 0.0
         if s + begin < room:
             covered, sloping = _area((s + begin) * narrow), _bell((s + begin) * narrow) * narrow
