@@ -550,13 +550,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 
     The moments of a region with zero flux are zero.
     """
-    flux = np.bincount(owner, light, count).astype(np.float64)
-    whole = np.where(flux > 0.0, flux, np.inf)
-    x, y = np.bincount(owner, light * column, count) / whole, np.bincount(owner, light * row, count) / whole
-    dx, dy = column - x[owner], row - y[owner]
-    xx = np.bincount(owner, light * dx * dx, count) / whole
-    yy = np.bincount(owner, light * dy * dy, count) / whole
-    xy = np.bincount(owner, light * dx * dy, count) / whole
+    flux, x, y, xx, yy, xy = _moment_sums(owner, column, row, light, count)
     # The point spread increases both principal moments by the same amount.
     # For a uniform line of length L and any point spread, the difference of the principal moments is L^2/12.
     spread = np.hypot(xx - yy, 2.0 * xy)
@@ -567,6 +561,50 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
         np.sqrt(np.maximum(0.5 * (xx + yy - spread), 0.0)),
         0.5 * np.arctan2(2.0 * xy, xx - yy),
     )
+
+
+def _moment_sums_numpy(
+    owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
+) -> FloatArray:
+    """Return flux, centroid (x, y) and second moments (xx, yy, xy) of `count` regions (6, count).
+
+    The arguments are those of `moments`.
+    """
+    flux = np.bincount(owner, light, count).astype(np.float64)
+    whole = np.where(flux > 0.0, flux, np.inf)
+    x, y = np.bincount(owner, light * column, count) / whole, np.bincount(owner, light * row, count) / whole
+    dx, dy = column - x[owner], row - y[owner]
+    xx = np.bincount(owner, light * dx * dx, count) / whole
+    yy = np.bincount(owner, light * dy * dy, count) / whole
+    return np.stack([flux, x, y, xx, yy, np.bincount(owner, light * dx * dy, count) / whole])
+
+
+@compiled_form_of(_moment_sums_numpy)
+def _moment_sums(
+    owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
+) -> FloatArray:
+    """See `_moment_sums_numpy`."""
+    sums = np.zeros((6, count))
+    for p in range(len(owner)):
+        own, counts = owner[p], float(light[p])
+        sums[0, own] += counts
+        sums[1, own] += counts * column[p]
+        sums[2, own] += counts * row[p]
+    for own in range(count):
+        whole = sums[0, own] if sums[0, own] > 0.0 else np.inf
+        sums[1, own] /= whole
+        sums[2, own] /= whole
+    for p in range(len(owner)):
+        own, counts = owner[p], float(light[p])
+        dx, dy = column[p] - sums[1, own], row[p] - sums[2, own]
+        sums[3, own] += counts * dx * dx
+        sums[4, own] += counts * dy * dy
+        sums[5, own] += counts * dx * dy
+    for own in range(count):
+        whole = sums[0, own] if sums[0, own] > 0.0 else np.inf
+        for k in range(3, 6):
+            sums[k, own] /= whole
+    return sums
 
 
 def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
@@ -599,42 +637,16 @@ _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
-def _repair_hot_pixels_numpy(signal: Image, noise: Image) -> int:
-    """See `repair_hot_pixels`."""
-    row, column = positions(signal > _REPAIR_SIGMAS * noise)
-    row, column, around = _hot(signal, row, column, noise[row, column])
-    signal[row, column] = np.median(around, axis=0)
-    return len(row)
-
-
-@compiled_form_of(_repair_hot_pixels_numpy)
 def repair_hot_pixels(signal: Image, noise: Image) -> int:
     """Replace hot pixels of `signal` (rows, columns) by their neighbours' median, and return their number.
 
     Only pixels well above the standard deviation `noise` (rows, columns) of the noise are tested.
     """
-    rows, columns = signal.shape
-    hot, count = np.empty(signal.shape, dtype=np.bool_), 0
-    limit, around, scratch = np.float32(_REPAIR_SIGMAS), np.empty(8), np.empty(8)
-    for row in range(1, rows - 1):
-        for column in range(1, columns - 1):
-            bright = signal[row, column] > limit * noise[row, column]
-            hot[row, column] = bright and _is_hot(signal, row, column, noise[row, column])
-            count += hot[row, column]
-    repaired, place = np.empty((count, 3)), 0
-    for row in range(1, rows - 1):
-        for column in range(1, columns - 1):
-            if hot[row, column]:
-                for k in range(8):
-                    beside = k + (k > 3)
-                    around[k] = signal[row - 1 + beside // 3, column - 1 + beside % 3]
-                repaired[place, 0], repaired[place, 1] = row, column
-                repaired[place, 2] = _median(around, scratch)
-                place += 1
-    # The neighbours of a repaired pixel may be hot, too, so that pixels are replaced after all medians.
-    for place in range(count):
-        signal[int(repaired[place, 0]), int(repaired[place, 1])] = repaired[place, 2]
-    return count
+    row, column = find_hot_pixels(signal, np.square(noise))
+    bright = signal[row, column] > _REPAIR_SIGMAS * noise[row, column]
+    row, column = row[bright], column[bright]
+    signal[row, column] = np.median([signal[row + dr, column + dc] for dr, dc in _AROUND], axis=0)
+    return len(row)
 
 
 def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]:

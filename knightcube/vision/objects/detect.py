@@ -26,6 +26,7 @@ ends, and succeeds in more images.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -34,6 +35,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.compiled import compiled_form_of
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
 from knightcube.vision.frame import MAD_TO_SIGMA, line_of, positions
@@ -59,6 +61,7 @@ from knightcube.vision.objects.streak_ends import (
     extend,
     measure_streaks,
     near_border,
+    pixels_of_region,
     segment_frame,
 )
 from knightcube.vision.objects.streak_images import at_mid_exposure, star_path, star_paths
@@ -360,6 +363,50 @@ class Judgement:
     light: StarLight | None = None
 
 
+def _light_beside_numpy(
+    region: IntArray, light: FloatArray, ends: FloatArray, half: FloatArray, reach: float
+) -> tuple[int, float]:
+    """Return the number of pixels of a region beside the path of a star, and their light, counts.
+
+    The path of a star is nearly a parabola over its chord.
+
+    Args:
+        region: pixels of the region (m, 2).
+        light: counts of the pixels (m,).
+        ends: ends of the path (2, 2), px.
+        half: displacement (2,) of the middle of the path from the middle of the chord, px.
+        reach: distance (px) from the path above which a pixel lies beside it.
+    """
+    chord = ends[1] - ends[0]
+    length = max(float(np.linalg.norm(chord)), 1.0)
+    along, normal = chord / length, np.array([-chord[1], chord[0]]) / length
+    sag = 4.0 * float(half @ normal) / length**2
+    place, away = (region - ends[0]) @ along, (region - ends[0]) @ normal
+    inside = np.clip(place, 0.0, length)
+    beside = np.hypot(away - sag * inside * (length - inside), place - inside) > reach
+    return int(beside.sum()), float(light[beside].sum())
+
+
+@compiled_form_of(_light_beside_numpy)
+def _light_beside(
+    region: IntArray, light: FloatArray, ends: FloatArray, half: FloatArray, reach: float
+) -> tuple[int, float]:
+    """See `_light_beside_numpy`."""
+    x, y = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
+    length = max(math.sqrt(x * x + y * y), 1.0)
+    x, y = x / length, y / length
+    sag = 4.0 * (half[1] * x - half[0] * y) / length**2
+    count, other = 0, 0.0
+    for p in range(len(region)):
+        dx, dy = region[p, 0] - ends[0, 0], region[p, 1] - ends[0, 1]
+        place = dx * x + dy * y
+        inside = min(max(place, 0.0), length)
+        if math.hypot(dy * x - dx * y - sag * inside * (length - inside), place - inside) > reach:
+            count += 1
+            other += light[p]
+    return count, other
+
+
 @dataclass(frozen=True, slots=True)
 class Judge:
     """Classifies streaks and regions of a frame as stars or objects by their pixels.
@@ -438,17 +485,9 @@ class Judge:
         reach = self.objects.psf_sigma * (_DIM_SIGMAS + float(np.sqrt(2.0 * np.log(max(brightness, 1.0)))))
         middle = self.pinhole.unit_vectors(ends.mean(axis=0)[None])[0]
         path = star_path(middle, self.rotation, 0.5, self.pinhole)
-        # The path of a star is nearly a parabola over its chord.
-        chord = ends[1] - ends[0]
-        length = max(float(np.linalg.norm(chord)), 1.0)
-        along, normal = chord / length, np.array([-chord[1], chord[0]]) / length
-        sag = 4.0 * float((path[len(path) // 2] - ends.mean(axis=0)) @ normal) / length**2
-        place, away = (region - ends[0]) @ along, (region - ends[0]) @ normal
-        inside = np.clip(place, 0.0, length)
-        far = np.hypot(away - sag * inside * (length - inside), place - inside)
-        beside = far > reach
-        other = float(signal[beside].sum())
-        return other >= self.objects.point_significance * noise * float(np.sqrt(beside.sum() + 1.0))
+        half = path[len(path) // 2] - ends.mean(axis=0)
+        count, other = _light_beside(region, signal, ends, half, reach)
+        return other >= self.objects.point_significance * noise * float(np.sqrt(count + 1.0))
 
     def _stars_fill(self, label: int) -> bool:
         """Return whether few stars near the axis of a region explain all light of the region."""
@@ -468,9 +507,7 @@ class Judge:
     def _pixels_of(self, label: int) -> IntArray:
         """Return the pixels (x, y) of a region (m, 2), row by row."""
         regions = self.segmented.regions
-        top, bottom, left, right = regions.boxes[np.searchsorted(regions.label, label)]
-        row, column = positions(regions.labels[top:bottom, left:right] == label)
-        return np.stack([column + left, row + top], axis=-1)
+        return pixels_of_region(regions.labels, regions.boxes[np.searchsorted(regions.label, label)], label)
 
     def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
         """Return the objects in regions in which objects and stars may be merged.

@@ -177,13 +177,59 @@ def find_regions(mask: BoolArray, signal: Image, least_area: int) -> Regions:
     light = np.maximum(signal[row, column], 0.0).astype(np.float64)
     found = moments(number, column, row, light, count)
     area = np.bincount(number, minlength=count)
+    boxes = _bounding_boxes(number, row, column, count)
+    kept = np.flatnonzero(area >= least_area)
+    return Regions(labels, kept + 1, boxes[kept], area[kept], found.flux[kept], found.length[kept])
+
+
+def _bounding_boxes_numpy(number: IntArray, row: IntArray, column: IntArray, count: int) -> IntArray:
+    """Return the bounding boxes (count, 4) of `Regions` from the region and position of each of m pixels."""
     boxes = np.empty((count, 4), dtype=np.int64)
-    boxes[:, ::2], boxes[:, 1::2] = max(mask.shape), 0
+    boxes[:, ::2], boxes[:, 1::2] = np.iinfo(np.int64).max, 0
     for edge, place in ((0, row), (2, column)):
         np.minimum.at(boxes[:, edge], number, place)
         np.maximum.at(boxes[:, edge + 1], number, place + 1)
-    kept = np.flatnonzero(area >= least_area)
-    return Regions(labels, kept + 1, boxes[kept], area[kept], found.flux[kept], found.length[kept])
+    return boxes
+
+
+@compiled_form_of(_bounding_boxes_numpy)
+def _bounding_boxes(number: IntArray, row: IntArray, column: IntArray, count: int) -> IntArray:
+    """See `_bounding_boxes_numpy`."""
+    boxes = np.empty((count, 4), dtype=np.int64)
+    boxes[:, ::2], boxes[:, 1::2] = np.iinfo(np.int64).max, 0
+    for p in range(len(number)):
+        box = boxes[number[p]]
+        box[0], box[1] = min(box[0], row[p]), max(box[1], row[p] + 1)
+        box[2], box[3] = min(box[2], column[p]), max(box[3], column[p] + 1)
+    return boxes
+
+
+def _pixels_of_region_numpy(labels: Image, box: IntArray, label: int) -> IntArray:
+    """See `pixels_of_region`."""
+    top, bottom, left, right = box
+    row, column = positions(labels[top:bottom, left:right] == label)
+    return np.stack([column + left, row + top], axis=-1)
+
+
+@compiled_form_of(_pixels_of_region_numpy)
+def pixels_of_region(labels: Image, box: IntArray, label: int) -> IntArray:
+    """Return the pixels (x, y) of a region (m, 2), row by row.
+
+    The arguments are the labels of a frame (rows, columns), the bounding box (4,) of the region as in
+    `Regions`, and the label of the region.
+    """
+    top, bottom, left, right = box
+    count, place = 0, 0
+    for row in range(top, bottom):
+        for column in range(left, right):
+            count += labels[row, column] == label
+    pixels = np.empty((count, 2), dtype=np.int64)
+    for row in range(top, bottom):
+        for column in range(left, right):
+            if labels[row, column] == label:
+                pixels[place, 0], pixels[place, 1] = column, row
+                place += 1
+    return pixels
 
 
 def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:

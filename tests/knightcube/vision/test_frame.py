@@ -138,6 +138,7 @@ def test_regions_are_scipys_numbered_by_their_first_pixels(mask: BoolArray) -> N
     _, first, group = np.unique(own, return_index=True, return_inverse=True)
     assert count == wanted
     np.testing.assert_array_equal(number, np.argsort(np.argsort(first))[group])
+    assert_forms_agree(label_pixels, pixel, mask.shape[1], interpreted=len(pixel) < 5_000)
 
 
 _EIGHT_BITS = np.random.default_rng(1).normal(20.0, 2.0, (64, 96)).astype(np.uint8)
@@ -344,6 +345,16 @@ def test_the_compiled_reduction_of_a_frame_equals_that_in_numpy(dtype: type[np.g
     assert len(frame._hot_places_numpy(signal, floor, 30.0)[0]) > 20
     assert_forms_agree(frame._hot_places, signal, floor, 30.0)
     assert_forms_agree(frame._box_sum, signal, relative=1e-6)
+
+
+def test_the_compiled_moments_of_regions_equal_those_in_numpy() -> None:
+    """One region has no pixels, and one has only pixels without light."""
+    draw = np.random.default_rng(7)
+    owner = draw.integers(0, 5, 300)
+    light = np.where(owner == 2, 0.0, draw.uniform(0.0, 90.0, 300))
+    column, row = draw.integers(0, 60, (2, 300))
+    assert_forms_agree(frame._moment_sums, owner, column, row, light, 6)
+    assert frame._moment_sums_numpy(owner, column, row, light, 6)[:, [2, 5]].tolist() == [[0.0, 0.0]] * 6
 
 
 def test_the_compiled_hot_pixels_are_those_of_numpy_among_pairs_and_squares() -> None:

@@ -21,6 +21,7 @@ from knightcube.vision.objects.detect import (
     ObjectReport,
     SpaceObject,
     Verdict,
+    _light_beside,
     angular_displacements,
     centre_residuals,
     detect,
@@ -48,6 +49,7 @@ from tests.knightcube.vision.objects.space_objects import (
     star_field,
 )
 from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
+from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import expose, rate_at, read_out, star_camera, true_endpoints
 
 _CAMERA = star_camera()
@@ -497,3 +499,12 @@ def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
     assert judge.begins_a_star(first[[0, part]], flux)
     assert not judge.begins_a_star(first[[0, part]], 4.0 * flux)
     assert not judge.begins_a_star(first[[0, part]] + np.array([[0.0, 0.0], [4.0, -4.0]]), flux)
+
+
+def test_all_forms_find_the_same_light_beside_a_path() -> None:
+    draw = np.random.default_rng(2)
+    region = draw.integers(0, 60, (200, 2))
+    ends = np.array([[10.0, 20.0], [45.0, 38.0]])
+    for half, reach in (([0.0, 0.0], 3.0), ([1.5, -3.0], 6.0), ([0.0, 0.0], 100.0)):
+        assert_forms_agree(_light_beside, region, draw.uniform(0.0, 9.0, 200), ends, np.array(half), reach)
+    assert_forms_agree(_light_beside, region, np.ones(200), ends[[0, 0]], np.zeros(2), 2.0)

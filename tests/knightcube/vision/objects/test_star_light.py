@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.objects.settings import EndpointSettings
@@ -11,7 +12,9 @@ from knightcube.vision.objects.star_light import (
     Patch,
     StarLight,
     _brightest_path,
+    _convolved,
     _fit_line,
+    _smoothed,
     brightest_left,
     cut_patch,
     fit_stars,
@@ -176,3 +179,11 @@ def test_all_forms_find_the_same_brightest_path(beyond: float) -> None:
         given = seen, steps, factor, np.array([beyond, 0.0, 0.0, beyond]), threshold
         assert_forms_agree(_brightest_path, *given)
     assert _brightest_path(*given) == (-np.inf, -1, -1)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 2), (20, 30)])
+def test_all_forms_smooth_alike_and_as_scipy_does(shape: tuple[int, int]) -> None:
+    light = np.random.default_rng(5).normal(size=shape)
+    assert_forms_agree(_convolved, light, np.array([0.5, 0.2, 0.05]))
+    expected = ndimage.gaussian_filter(light, 1.3, mode="constant")
+    np.testing.assert_allclose(_smoothed(light, 1.3), expected, atol=1e-12)

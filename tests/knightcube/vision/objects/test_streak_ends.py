@@ -9,6 +9,7 @@ from scipy import ndimage
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.frame import box_sum, less_boxes, repair_hot_pixels
 from knightcube.vision.objects.streak_ends import (
+    _bounding_boxes,
     _corners_of_regions,
     centre_of_intensity,
     centre_of_rotation,
@@ -21,6 +22,7 @@ from knightcube.vision.objects.streak_ends import (
     harris_response,
     kernel_radius,
     local_maxima,
+    pixels_of_region,
     smoothed,
     structure_tensor,
     threshold_local,
@@ -205,6 +207,12 @@ def test_extension_moves_both_ends_outward() -> None:
     np.testing.assert_allclose(moved, [[[7.0, 6.0], [16.0, 18.0]]])
 
 
+def test_extension_does_not_move_the_equal_ends_of_a_point() -> None:
+    ends = np.array([[[10.0, 10.0], [10.0, 10.0]], [[0.0, 0.0], [0.0, 1.0]]])
+    moved = extend(ends, chord_outward(ends), 5.0)
+    np.testing.assert_array_equal(moved, [[[10.0, 10.0], [10.0, 10.0]], [[0.0, -5.0], [0.0, 6.0]]])
+
+
 def test_the_centre_of_rotation_is_the_axis_projected() -> None:
     centre = np.array([700.0, 200.0])
     angle = np.array([0.1, 1.0, 2.3, 4.0])
@@ -219,12 +227,29 @@ def test_parallel_streaks_have_no_centre_of_rotation() -> None:
     assert np.isnan(centre_of_rotation(streaks)).all()
 
 
+def test_all_forms_find_the_same_bright_pixels_boxes_and_regions() -> None:
+    draw = np.random.default_rng(6)
+    signal = (5.0 * ndimage.gaussian_filter(draw.normal(size=(30, 41)), 1.0)).astype(np.float32)
+    noise = draw.uniform(0.2, 0.6, signal.shape).astype(np.float32)
+    assert_forms_agree(threshold_local, signal, noise, 2.0)
+    mask = threshold_local(signal, noise, 2.0)
+    regions = find_regions(mask, signal, 1)
+    assert len(regions) > 5
+    row, column = np.nonzero(mask)
+    number = regions.labels[row, column].astype(np.int64) - 1
+    assert_forms_agree(_bounding_boxes, number, row, column, len(regions))
+    for box, label in zip(regions.boxes, regions.label.tolist(), strict=True):
+        assert_forms_agree(pixels_of_region, regions.labels, box, label)
+
+
+@pytest.mark.parametrize("upright", [False, True])
 @pytest.mark.parametrize("half_width", [0, 3])
-def test_all_forms_find_the_same_corners_of_regions(half_width: int) -> None:
+def test_all_forms_find_the_same_corners_of_regions(half_width: int, upright: bool) -> None:
     """The regions include a bright streak, noise peaks, and regions at the border of the frame."""
     draw = np.random.default_rng(5)
     signal = 10.0 * ndimage.gaussian_filter(draw.normal(size=(40, 50)), 1.2)
     signal += 40.0 * np.exp(-0.5 * (np.arange(40)[:, None] - 14.0 - 0.3 * np.arange(50)) ** 2)
+    signal = np.ascontiguousarray(signal.T) if upright else signal
     regions = find_regions(signal > 3.0, signal.astype(np.float32), 1)
     labels = np.ascontiguousarray(regions.labels, dtype=np.int32)
     kernels = gaussian_kernel(1.0, 3), gaussian_derivative_kernel(1.0, 3), gaussian_kernel(1.5, 5)

@@ -7,9 +7,11 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.objects.streak_images import (
+    _path_among_stars,
     _paths_on_circles,
     fitted_line,
     line_image,
+    path_among_stars,
     pixels_near,
     spread_over,
     spread_with_slopes,
@@ -101,6 +103,18 @@ def test_all_forms_return_the_same_paths_of_stars() -> None:
         assert_forms_agree(
             _paths_on_circles, directions, rotation, draw.uniform(0.0, 1.0, 4), 900.0, 511.5, 300.0
         )
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_all_forms_return_the_same_path_among_the_stars(backward: bool) -> None:
+    """The path begins at the first end, also if the slower motion begins at the second."""
+    ends = np.array([[200.0, 250.0], [290.0, 262.0]])[:: -1 if backward else 1]
+    view = float(_CAMERA.pinhole.focal_length), *_CAMERA.pinhole.centre
+    for rotation in (0.0 * _ROTATION, _ROTATION, -_ROTATION):
+        assert_forms_agree(_path_among_stars, ends, rotation, np.linspace(-0.2, 1.2, 9), *view)
+        for parts in (None, np.array([0.0, 1.0])):
+            path = path_among_stars(ends, rotation, _CAMERA.pinhole, parts)
+            np.testing.assert_allclose(path[[0, -1]], ends, atol=1e-9 if parts is not None else 1.0)
 
 
 def test_all_forms_find_the_same_pixels_near_points() -> None:
