@@ -621,13 +621,13 @@ class SlewSearch:
             for batch in batches:
                 relaxed += batch
                 if time_cost is None:
-                    yield from map(self._fresh, self._cheapest(batch))
+                    yield from self._tried(self._cheapest(batch))
                 elif (found := self._walker.shortened(batch, HORIZON_RANGE[0], time_cost)) is not None:
-                    yield self._fresh(found)
+                    yield from self._tried([found])
             if time_cost is not None or not relaxed:
                 continue
             if (found := self._walker.shortened(relaxed, self._task.horizon, MINIMUM_TIME)) is not None:
-                yield self._fresh(found)
+                yield from self._tried([found])
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
         """Return a path outside the cones that the path `found` crosses with the given depths, rad.
@@ -643,11 +643,12 @@ class SlewSearch:
         self._widened += 1
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
-    def _fresh(self, found: SolvedPath) -> SolvedPath:
-        """Reset the cones and the usable dipole limit of the solver, and return the path `found`."""
-        self._widened, self.solver.share = 0, 1.0
-        self.solver.extra = np.zeros_like(self.solver.extra)
-        return found
+    def _tried(self, paths: list[SolvedPath]) -> Iterator[SolvedPath]:
+        """Yield the paths; after the trial of each, reset the cones and the dipole limit of the solver."""
+        for path in paths:
+            yield path
+            self._widened, self.solver.share = 0, 1.0
+            self.solver.extra = np.zeros_like(self.solver.extra)
 
     def _rungs(self) -> Iterator[Iterator[list[SolvedPath]]]:
         """Yield paths without the dipole limit, first of the requested duration and then of longer durations.

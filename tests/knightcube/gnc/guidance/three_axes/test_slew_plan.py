@@ -11,7 +11,13 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import AttitudeEnd, BoresightEnd, Cone, SlewCraft
+from knightcube.gnc.guidance.three_axes.slew_model import (
+    MINIMUM_TIME,
+    AttitudeEnd,
+    BoresightEnd,
+    Cone,
+    SlewCraft,
+)
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewOrder, SlewStatus, plan_order, plan_task
 from tests.support.circular_orbits import circular
 from tests.support.random_slews import clearance, slews
@@ -46,6 +52,16 @@ def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> No
     assert plan.status is SlewStatus.STRETCHED
     assert case["T"] * 0.999 < plan.horizon < 1.02 * case["T"]
     assert plan.peak <= 1.001
+
+
+def test_a_slew_of_least_time_is_found_although_the_first_path_cannot_be_flown() -> None:
+    """The first path is shorter than the optimum, and its integration fails."""
+    case = problem("T-knightcube-1u-sso-y180")
+    task = task_of(case, case["T"], time_cost=MINIMUM_TIME)
+    plan = plan_task(task)
+    assert plan.horizon <= 1.02 * case["T"]
+    assert plan.peak <= 1.001
+    assert off_degrees(flown(plan, task)[:4], np.array(case["qf"])) <= 0.005
 
 
 def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
