@@ -96,32 +96,40 @@ def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
     The last batch includes triangles of neighbouring stars, for points that are not sorted by brightness. The
     mirrored field has the same batches.
     """
-    batches = np.split(middle_sized(field)[: sum(sizes.spread)], np.cumsum(sizes.spread)[:-1])
+    batches = np.split(middle_sized(field, sum(sizes.spread)), np.cumsum(sizes.spread)[:-1])
     if len(field) > _BRIGHTEST:
         batches[-1] = np.concatenate([batches[-1], neighbours(field)])
     return batches
 
 
-def middle_sized(field: StarField) -> IntArray:
-    """Return medium-sized triangles (t, 3) of the brightest stars, in a random order."""
-    triangles = triples(min(len(field), _MOST_STARS))
-    first, second, third = triangles.T
+def middle_sized(field: StarField, most: int) -> IntArray:
+    """Return up to `most` medium-sized triangles (t, 3) of the brightest stars, in a random order."""
+    triangles = triples(min(len(field), _MOST_STARS), shuffled=True)
     direction = field.direction[:_MOST_STARS]
-    cosine = direction @ direction.T
-    least = np.minimum(np.minimum(cosine[first, second], cosine[second, third]), cosine[third, first])
-    longest = np.sqrt(np.maximum(2.0 - 2.0 * least, 0.0)) / (2.0 * max(field.half_width))
-    kept = np.flatnonzero((longest >= _MIDDLE_SIZES[0]) & (longest <= _MIDDLE_SIZES[1]))
-    # The seed is fixed, so that the same field always gives the same triangles.
-    return np.asarray(triangles[np.random.default_rng(len(field)).permutation(kept)])
+    # The chord between two stars follows from their cosine, and the longest side from the least cosine.
+    cosine = (direction @ direction.T).ravel()
+    shortest, longest = (2.0 * max(field.half_width) * size for size in _MIDDLE_SIZES)
+    found = [triangles[:0]]
+    while len(triangles) and sum(map(len, found)) < most:
+        tried, triangles = triangles[: 2 * most], triangles[2 * most :]
+        first, second, third = tried.T
+        pairs = np.stack([first, second, third]) * len(direction) + np.stack([second, third, first])
+        chord = 2.0 - 2.0 * cosine[pairs].min(axis=0)
+        found.append(tried[(chord >= shortest**2) & (chord <= longest**2)])
+    return np.concatenate(found)[:most]
 
 
-@lru_cache(maxsize=32)
-def triples(count: int) -> IntArray:
-    """Return all triangles (t, 3) of `count` stars, sorted by the index of each triangle's faintest star."""
+@lru_cache(maxsize=64)
+def triples(count: int, shuffled: bool = False) -> IntArray:
+    """Return all triangles (t, 3) of `count` stars, sorted by the index of each triangle's faintest star.
+
+    Shuffled triangles are in a random order, which is always the same.
+    """
     first, second, third = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
     ascending = (first < second) & (second < third)
     triangles = np.stack([first[ascending], second[ascending], third[ascending]], axis=-1)
-    return np.asarray(triangles[np.lexsort(triangles.T)])
+    order = np.random.default_rng(count).permutation(len(triangles)) if shuffled else np.lexsort(triangles.T)
+    return np.asarray(triangles[order])
 
 
 def neighbours(field: StarField) -> IntArray:
@@ -180,15 +188,17 @@ class TriangleMatches:
     """Matches of observed triangles with triangles of guide stars.
 
     Attributes:
-        observed: indices of the observed stars at the corners of each match (k, 3), uint32.
-        star: indices of the guide stars at the corresponding corners (k, 3), uint32.
+        observed: indices of the observed stars at the corners of each match (k, 3), uint16.
+        star: indices of the guide stars at the corresponding corners (k, 3), uint16.
         scale: factor on the observed tangents for which both triangles of a match have equal longest sides
             (k,).
+        code: hash code of each pair of an observed star and a guide star at a similar scale (k, 3), uint32.
     """
 
-    observed: npt.NDArray[np.uint32]
-    star: npt.NDArray[np.uint32]
+    observed: npt.NDArray[np.uint16]
+    star: npt.NDArray[np.uint16]
     scale: FloatArray
+    code: npt.NDArray[np.uint32]
 
     def __len__(self) -> int:
         return len(self.scale)
@@ -202,27 +212,33 @@ class TriangleMatches:
             np.concatenate([part.observed for part in parts]),
             np.concatenate([part.star for part in parts]),
             np.concatenate([part.scale for part in parts]),
+            np.concatenate([part.code for part in parts]),
         )
 
 
 _BINS_PER_LN_SCALE = 15.0
+# Factors of a multiplicative hash, below 2^31 so that products of 32-bit numbers fit into 64 bits.
+_OF_STAR, _OF_PAIR, _OF_CODE = 1021, 257, 1_640_531_527
 
 
-def _votes(
-    observed: npt.NDArray[np.uint32], star: npt.NDArray[np.uint32], scale: FloatArray
-) -> npt.NDArray[np.intp]:
+def _codes(
+    observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16], scale: FloatArray, lowest: float
+) -> npt.NDArray[np.uint32]:
+    """Return the hash codes (k, 3) of the pairs in k matches; pairs are equal if their scale is similar."""
+    bins = (np.log(scale / lowest) * _BINS_PER_LN_SCALE).astype(np.uint32)
+    pair = star.astype(np.uint32) * np.uint32(_OF_STAR) + observed
+    return np.asarray((pair * np.uint32(_OF_PAIR) + bins[:, None]) * np.uint32(_OF_CODE))
+
+
+def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
     """Return the votes (k,) for each of k matches of triangles.
 
     The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
-    contain the pair. The votes of a match are the sum of the votes of its three pairs.
+    contain the pair. The votes of a match are the sum of the votes of its three pairs. Pairs that share the
+    first bits of their codes by chance, which is rare, only add wrong votes.
     """
-    bins = np.log(scale) * _BINS_PER_LN_SCALE
-    bins -= bins.min()
-    bits = max(13, star.size.bit_length())
-    # With this multiplicative hash, two pairs rarely share a slot, which would only add wrong votes.
-    code = (star * np.uint32(1021) + observed) * np.uint32(257)
-    code += bins.astype(np.uint32)[:, None]
-    slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
+    bits = max(13, code.size.bit_length())
+    slot = code >> np.uint32(32 - bits)
     return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot].sum(axis=1))
 
 
@@ -246,7 +262,7 @@ def look_up(
         distortion: additional error of a side ratio due to distortion of the lens.
         most: maximum number of index entries to read, in the order of the observed triangles.
     """
-    observed, star, scale, read = _look_up(
+    observed, star, scale, code, read = _look_up(
         np.ascontiguousarray(field.direction),
         np.ascontiguousarray(field.sigma),
         np.array([steps.middle, steps.lowest, steps.highest]),
@@ -257,10 +273,11 @@ def look_up(
         most,
         *sky.triangles.table,
     )
-    return TriangleMatches(observed, star, scale), read
+    return TriangleMatches(observed, star, scale, code), read
 
 
-_Found = tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], FloatArray, int]
+_Matches = tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], FloatArray, npt.NDArray[np.uint32]]
+_Found = tuple[*_Matches, int]
 
 
 def _look_up_numpy(
@@ -274,11 +291,11 @@ def _look_up_numpy(
     most: int,
     key: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
-    shape: npt.NDArray[np.uint8],
+    places: npt.NDArray[np.uint16],
     below: npt.NDArray[np.int32],
     layout: IntArray,
 ) -> _Found:
-    """Return observed stars, guide stars and scales of the matches, and the number of entries read."""
+    """Return the arrays of the `TriangleMatches`, and the number of entries read."""
     scales = steps[0]
     corners, sides, left = _forms(direction, triangles, scales)
     size = np.maximum(sides[:, 2], SIZE_UNIT)
@@ -302,11 +319,11 @@ def _look_up_numpy(
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
     near = np.ones(len(entry), dtype=np.bool_)
+    place = places[entry].view(np.uint8).reshape(-1, 2)
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
-        place = shape[:, column][entry]
         # Differences of unsigned bytes wrap around, so that positions below the lowest one fail the test.
-        near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
+        near &= place[:, column] - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
     entry = entry[chosen]
@@ -316,7 +333,8 @@ def _look_up_numpy(
     fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
     scale = longest / size[query] * scales[step[query]]
-    return corners[query].astype(np.uint32), star_of[entry].astype(np.uint32), scale, total
+    observed, star = corners[query].astype(np.uint16), star_of[entry]
+    return observed, star, scale, _codes(observed, star, scale, steps[1, 0] * (1.0 - CELL)), total
 
 
 @compiled_form_of(_look_up_numpy)
@@ -331,11 +349,12 @@ def _look_up(
     most: int,
     key: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
-    shape: npt.NDArray[np.uint8],
+    places: npt.NDArray[np.uint16],
     below: npt.NDArray[np.int32],
     layout: IntArray,
 ) -> _Found:
     cells, unit = layout[0], 1.0 / (1 << layout[2])
+    lowest = steps[1, 0] * (1.0 - 1.0 / cells)
     seen = _at_scales(direction, steps[0])
     # At most three cells of each of the two side ratios agree with a triangle of sufficient accuracy.
     runs = np.empty((9 * len(triangles) * len(seen), 7), dtype=np.int64)
@@ -360,11 +379,13 @@ def _look_up(
             )
             for run in range(count, count + added):
                 if total + runs[run, 1] - runs[run, 0] > most:
-                    return *_matching_entries(runs[:run], limits, corners, key, star_of, shape, layout), total
+                    kept = _matching_entries(runs[:run], total, limits, key, places, layout)
+                    return *_matches(*kept, limits, corners, key, star_of, layout, lowest), total
                 total += runs[run, 1] - runs[run, 0]
                 runs[run, 6] = queries
             queries, count = queries + 1, count + added
-    return *_matching_entries(runs[:count], limits, corners, key, star_of, shape, layout), total
+    kept = _matching_entries(runs[:count], total, limits, key, places, layout)
+    return *_matches(*kept, limits, corners, key, star_of, layout, lowest), total
 
 
 @loop_helper
@@ -403,46 +424,90 @@ def _add_runs(
 @loop_helper
 def _matching_entries(
     runs: IntArray,
+    total: int,
+    limits: FloatArray,
+    key: npt.NDArray[np.uint32],
+    places: npt.NDArray[np.uint16],
+    layout: IntArray,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Return the index entries (k,) among the `total` ones in `runs` that match, and their triangles (k,)."""
+    entry, query = np.empty(total + 8, dtype=np.int32), np.empty(total + 8, dtype=np.int32)
+    found, sizes, most = 0, 1 << layout[2], 0
+    for run in range(len(runs)):
+        most = max(most, runs[run, 1] - runs[run, 0])
+    # Entries are compared eight at a time, so that the comparison takes vector instructions only.
+    near = np.zeros(8 * (most // 8 + 1), dtype=np.uint8)
+    eight = near.view(np.uint64)
+    for run in range(len(runs)):
+        begin, end, low, high, lower, upper, triangle = runs[run]
+        if begin == end:
+            continue
+        # The entries of a range are in the same cells. The lengths exclude entries before and after the range.
+        form = np.int64(key[begin]) & ~(sizes - 1)
+        shortest = form + min(math.ceil(limits[triangle, 0] * sizes), sizes - 1)
+        longest = form + min(math.floor(limits[triangle, 1] * sizes), sizes - 1)
+        groups = (end - begin + 7) // 8
+        begin = max(min(begin, len(key) - 8 * groups), 0)
+        lengths = key[begin : begin + 8 * groups]
+        if len(lengths) < 8 * groups:
+            near[:] = 0
+        _mark(
+            near[: len(lengths)],
+            lengths,
+            places[begin : begin + 8 * groups],
+            (np.uint32(shortest), np.uint32(longest)),
+            (np.uint8(low), np.uint8(high)),
+            (np.uint8(lower), np.uint8(upper)),
+        )
+        for group in range(groups):
+            if eight[group]:
+                for k in range(8 * group, 8 * group + 8):
+                    entry[found], query[found] = begin + k, triangle
+                    found += int(near[k])
+    return entry[:found], query[:found]
+
+
+@loop_helper
+def _mark(
+    near: npt.NDArray[np.uint8],
+    lengths: npt.NDArray[np.uint32],
+    places: npt.NDArray[np.uint16],
+    length: tuple[np.uint32, np.uint32],
+    short: tuple[np.uint8, np.uint8],
+    middle: tuple[np.uint8, np.uint8],
+) -> None:
+    """Write 1 to `near` (k,) for index entries between the limits of key and places, and 0 for others."""
+    for k in range(len(near)):
+        one, two = np.uint8(places[k] & 0xFF), np.uint8(places[k] >> 8)
+        fits = (lengths[k] >= length[0]) & (lengths[k] <= length[1])
+        fits &= (one >= short[0]) & (one <= short[1]) & (two >= middle[0]) & (two <= middle[1])
+        near[k] = np.uint8(fits)
+
+
+@loop_helper
+def _matches(
+    entry: npt.NDArray[np.int32],
+    query: npt.NDArray[np.int32],
     limits: FloatArray,
     corners: IntArray,
     key: npt.NDArray[np.uint32],
     star_of: npt.NDArray[np.uint16],
-    shape: npt.NDArray[np.uint8],
     layout: IntArray,
-) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32], FloatArray]:
-    """Return observed stars, guide stars and scales of the entries in `runs` that match their triangle."""
-    observed, star = np.empty((256, 3), dtype=np.uint32), np.empty((256, 3), dtype=np.uint32)
-    scale, found, sizes = np.empty(256), 0, 1 << layout[2]
-    longest_run = 0
-    for run in range(len(runs)):
-        longest_run = max(longest_run, runs[run, 1] - runs[run, 0])
-    near = np.empty(longest_run + 1, dtype=np.int64)
-    for run in range(len(runs)):
-        begin, end, low, high, lower, upper, query = runs[run]
-        shortest, longest = math.ceil(limits[query, 0] * sizes), math.floor(limits[query, 1] * sizes)
-        # The entries of a range are in the same cells, and are sorted by the longest side.
-        form = np.int64(key[begin]) & ~(sizes - 1) if begin < end else 0
-        while begin < end and key[begin] < form + shortest:
-            begin += 1
-        while begin < end and key[end - 1] > form + longest:
-            end -= 1
-        places, count = shape[begin:end], 0
-        # Without branches, which the processor cannot predict here, the loop takes a fraction of the time.
-        for k in range(len(places)):
-            one, two = np.int64(places[k, 0]), np.int64(places[k, 1])
-            near[count] = begin + k
-            count += int((one >= low) & (one <= high) & (two >= lower) & (two <= upper))
-        for at in range(count):
-            k = near[at]
-            if found == len(scale):
-                observed = np.concatenate((observed, np.empty_like(observed)))
-                star = np.concatenate((star, np.empty_like(star)))
-                scale = np.concatenate((scale, np.empty_like(scale)))
-            for c in range(3):
-                observed[found, c], star[found, c] = corners[query, c], star_of[k, c]
-            scale[found] = float(np.int64(key[k]) & (sizes - 1)) / sizes * limits[query, 2]
-            found += 1
-    return observed[:found].copy(), star[:found].copy(), scale[:found].copy()
+    lowest: float,
+) -> _Matches:
+    """Return the arrays of the `TriangleMatches` for k index entries that match the triangles `query`."""
+    observed, star = np.empty((len(entry), 3), dtype=np.uint16), np.empty((len(entry), 3), dtype=np.uint16)
+    scale, code = np.empty(len(entry)), np.empty((len(entry), 3), dtype=np.uint32)
+    sizes = 1 << layout[2]
+    for k in range(len(entry)):
+        one, two = entry[k], query[k]
+        scale[k] = float(np.int64(key[one]) & (sizes - 1)) / sizes * limits[two, 2]
+        part = int(math.log(scale[k] / lowest) * _BINS_PER_LN_SCALE)
+        for c in range(3):
+            observed[k, c], star[k, c] = corners[two, c], star_of[one, c]
+            pair = np.int64(star_of[one, c]) * _OF_STAR + corners[two, c]
+            code[k, c] = ((pair * _OF_PAIR + part) & 0xFFFFFFFF) * _OF_CODE & 0xFFFFFFFF
+    return observed, star, scale, code
 
 
 @loop_helper
@@ -666,6 +731,7 @@ def _candidates(
         finds.observed,
         finds.star,
         finds.scale,
+        finds.code,
         tried,
         most,
         *observed.scale,
@@ -675,16 +741,17 @@ def _candidates(
 def _choose_numpy(
     direction: FloatArray,
     guide: FloatArray,
-    observed: npt.NDArray[np.uint32],
-    star: npt.NDArray[np.uint32],
+    observed: npt.NDArray[np.uint16],
+    star: npt.NDArray[np.uint16],
     scale: FloatArray,
+    code: npt.NDArray[np.uint32],
     tried: IntArray,
     most: int,
     lowest: float,
     highest: float,
 ) -> _Chosen:
     """Return matrices and scales of the candidates, and the extended list of tried pairs."""
-    votes = _votes(observed, star, scale)
+    votes = _votes(code)
     # There may be a hundred thousand matches, so only the matches with the most votes are sorted.
     count = min(_RANKED * most, len(votes))
     least = np.partition(votes, len(votes) - count)[len(votes) - count]
@@ -712,15 +779,16 @@ def _choose_numpy(
 def _choose(
     direction: FloatArray,
     guide: FloatArray,
-    observed: npt.NDArray[np.uint32],
-    star: npt.NDArray[np.uint32],
+    observed: npt.NDArray[np.uint16],
+    star: npt.NDArray[np.uint16],
     scale: FloatArray,
+    code: npt.NDArray[np.uint32],
     tried: IntArray,
     most: int,
     lowest: float,
     highest: float,
 ) -> _Chosen:
-    votes = _counted_votes(observed, star, scale)
+    votes = _counted_votes(code)
     order = _most_voted(votes, min(_RANKED * most, len(votes)))
     pairs = np.empty((len(tried) + 3 * most, 2), dtype=np.int64)
     pairs[: len(tried)] = tried
@@ -758,7 +826,7 @@ def _choose(
 
 
 @loop_helper
-def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint32], star: npt.NDArray[np.uint32]) -> int:
+def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16]) -> int:
     """Return how many corners of a match, (3,) and (3,), are among the pairs (k, 2)."""
     shared = 0
     for c in range(3):
@@ -770,32 +838,23 @@ def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint32], star: npt.N
 
 
 @loop_helper
-def _counted_votes(
-    observed: npt.NDArray[np.uint32], star: npt.NDArray[np.uint32], scale: FloatArray
-) -> IntArray:
+def _counted_votes(code: npt.NDArray[np.uint32]) -> IntArray:
     """Return the votes (k,) that `_votes` returns."""
-    least = scale[0]
-    for k in range(len(scale)):
-        least = min(least, scale[k])
-    least = math.log(least) * _BINS_PER_LN_SCALE
-    bits, size = 0, 3 * len(scale)
+    bits, size = 0, 3 * len(code)
     while size:
         size >>= 1
         bits += 1
     bits = max(13, bits)
+    unused = 32 - bits
     count = np.zeros(1 << bits, dtype=np.int32)
-    slot = np.empty((len(scale), 3), dtype=np.int32)
-    for k in range(len(scale)):
-        part = int(math.log(scale[k]) * _BINS_PER_LN_SCALE - least)
+    for k in range(len(code)):
         for c in range(3):
-            code = (np.int64(star[k, c]) * 1021 + np.int64(observed[k, c])) * 257 + part
-            # The product modulo 2^32, computed in two parts that 64-bit integers can hold.
-            high = ((code >> 16) & 0xFFFF) * 2654435761 & 0xFFFF
-            slot[k, c] = ((code & 0xFFFF) * 2654435761 + (high << 16) & 0xFFFFFFFF) >> (32 - bits)
-            count[slot[k, c]] += 1
-    votes = np.empty(len(scale), dtype=np.int64)
-    for k in range(len(scale)):
-        votes[k] = np.int64(count[slot[k, 0]]) + count[slot[k, 1]] + count[slot[k, 2]]
+            count[np.int64(code[k, c]) >> unused] += 1
+    votes = np.empty(len(code), dtype=np.int64)
+    for k in range(len(code)):
+        votes[k] = 0
+        for c in range(3):
+            votes[k] += count[np.int64(code[k, c]) >> unused]
     return votes
 
 

@@ -258,12 +258,14 @@ class TriangleIndex:
 
     @cached_property
     def table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The arrays `key`, `corners`, `shape` and `below`, contiguous and read-only, and the layout of keys.
+        """The arrays `key`, `corners`, places and `below`, contiguous and read-only, and the layout of keys.
 
-        The layout (4,) is `CELLS`, `FINE`, `SIZE_BITS` and `RUN_BITS`.
+        The places (m,), uint16, have the two columns of `shape` in their low and high bytes. The layout (4,)
+        is `CELLS`, `FINE`, `SIZE_BITS` and `RUN_BITS`.
         """
         layout = np.array([CELLS, FINE, SIZE_BITS, RUN_BITS])
-        given = self.key, self.corners, self.shape, self.below, layout
+        places = np.ascontiguousarray(self.shape).view("<u2").ravel()
+        given = self.key, self.corners, places, self.below, layout
         arrays = [np.ascontiguousarray(array).view() for array in given]
         for array in arrays:
             array.flags.writeable = False

@@ -280,11 +280,11 @@ def test_all_forms_find_the_same_matches_and_candidates_in_the_same_order(
         *SKY.triangles.table,
     )
     assert_forms_agree(_look_up, *looked_up)
-    observed, star, scale, read = _look_up.numpy_form(*looked_up)
+    *matches, read = _look_up.numpy_form(*looked_up)
     assert 0 < read <= most
-    tried = np.stack([observed[0], star[0]], axis=1).astype(np.int64)
+    tried = np.stack([matches[0][0], matches[1][0]], axis=1).astype(np.int64)
     for known in (tried[:0], tried):
-        chosen = (field.direction, SKY.stars.direction, observed, star, scale, known, 12, *field.scale)
+        chosen = (field.direction, SKY.stars.direction, *matches, known, 12, *field.scale)
         assert_forms_agree(_choose, *chosen)
         assert len(_choose.numpy_form(*chosen)[1]) > 0
 
