@@ -93,11 +93,11 @@ def batches_of(
 def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
     """Return batches of triangles (t, 3) of many stars.
 
-    The last batch includes triangles of neighbouring stars, for points that are not sorted by brightness. The
-    mirrored field has the same batches.
+    For points that are not sorted by brightness, or too many for triangles of all, the last batch includes
+    triangles of neighbouring stars. The mirrored field has the same batches.
     """
     batches = np.split(middle_sized(field, sum(sizes.spread)), np.cumsum(sizes.spread)[:-1])
-    if len(field) > _BRIGHTEST:
+    if len(field) > (_BRIGHTEST if field.magnitude is None else _MOST_STARS):
         batches[-1] = np.concatenate([batches[-1], neighbours(field)])
     return batches
 

@@ -526,7 +526,12 @@ def _first_match(
 ) -> _Found:
     given, observed = len(expected) > 0, len(direction)
     seen, nearest, squared = np.empty((observed, 3)), np.empty(observed, dtype=np.int64), np.empty(observed)
-    most = _most_stars(observed)
+    most, widest = _most_stars(observed), 0.0
+    for gate in gates:
+        widest = max(widest, gate)
+    tangent = direction[:, 0] / direction[:, 2]
+    order = np.argsort(tangent, kind="mergesort")
+    tangent = tangent[order]
     for number in range(len(scales)):
         scale = scales[number]
         if not given:
@@ -536,10 +541,13 @@ def _first_match(
         if len(expected) < least:
             continue
         _stretch(direction, scale, seen)
-        _pair(seen, sigma, scale, matrices[number], guide, expected, nearest, squared)
-        mean = 0.0
+        mean, reach = 0.0, 0.0
         for k in range(observed):
             mean += (sigma[k] * scale) ** 2 / observed
+            reach = max(reach, widest * sigma[k] * scale)
+        _pair(
+            seen, sigma, scale, matrices[number], guide, expected, order, tangent, reach, nearest, squared
+        )
         area = 4.0 * across * down * scale * scale
         gate, bound = _best_gate(
             squared, nearest, gates, least, enough, mean / area, 4.0 * math.pi / area * searched, ln_scales
@@ -644,22 +652,31 @@ def _pair(
     matrix: FloatArray,
     guide: FloatArray,
     expected: IntArray,
+    order: IntArray,
+    tangent: FloatArray,
+    reach: float,
     nearest: IntArray,
     squared: FloatArray,
 ) -> None:
     """Write the nearest expected star of each observed star and its squared distance in standard deviations.
 
-    The distance is infinite for an observed star that is not the nearest one of its nearest expected star.
+    The distance is infinite for an observed star that is not the nearest one of its nearest expected star,
+    and for one farther than the chord `reach` from every expected star. The `tangent` (n,), at scale 1, of
+    the observed stars along the first axis ascends in the given `order`.
     """
-    closest, owner = np.full(len(seen), -2.0), np.zeros(len(expected), dtype=np.int64)
+    closest, owner = np.full(len(seen), -2.0), np.full(len(expected), -1)
     nearest[:] = 0
+    strip = _widest_difference(seen, reach) / scale
     for e in range(len(expected)):
         gx, gy, gz = guide[expected[e], 0], guide[expected[e], 1], guide[expected[e], 2]
         x = matrix[0, 0] * gx + matrix[0, 1] * gy + matrix[0, 2] * gz
         y = matrix[1, 0] * gx + matrix[1, 1] * gy + matrix[1, 2] * gz
         z = matrix[2, 0] * gx + matrix[2, 1] * gy + matrix[2, 2] * gz
-        best = -2.0
-        for k in range(len(seen)):
+        middle, best = x / (z * scale), -2.0
+        for at in range(np.searchsorted(tangent, middle - strip), len(tangent)):
+            if tangent[at] > middle + strip:
+                break
+            k = order[at]
             cosine = seen[k, 0] * x + seen[k, 1] * y + seen[k, 2] * z
             if cosine > closest[k]:
                 closest[k], nearest[k] = cosine, e
@@ -669,6 +686,21 @@ def _pair(
         squared[k] = 2.0 * (1.0 - closest[k]) / (sigma[k] * scale) ** 2
         if owner[nearest[k]] != k:
             squared[k] = math.inf
+
+
+@loop_helper
+def _widest_difference(seen: FloatArray, reach: float) -> float:
+    """Return a bound of the difference of tangents of two stars, one of `seen` (n, 3), a chord `reach` apart.
+
+    A gnomonic image is enlarged by at most 1 + t^2 between two stars, where t is the larger field angle's
+    tangent.
+    """
+    lowest = 1.0
+    for k in range(len(seen)):
+        lowest = min(lowest, seen[k, 2])
+    apart = 2.0 * math.asin(min(0.5 * reach, 1.0))
+    farthest = math.acos(max(lowest, -1.0)) + apart
+    return apart / math.cos(farthest) ** 2 if farthest < 1.5 else math.inf
 
 
 @loop_helper
