@@ -442,7 +442,7 @@ def _matching_entries(
         begin, end, low, high, lower, upper, triangle = runs[run]
         if begin == end:
             continue
-        # The entries of a range are in the same cells. The lengths exclude entries before and after the range.
+        # The entries of a range are in the same cells. Entries before and after the range fail by length.
         form = np.int64(key[begin]) & ~(sizes - 1)
         shortest = form + min(math.ceil(limits[triangle, 0] * sizes), sizes - 1)
         longest = form + min(math.floor(limits[triangle, 1] * sizes), sizes - 1)

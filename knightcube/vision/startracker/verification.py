@@ -545,9 +545,7 @@ def _first_match(
         for k in range(observed):
             mean += (sigma[k] * scale) ** 2 / observed
             reach = max(reach, widest * sigma[k] * scale)
-        _pair(
-            seen, sigma, scale, matrices[number], guide, expected, order, tangent, reach, nearest, squared
-        )
+        _pair(seen, sigma, scale, matrices[number], guide, expected, order, tangent, reach, nearest, squared)
         area = 4.0 * across * down * scale * scale
         gate, bound = _best_gate(
             squared, nearest, gates, least, enough, mean / area, 4.0 * math.pi / area * searched, ln_scales
