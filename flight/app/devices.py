@@ -247,7 +247,7 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
         driver_of("coils", config.coils).off(config.coils),
     )
     if not off:
-        raise ConfigError("coils.driver", "registers no writes (`off`) by which the guardian stops the coils")
+        raise ConfigError("coils.driver", "gives no I2C writes (`off`) for the guardian to stop the coils")
     bus = rig.wires.i2c()
     with suppress(DeviceError) if patient else nullcontext():
         for write in off:

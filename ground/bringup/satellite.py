@@ -99,7 +99,7 @@ def _monitor_faults(key: str, power: Power, rest: PowerReading, driven: PowerRea
         text = f"its current falls by {-1e3 * rise:.0f} mA when a coil is driven"
         return [Finding(key, "reversed", text, "exchange the two wires at its shunt")]
     if rise < 0.01:
-        text = f"its current changes by {1e3 * rise:.0f} mA only when a coil is driven"
+        text = f"its current hardly changes when a coil is driven: by {1e3 * rise:.0f} mA"
         return [Finding(key, "no current", text, "wire its shunt into the line of the battery or of the bus")]
     return []
 
@@ -200,7 +200,7 @@ def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
     """Return the faults that time, position and velocity of valid fixes show."""
     utc, positions = np.array([one.utc_ns for one in fixes]), np.array([one.position for one in fixes])
     if len(fixes) > 2 and (np.diff(utc) == 0).mean() > 0.5:
-        text = f"it repeats the fix of one time, {len(fixes)} times"
+        text = f"its time does not advance in {len(fixes)} fixes"
         return [Finding("gps", "stuck", text, "switch it off and on; replace it if the fix stays")]
     findings = []
     if abs(offset) > _CLOCK_S:

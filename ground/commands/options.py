@@ -59,7 +59,7 @@ def check_size(path: Path, pixels: Image) -> None:
     """Raise UsageError for a picture that is too small to be analysed."""
     rows, columns = pixels.shape
     if min(rows, columns) < LEAST_SIDE:
-        raise UsageError(f"{path}: {columns} x {rows} pixels: give {LEAST_SIDE} or more each way")
+        raise UsageError(f"{path}: {columns} x {rows} pixels: give {LEAST_SIDE} or more per side")
 
 
 def raw_shape(text: str) -> tuple[int, int, int]:

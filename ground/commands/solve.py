@@ -65,7 +65,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of the field)"
     )
     parser.add_argument(
-        "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
+        "--exposure",
+        type=positive,
+        metavar="S",
+        help="exposure time, needed for the angular rate from streaks",
     )
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(

@@ -259,7 +259,7 @@ class PointingTargets:
         Raises UsageError if the command gives a q2, as for the testbed.
         """
         if not isinstance(wanted, PointingTarget):
-            raise UsageError("a satellite accepts a pointing goal, not a q2")
+            raise UsageError("a satellite needs a pointing goal; a target q2 is for the testbed")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
             raise UsageError("no star camera searches for objects: add `camera: {objects: {}}`")
         return Target(COMMANDED + number, PointingTargetLaw(wanted, self._paths))

@@ -101,7 +101,7 @@ def test_a_picture_too_small_to_show_anything_is_refused(
     name, *options = words.split()
     done = command(name, path, *options)
     assert done.returncode == 2
-    assert done.stderr == f"knightcube: {path}: {shape[1]} x {shape[0]} pixels: give 16 or more each way\n"
+    assert done.stderr == f"knightcube: {path}: {shape[1]} x {shape[0]} pixels: give 16 or more per side\n"
 
 
 @pytest.mark.parametrize("method", ["likelihood", "harris"])

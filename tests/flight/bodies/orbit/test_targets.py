@@ -33,7 +33,7 @@ def test_a_commanded_direction_is_a_target_with_the_command_s_number() -> None:
 
 
 def test_a_satellite_refuses_a_q2_and_an_object_without_a_camera_that_searches() -> None:
-    with pytest.raises(UsageError, match="not a q2"):
+    with pytest.raises(UsageError, match="q2 is for the testbed"):
         targets().commanded(0.3, 1)
     with pytest.raises(UsageError, match="no star camera"):
         targets().commanded(OBJECT, 1)
