@@ -4,12 +4,13 @@
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
-The names exported here are the public interface. The modules below `knightcube` can also be imported, but
-they may change with any release. The package `knightcube` needs neither a clock nor a configuration file, a
-device or a socket.
+The names exported here are the public interface. The submodules of `knightcube` can also be imported, but
+their interfaces may change with any release. The package `knightcube` uses no clock, configuration file,
+device or socket.
 
 Each name is imported at its first use, so that `import knightcube` takes almost no time. A new name must be
-added to both lists below: the first is for type checkers and editors, the second for the interpreter.
+added both to the imports below, which are for type checkers and editors, and to the table `_MODULE_OF`, which
+is for the interpreter.
 """
 
 from __future__ import annotations
@@ -80,11 +81,11 @@ _MODULE_OF = {
 __all__ = list(_MODULE_OF)
 
 _EXTRA_OF = {"erfa": "orbit", "nlopt": "vmc", "pygeomag": "orbit", "sgp4": "orbit"}
-"""Optional packages, each with the extra of this distribution that installs it."""
+"""Names of optional packages, and for each the optional dependency group of KnightCube that installs it."""
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name of the package, which is imported now.
+    """Import and return the public object called `name`.
 
     Raises AttributeError for an unknown name. Raises ImportError, with the command that installs the package,
     if an optional package is missing.
@@ -105,5 +106,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names of the module, including those that are not imported yet."""
+    """Return the names of the module, including public names that are not imported yet."""
     return sorted({*globals(), *_MODULE_OF})

@@ -1,8 +1,9 @@
-"""Machine code for hot functions, by numba where it is installed.
+"""Compiled forms of frequently executed functions, which numba generates where it is installed.
 
-A hot function has two forms that return the same values up to rounding. The numpy form is the reference, and
-works everywhere. The loop form is plain Python with loops over elements, which numba compiles at its first
-call. `@compiled_form_of(numpy_form)` joins the two:
+Each such function has a numpy form and a loop form, which return the same values up to rounding. The numpy
+form is the reference, and also works without numba. The loop form is plain Python with loops over elements,
+which numba compiles at its first call. The decorator `@compiled_form_of(numpy_form)` combines the loop form
+with the numpy form:
 
     @compiled_form_of(sum_of_squares_numpy)
     def sum_of_squares(values: FloatArray) -> float:
@@ -12,8 +13,8 @@ call. `@compiled_form_of(numpy_form)` joins the two:
         return total
 
 `pip install knightcube[fast]` installs numba. The environment variable KNIGHTCUBE_COMPILED=0 selects the
-numpy forms although numba is installed; so does `use_numpy_forms()`, which the control loop of a flight in
-real time calls, because the first call of a compiled form takes some seconds.
+numpy forms even if numba is installed. The function `use_numpy_forms` also selects the numpy forms; the
+control loop calls it in a real-time flight, because the first call of a compiled form takes some seconds.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ Result = TypeVar("Result")
 
 _SWITCH = "KNIGHTCUBE_COMPILED"
 _ANY_ORDER = {"reassoc", "contract", "nsz"}
-"""Options of LLVM for helpers: sums may be computed in any order, which lets them use vector instructions."""
+"""LLVM options for helpers: sums may be computed in any order, which permits vector instructions."""
 _COMPILING = (
     "numba compiles the star tracker and the streak fit for this machine; this takes up to a minute, once "
     f"({_SWITCH}=0 avoids it)"
@@ -53,15 +54,15 @@ class HotFunction(Generic[Parameters, Result]):
         self._refusals: tuple[type[Exception], ...] = ()
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        """Return the result of the compiled form, or of the numpy form where that is in use.
+        """Return the result of the compiled form, or of the numpy form if compiled forms are switched off.
 
-        The numpy form is also used for arguments that numba does not know, such as big-endian arrays, and if
-        the file of the machine code is damaged or cannot be written.
+        The numpy form is also used for argument types that numba does not support, such as big-endian arrays,
+        and if the cache file of the compiled form is damaged or cannot be written.
         """
         chosen = self._chosen or self._choose()
         try:
             return chosen(*args, **kwargs)
-        except self._refusals:  # raised before the machine code runs
+        except self._refusals:  # raised before the compiled form runs
             return self.numpy_form(*args, **kwargs)
 
     def _choose(self) -> Callable[Parameters, Result]:
@@ -75,7 +76,7 @@ class HotFunction(Generic[Parameters, Result]):
     def compiled_form(self) -> Callable[Parameters, Result]:
         """Return the loop form as a function that numba compiles and, if possible, stores in a file.
 
-        Raises ImportError if numba is not installed, or does not fit the installed numpy.
+        Raises ImportError if numba is not installed, or does not support the installed numpy version.
         """
         numba = importlib.import_module("numba")
         _announce_compilation()
@@ -83,18 +84,19 @@ class HotFunction(Generic[Parameters, Result]):
             numba.extending.register_jitable(error_model="numpy", fastmath=_ANY_ORDER)(_helpers.pop())
         try:
             return _typed(numba.njit(cache=True, error_model="numpy")(self.loop_form))
-        except RuntimeError:  # no folder for the file can be written
+        except RuntimeError:  # no cache folder is writable
             return _typed(numba.njit(error_model="numpy")(self.loop_form))
 
 
 def compiled_form_of(
     numpy_form: Callable[Parameters, Result],
 ) -> Callable[[Callable[Parameters, Result]], HotFunction[Parameters, Result]]:
-    """Return the decorator that joins a loop form to its numpy form.
+    """Return the decorator that combines a loop form with its numpy form.
 
-    The loop form takes arrays and numbers by position. It calls only functions of numpy that numba knows, and
-    functions of its own module that `loop_helper` decorates, and uses no constants of other modules: the kept
-    machine code is made again when this module changes, and not when another one does.
+    The loop form has only positional arguments, which are arrays and numbers. It may call only numpy
+    functions that numba supports, and functions of the same module that `loop_helper` decorates. It must not
+    use constants of other modules, because numba renews the cached compiled form only if the module of the
+    loop form changes.
     """
     return lambda loop_form: HotFunction(numpy_form, loop_form)
 
@@ -102,7 +104,7 @@ def compiled_form_of(
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Decorate a function that loop forms of the same module call, and return it unchanged.
 
-    The machine code of a helper may compute sums in any order.
+    The compiled form of a helper may compute sums in any order.
     """
     _helpers.append(function)
     return function
@@ -115,7 +117,7 @@ def in_use() -> bool:
 
 @functools.cache
 def _numba_is_usable() -> bool:
-    """Import numba, and return False if it is not installed or does not fit the installed numpy."""
+    """Import numba, and return whether it is installed and supports the installed numpy version."""
     try:
         importlib.import_module("numba")
     except ImportError:
@@ -125,7 +127,7 @@ def _numba_is_usable() -> bool:
 
 @functools.cache
 def _announce_compilation() -> None:
-    """Make the first compilation of this process log a warning; code that is read from a file needs none."""
+    """Log a warning at the first compilation of this process; functions read from the cache need none."""
     event = importlib.import_module("numba.core.event")
 
     class FirstCompilation(event.Listener):  # type: ignore[misc, name-defined]  # numba has no types
@@ -140,7 +142,7 @@ def _announce_compilation() -> None:
 
 
 def use_numpy_forms() -> None:
-    """Make this process, and those that it starts, use numpy forms for all functions not yet called."""
+    """Make this process and its child processes use the numpy form of each function not yet called."""
     os.environ[_SWITCH] = "0"
 
 

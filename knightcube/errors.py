@@ -1,4 +1,4 @@
-"""Exceptions of the library and the flight application. Each exception has its details as attributes."""
+"""Exceptions of the library and the flight application. Attributes of each exception contain the details."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ class FlightError(Exception):
 
 
 class UsageError(FlightError):
-    """A mistake of the user, such as a file that is not a picture.
+    """Error made by the user, such as a file that is not an image.
 
-    The message names the mistake and its cure in one line. A command prints the message without a traceback
+    The message states the error and its remedy in one line. A command prints the message without a traceback
     and ends with status 2.
     """
 
 
 class InputError(UsageError):
-    """A file, or a value in a file, that cannot be used.
+    """Error raised for a file, or a value in a file, that cannot be used.
 
     Attributes:
         where: path of the file, or dotted name of the configuration value.
-        problem: description of the fault and its remedy.
+        problem: description of the error and its remedy.
     """
 
     def __init__(self, where: str, problem: str) -> None:

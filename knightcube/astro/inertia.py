@@ -16,8 +16,8 @@ _ROUNDING = 1e-6
 def principal_axes(inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the principal moments (3,), kg m^2, and the rotation (3, 3) from body axes to principal axes.
 
-    The principal axes are numbered and directed so that the rotation angle is as small as possible. A
-    diagonal tensor has the identity as its rotation.
+    The principal axes are numbered and directed so that the rotation angle is as small as possible. For a
+    diagonal tensor, the rotation is the identity.
 
     Args:
         inertia: (3, 3) symmetric inertia tensor in body axes, kg m^2.
@@ -35,7 +35,7 @@ def principal_axes(inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def inertia_problem(inertia: FloatArray) -> str:
-    """Return why no body can have an inertia tensor (3, 3), kg m^2, with the remedy, or an empty text."""
+    """Return why an inertia tensor (3, 3), kg m^2, is impossible, with the remedy; empty for a valid one."""
     scale = float(np.abs(inertia).max())
     for row, column in ((0, 1), (0, 2), (1, 2)):
         above, below = float(inertia[row, column]), float(inertia[column, row])

@@ -11,8 +11,8 @@ testbed frame T points down along the suspension thread, and the magnetic field 
 north is the direction of the field, so that N = -z, D = y and E = D x N = -x, and v_T = [[0, -1, 0], [0, 0,
 1], [-1, 0, 0]] v_NED.
 
-The functions from `compose` on implement the same algebra with tuples of floats for the control cycle,
-because a numpy call on three or four numbers takes ten times as long as plain arithmetic.
+The function `compose` and the functions after it implement the same algebra with tuples of floats for the
+control cycle, because a numpy call on three or four numbers takes ten times as long as plain arithmetic.
 """
 
 from __future__ import annotations

@@ -6,11 +6,12 @@ are the starts and b the ends of star streaks, A is the rotation during the expo
 the rotation vector divided by the exposure time, with the sign convention v' = -omega x v (Sease, eq.
 4.8-4.10, corrected).
 
-The function `solve` computes attitudes with any rotation angle. A sequential rotation, based on the TRIAD
-attitude, limits the angle to 120 deg and |g| to 1.74. An error e of the observed direction b enters the
-equation of OLAE as (1 + [g x]) e, which is larger than e by a factor of up to sqrt(1 + g^2) and anisotropic.
-The weights 1/sigma^2 are therefore not optimal. The OLAE attitude differs from the solution of Wahba's
-problem by an angle of the order of the noise. The returned covariance is that of the OLAE attitude.
+The function `solve` computes attitudes with any rotation angle. The reference frame is first rotated by 180
+deg about an axis chosen from the TRIAD attitude, which limits the remaining rotation angle to 120 deg and |g|
+to 1.74. An error e of the observed direction b enters the equation of OLAE as (1 + [g x]) e, which is larger
+than e by a factor of up to sqrt(1 + g^2) and anisotropic. The weights 1/sigma^2 are therefore not optimal.
+The OLAE attitude differs from the solution of Wahba's problem by an angle of the order of the noise. The
+returned covariance is that of the OLAE attitude.
 
 Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, Journal of Guidance, Control, and
 Dynamics 30 (2007).

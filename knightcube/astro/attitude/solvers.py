@@ -86,7 +86,7 @@ _MAXIMUM_STEPS = 100
 _MINIMUM_SLOPE = 1e-13
 """Minimum product of the three differences between the largest eigenvalue of Davenport's K and the others.
 
-In a narrow field of view, two of the three differences are of the order of one.
+In a narrow field of view, two of the three eigenvalue differences are of the order of one.
 """
 
 

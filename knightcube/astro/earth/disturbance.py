@@ -3,11 +3,11 @@
 The directions of the air flow and of the sunlight follow from the orbit. The magnitudes of all torques are
 estimated in flight. The atmosphere rotates with the Earth, and its density in the diurnal bulge is four times
 the density at night (Montenbruck & Gill 2000, section 3.5.2: cos^4 of half the angle from an apex 30 deg
-behind the Sun). Each torque by air or sunlight is the cross product c x d of a body vector c and a pressure
-vector d. The body vector c (N m) is constant: the force multiplied by the lever arm of the centre of
-pressure. The pressure vector d is the direction of the pressure in body axes, multiplied by relative strength
-and exposed area. The exposed areas are those of a homogeneous box with the moments of inertia of the body.
-Disturbance torques other than those by air and sunlight are represented by a constant torque in body axes.
+behind the Sun). The aerodynamic torque and the solar radiation torque are each the cross product c x d of a
+body vector c and a pressure vector d. The body vector c (N m) is constant: the force multiplied by the lever
+arm of the centre of pressure. The pressure vector d is the direction of the pressure in body axes, multiplied
+by relative strength and exposed area. The exposed areas are those of a homogeneous box with the moments of
+inertia of the body. All other disturbance torques are represented by a constant torque in body axes.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from knightcube.astro.earth.orientation import ROTATION_RATE
 
 CONSTANT, AIR, LIGHT = slice(0, 3), slice(3, 6), slice(6, 9)
 SIZES = 9
-"""Number of estimated torque components (N m): three each for the constant torque, air and sunlight."""
+"""Number of torque components (N m): three each of the constant, aerodynamic and solar radiation torque."""
 _NIGHT, _DAY = 0.4, 1.6
-"""Relative density of the air at night and in the diurnal bulge."""
+"""Air density at night (first value) and in the diurnal bulge (second value), relative to the mean."""
 _LAG = math.radians(30.0)
 """Angle (rad) by which the diurnal bulge lags behind the Sun."""
 _THINNEST = 0.02
-"""Minimum squared side length of the box, relative to 12 times the largest moment of inertia per mass."""
+"""Minimum squared side length of the box, divided by 12 times the largest moment of inertia per mass."""
 _HEIGHT, _SCALE_HEIGHT = EARTH_RADIUS + 500e3, 65e3
 """Geocentric distance (m) at which the relative air density is one, and scale height (m) of the air."""
 
@@ -48,11 +48,11 @@ class Pressures:
     light: FloatArray
 
     def until(self, count: int) -> Pressures:
-        """Return the pressures at the first `count` times."""
+        """Return the pressure vectors at the first `count` times."""
         return Pressures(self.air[:count], self.light[:count])
 
     def facing(self, areas: FloatArray, to_body: FloatArray) -> Pressures:
-        """Return the pressures multiplied by the exposed area of a box.
+        """Return the pressure vectors multiplied by the exposed area of a box.
 
         Args:
             areas: (3,) relative areas of the faces of the box.
@@ -66,7 +66,7 @@ class Pressures:
 
 
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
-    """Return the pressures along an orbit.
+    """Return the pressure vectors of air and sunlight along an orbit.
 
     The relative strength of the air pressure is about one at an altitude of 500 km, and that of the sunlight
     is one in full sunlight.
@@ -92,7 +92,7 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
 
 
 def mean_density(distance: float) -> float:
-    """Return the relative air density at a geocentric distance (m), mean of day and night; one at 500 km."""
+    """Return the mean air density of day and night at a geocentric distance (m), relative to 500 km."""
     return math.exp((_HEIGHT - distance) / _SCALE_HEIGHT)
 
 

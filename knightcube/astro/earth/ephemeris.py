@@ -6,8 +6,8 @@ s, the interpolation errors are 1 mm and 3 nT.
 
 The class `FieldAhead` predicts the geomagnetic field up to an hour ahead within the control loop. Because the
 full model takes 0.2 ms for a single time, each call adds only a few nodes at intervals of one minute, between
-which the field is interpolated linearly. Beyond the last node a dipole model is used, whose field direction
-has an error of 9 deg RMS.
+which the field is interpolated linearly. For times after the last node a dipole model is used, whose field
+direction has an RMS error of 9 deg.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ Between two nodes the field rotates by 8 deg, and the linearly interpolated fiel
 NODES_PER_CALL = 5
 """Maximum number of nodes that one call adds to the field prediction."""
 LARGEST_JUMP = 50e3
-"""Change (m) of the known orbit above which all nodes are discarded, for example after a clock error."""
+"""Change (m) of the satellite's position above which all nodes are discarded, as after a clock error."""
 
 
 def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) -> FloatArray:
@@ -177,7 +177,7 @@ def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) 
     along = np.einsum("ni,ni->n", dipole, direction)[:, None]
     found = np.asarray((_REFERENCE_RADIUS / distance) ** 3 * (3.0 * along * direction - dipole))
     first = found[0]
-    across = np.cross(field, first)  # axis of the rotation of `first` into `field`
+    across = np.cross(field, first)  # rotation axis from `first` to `field`
     length = float(np.linalg.norm(across))
     weight = np.exp(-times / _CORRECTION_TIME)[:, None]
     angle_off = math.atan2(length, float(first @ field))
@@ -226,7 +226,7 @@ class FieldAhead:
         return NODE_STEP * (len(self._fields) - 1)
 
     def _restart(self, state: OrbitState) -> float:
-        """Discard past nodes, or all nodes if the known orbit has changed.
+        """Discard past nodes, or all nodes if the satellite's position is not on the predicted orbit.
 
         Returns the time (s) since the first node.
         """

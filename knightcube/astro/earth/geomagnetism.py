@@ -28,13 +28,13 @@ from knightcube.errors import FlightError
 FIRST_YEAR, LAST_YEAR = 2025.0, 2030.0
 DEGREE = 12
 _NEAR_POLE = 0.5 * math.pi - 1e-6
-"""Largest latitude (rad) of the common expansion, because pygeomag treats the poles separately."""
+"""Latitude (rad) above which positions are evaluated one by one, because pygeomag treats poles separately."""
 NANOTESLA = 1e-9
 EXTRAPOLATION = 2.5e-8
 """Standard deviation of the extrapolated field, T per component and per year outside the model's validity.
 
-Extrapolations of IGRF-14 from 2005, 2010 and 2015 by the variation of the previous five years had errors of
-up to 170 nT rms ten years after their validity, at an altitude of 500 km.
+When the IGRF-14 fields of 2005, 2010 and 2015 were extrapolated by the variation of the previous five years,
+the RMS error at an altitude of 500 km was up to 170 nT ten years after the end of validity.
 """
 LONGEST_EXTRAPOLATION = 20.0
 """Time (years) after which the extrapolated field no longer changes."""
@@ -99,9 +99,10 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
 
 
 def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return the fields (n, 3) in ICRS axes, T, at n times and positions, exactly as `field` gives each.
+    """Return the fields (n, 3) in ICRS axes, T, at n times and positions, equal to the results of `field`.
 
-    The expansion is evaluated for all positions together. A position takes 0.03 ms if there are a hundred.
+    The expansion is evaluated for all positions together. For a hundred positions, the computation takes 0.03
+    ms per position.
 
     Args:
         julian_dates: (n,) Julian dates UTC.
@@ -110,7 +111,7 @@ def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
     to_ground = celestial_to_terrestrial(julian_dates)
     there = np.array([turn @ position for turn, position in zip(to_ground, positions, strict=True)])
     longitude, latitude, height = geodetic(there)
-    if not np.abs(latitude).max() < _NEAR_POLE:  # also for an invalid position, which `field` refuses
+    if not np.abs(latitude).max() < _NEAR_POLE:  # also for NaN, for which `field` raises an error
         return np.array([field(float(date), at) for date, at in zip(julian_dates, positions, strict=True)])
     parts = zip(
         _expansion(julian_epoch(julian_dates), latitude, longitude, height),
@@ -124,9 +125,9 @@ def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
 def _expansion(
     years: FloatArray, latitude: FloatArray, longitude: FloatArray, height: FloatArray
 ) -> list[tuple[float, float, float]]:
-    """Return the field components north, east and down, nT, with each operation of `GeoMag.calculate`."""
+    """Return the north, east and down components, nT, with the same operations as `GeoMag.calculate`."""
     model = _model()
-    assert model.model  # it has read its coefficients
+    assert model.model  # the model has read its coefficients
     lowest, highest = FIRST_YEAR - LONGEST_EXTRAPOLATION, LAST_YEAR + LONGEST_EXTRAPOLATION
     since = np.minimum(np.maximum(years, lowest), highest) - model._epoch
     at = [math.radians(math.degrees(angle)) for angle in latitude.tolist()]
@@ -153,10 +154,10 @@ def _expansion(
 def _sums(
     model: GeoMag, since: FloatArray, st: FloatArray, ct: FloatArray, ratio: FloatArray, east: list[float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the sums (n,) over degrees and orders: radial, along the meridian, and along the parallel.
+    """Return the spherical harmonic sums (n,) of the radial, meridional and azimuthal field components.
 
-    `since` are years after the epoch, `st` and `ct` sine and cosine of the colatitude, `ratio` the reference
-    radius over the distance, and `east` the longitudes, rad.
+    The argument `since` contains the years after the epoch of the model, `st` and `ct` the sine and cosine of
+    the colatitude, `ratio` the reference radius divided by the distance, and `east` the longitudes, rad.
     """
     sines = [np.zeros(len(east)), np.array([math.sin(angle) for angle in east])]
     cosines = [np.ones(len(east)), np.array([math.cos(angle) for angle in east])]
@@ -188,7 +189,7 @@ def _sums(
 
 
 def _rounded(north: float, east: float, down: float) -> tuple[float, float, float]:
-    """Return components as pygeomag gives them, computed from intensity, declination and inclination."""
+    """Return the components, nT, computed from intensity, declination and inclination as in pygeomag."""
     level = math.sqrt(north * north + east * east)
     result = GeoMagResult(0.0, 0.0, 0.0, 0.0)
     result.f = math.sqrt(level * level + down * down)

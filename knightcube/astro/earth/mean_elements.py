@@ -30,19 +30,20 @@ _FIRST_SPAN, _GROWTH = 2_500.0, 3.0
 _VELOCITY_TIME = 100.0
 """Ratio (s) of the standard deviations of positions and velocities that is assumed in the fit."""
 _FAR, _NEAREST, _ROUNDS = 6.0, 300.0, 4
-"""Two limits of a residual (relative to the median, and m) for rejection, and maximum number of fits."""
+"""Rejection limits of a residual, as a multiple of the median and in m (the larger applies), and maximum
+number of fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
-"""Eccentricity of the first guess, and relative step of the numerical derivatives.
+"""Eccentricity of the initial guess, and relative step of the numerical derivatives.
 
-SGP4 replaces eccentricities below 1e-6, so that the derivatives of a circular orbit would be wrong. The
-components of the eccentricity vector are increased by 1 in the parameters, so that their steps are 1e-6.
+SGP4 replaces eccentricities below 1e-6, so that the derivatives of a circular orbit would be wrong. The fit
+parameters are the components of the eccentricity vector plus 1, so that their steps are 1e-6.
 """
 _SOON = 10.0
 """Time (s) after the first state at which a second position is extrapolated from its velocity."""
 _PARAMETER = 1e-9 * GRAVITATIONAL_PARAMETER
 """Gravitational parameter, km^3/s^2."""
 _FAILED = 1e6
-"""Residual (km) of elements that SGP4 cannot propagate."""
+"""Residual (km) assigned to elements that SGP4 cannot propagate."""
 _NUMBER = 99_999
 
 
@@ -52,9 +53,9 @@ class FittedElements:
 
     Attributes:
         lines: the two lines.
-        residuals: (n,) distances of the positions from the elements, m.
+        residuals: (n,) distances between the given positions and the positions computed from the elements, m.
         used: (n,) whether each position was used in the fit.
-        growth: standard deviation of the error along the track that builds up in a day, m. The growth follows
+        growth: standard deviation of the along-track error that accumulates in a day, m. The growth follows
             from the scatter of the residuals and excludes drag and other model errors.
     """
 
@@ -74,8 +75,8 @@ def fit_elements(
 ) -> FittedElements:
     """Return two-line elements, whose epoch is the first date, for measured positions.
 
-    Raises UsageError if there are fewer than four positions, or two with velocities, if they are not in order
-    of time, or if no elements fit.
+    Raises UsageError if fewer than four positions are given (fewer than two with velocities), if the
+    positions are not in order of time, or if no elements fit.
 
     Args:
         dates: (n,) Julian dates UTC, ascending; without velocities, the first two are less than half a
@@ -112,7 +113,7 @@ class _Fit:
     """The least-squares fit of two-line elements to states (m, and m/s) in ICRS axes."""
 
     def __init__(self, dates: FloatArray, states: FloatArray) -> None:
-        """`states` has the shape (n, 3) of positions, or (n, 6) with velocities."""
+        """Store the times and the `states`: positions (n, 3), or positions and velocities (n, 6)."""
         self.epoch = float(dates[0])
         self.minutes = (dates - self.epoch) * 1440.0
         to_icrs = np.array([mean_equator_to_celestial(float(date)) for date in dates])
@@ -151,7 +152,7 @@ class _Fit:
         return least_squares(residuals, parameters, method="lm", diff_step=_DIFFERENCE)
 
     def growth(self, solution: Any, positions: FloatArray) -> float:
-        """Return the standard deviation of the error along the track that builds up in a day, m."""
+        """Return the standard deviation of the along-track error that accumulates in a day, m."""
         freedom = max(len(solution.fun) - len(solution.x), 1)
         covariance = (
             np.linalg.pinv(solution.jac.T @ solution.jac) * float(solution.fun @ solution.fun) / freedom
@@ -161,7 +162,7 @@ class _Fit:
 
 
 def distances(lines: tuple[str, str], dates: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return the distances (n,), m, of positions (n, 3) in ICRS axes at Julian dates (n,) from elements.
+    """Return the distances (n,), m, between positions (n, 3), ICRS, and elements at Julian dates (n,).
 
     Raises UsageError for elements that SGP4 cannot propagate to these dates.
     """
@@ -194,7 +195,7 @@ def _first_guess(positions: FloatArray) -> FloatArray:
 def _satellite(parameters: FloatArray, epoch: float) -> Satrec:
     """Return the SGP4 satellite with the six fitted parameters and the Julian date `epoch` as its epoch."""
     motion, along, across, inclination, node, argument = parameters.tolist()
-    if inclination < 0.0:  # the same plane with a positive inclination
+    if inclination < 0.0:  # the same orbital plane, described by a positive inclination
         inclination, node, argument = -inclination, node + math.pi, argument + math.pi
     along, across = along - 1.0, across - 1.0
     eccentricity, perigee = min(math.hypot(along, across), 0.95), math.atan2(across, along)

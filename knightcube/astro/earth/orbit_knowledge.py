@@ -230,7 +230,7 @@ class _Field:
     """Field of a line of a two-line element set.
 
     Attributes:
-        first, last: numbers of the first and last column, counted from 1.
+        first, last: first and last column of the field, counted from 1.
         name: name of the quantity.
         form: regular expression of the whole field.
         example: example of a valid field.
@@ -302,7 +302,8 @@ def check_lines(first: str, second: str) -> None:
         )
     days = 366.0 if int(first[18:20]) % 4 == 0 else 365.0
     if not 1.0 <= float(first[20:32]) < days + 1.0:
-        # For resonant orbits, SGP4 takes steps of half a day, which are too many from an absurd epoch.
+        # For resonant orbits, SGP4 takes steps of half a day, and an absurd epoch would require too many
+        # steps.
         raise UsageError(
             f"{first!r}: line 1, columns 21 to 32: the day of the year of the epoch, {first[20:32].strip()}, "
             f"must be from 1 to {days:g}"

@@ -2,7 +2,7 @@
 
 A dipole moment m causes the torque m x B, which has no component along the field B (Wertz 1978, section
 18.1). With three equal coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. For any
-number lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed, lambda is
+scalar lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed, lambda is
 chosen so that the failed coil needs no current, which is possible unless the axis of the failed coil is
 normal to the field. A requested torque that the coils cannot produce is projected onto the space of torques
 that the coils can produce. If a current exceeds its limit, all currents are scaled by one factor, which
@@ -20,7 +20,7 @@ from knightcube.errors import FlightError
 
 WEAKEST = 0.15
 """Torque per unit current, relative to the strongest direction, below which a torque direction is discarded.
-A torque in a weak direction would need all the current, and scaling would then reduce the torque in the
+A torque in such a direction would need the full current, and scaling would then reduce the torque in the
 other directions."""
 
 
@@ -54,9 +54,9 @@ def allocate(
     Column k of `dipoles` (3, n) is the dipole moment of coil k per ampere, m^2. The current limits of the
     coils are `limits` (n,), A, and the mask `available` (n,) marks the coils that may be used. The mask
     `free` (3,) marks the axes about which the body can rotate; a suspension thread carries the torque about
-    the other axes. Of all currents that make the torque, the currents with the least heat in the resistances
-    `resistance` (n,), ohm, are chosen. Without this argument, the resistances are equal. Raises FlightError
-    for an input that is not finite.
+    the other axes. Of all currents that produce the torque, the currents with the least heat in the coil
+    resistances `resistance` (n,), ohm, are chosen. Without the argument `resistance`, the resistances are
+    assumed to be equal. Raises FlightError for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):

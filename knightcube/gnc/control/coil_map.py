@@ -1,12 +1,13 @@
 """The map between the dipole moment of a satellite and the currents of its coils.
 
-Column k of the matrix D (3, n) is the dipole moment of coil k per ampere, so the currents i make the dipole
-moment D i. More than three coils can make a dipole moment by different currents. Of all possible currents,
-those with the least heat i' R i are used, where R is the diagonal matrix of the coils' resistances. Without
-current limits, the currents of least heat for a dipole moment m are P m, with the weighted pseudo-inverse P
-of D. If P m exceeds the limit of a coil, the other coils carry the remainder. Control laws and planners need
-only dipole moments in body axes and one limit per body axis. The limits span the largest box of dipole
-moments that the coils can make. The heat of a dipole moment m is m' H m with H = P' R P.
+Column k of the matrix D (3, n) is the dipole moment of coil k per ampere, so the currents i produce the
+dipole moment D i. If a satellite has more than three coils, different currents can produce the same dipole
+moment. Of all possible currents, those with the least heat i' R i are used, where R is the diagonal matrix of
+the coils' resistances. Without current limits, the currents of least heat for a dipole moment m are P m, with
+the weighted pseudo-inverse P of D. If the current of a coil in P m exceeds its limit, the other coils produce
+the remainder of the dipole moment. Control laws and planners need only dipole moments in body axes and one
+limit per body axis. The limits per body axis define the largest box of dipole moments that the coils can
+produce. The heating power of a dipole moment m is m' H m with H = P' R P.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from knightcube.errors import UsageError
 _PERMEABILITY = 1e-7
 """Vacuum permeability divided by 4 pi, T m/A."""
 _SEGMENTS = 128
-"""Number of segments of a loop."""
+"""Number of straight segments that approximate a circular coil."""
 LEAST_SPREAD = 0.05
-"""Singular value of the unit vectors along the coils below which the coils lie nearly in a plane."""
+"""Smallest singular value of the unit vectors along the coil axes; below it, the axes are nearly coplanar."""
 _STEPS = 200
-"""Largest number of iterations for the box of dipole moments."""
+"""Number of iterations that compute the largest box of dipole moments."""
 _PARALLEL = 1e-6
-"""Smallest sine of the angle between two coils that are not parallel."""
+"""Sine of the angle between two coil axes below which the coils count as parallel."""
 _NEWTON_STEPS, _EXACT = 60, 1e-9
 """Largest number of Newton steps for limited currents, and relative accuracy of their dipole moment."""
 _SATURATED = 1e-4
@@ -58,9 +59,9 @@ def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None
 
 
 def missing_direction(dipoles: FloatArray) -> FloatArray | None:
-    """Return the unit vector (3,) normal to coils in a plane, or None if the coils span space.
+    """Return the unit vector (3,) normal to coplanar coil axes, or None if the axes span three dimensions.
 
-    Column k of `dipoles` (3, n) is along coil k. Raises UsageError if all coils are parallel.
+    Column k of `dipoles` (3, n) is along the axis of coil k. Raises UsageError if all coils are parallel.
     """
     lengths = np.linalg.norm(dipoles, axis=0)
     directions, sizes, _ = np.linalg.svd(dipoles / lengths)
@@ -82,14 +83,14 @@ class CoilMap:
         dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         current_limits: largest current of each coil (n,), A.
         resistance: resistance of each coil (n,), ohm.
-        limits: largest dipole moment along each body axis (3,), A m^2. All dipole moments within these three
-            limits can be made.
+        limits: largest dipole moment along each body axis (3,), A m^2. The coils can produce all dipole
+            moments within these three limits.
         heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, of currents below their
             limits.
     """
 
     def __init__(self, dipoles: FloatArray, current_limits: FloatArray, resistance: FloatArray) -> None:
-        """Raise UsageError if the coils cannot make a dipole moment in every direction."""
+        """Raise UsageError if the coils cannot produce a dipole moment in every direction."""
         normal = missing_direction(dipoles)
         if normal is not None:
             axis = ", ".join(f"{component:.2f}" for component in normal)
@@ -111,18 +112,18 @@ class CoilMap:
 
     @property
     def is_redundant(self) -> bool:
-        """Whether different currents can make the same dipole moment."""
+        """Whether different currents can produce the same dipole moment."""
         return len(self.current_limits) > 3
 
     def working(self, used: BoolArray, assumed: float = 0.5) -> CoilMap:
-        """Return the map of the coils that work, with limits and heat of these coils.
+        """Return the map of the working coils, with the limits and the heating power of these coils.
 
-        If the coils that work lie in a plane, a coil along its normal is assumed. Allocation makes a dipole
-        moment along the normal by adding a dipole moment along the magnetic field. Raises UsageError if all
-        coils that work are parallel.
+        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed. The
+        allocation replaces a dipole moment along the normal by adding a dipole moment along the magnetic
+        field, which causes no torque. Raises UsageError if all working coils are parallel.
 
         Args:
-            used: flags (n,) of the coils that work.
+            used: flags (n,), true for the working coils.
             assumed: dipole moment of the assumed coil, as a fraction of that of the weakest coil.
         """
         if used.all():
@@ -141,7 +142,7 @@ class CoilMap:
         return CoilMap(dipoles, limits, resistance)
 
     def currents(self, dipole: FloatArray) -> FloatArray:
-        """Return the currents (n,), A, of least heat that make a dipole moment (3,), A m^2.
+        """Return the currents (n,), A, of least heat that produce a dipole moment (3,), A m^2.
 
         More than three coils stay within their limits if the dipole moment is within `limits`.
         """
@@ -153,7 +154,7 @@ class CoilMap:
         return found
 
     def _limited_currents(self, dipole: FloatArray) -> FloatArray:
-        """Return the currents (n,), A, of least heat within the limits that make a dipole moment (3,).
+        """Return the currents (n,), A, of least heat within the limits that produce a dipole moment (3,).
 
         By duality, the currents are R^-1 D' y, clipped to the limits, for a vector y (3,) of Lagrange
         multipliers. The multipliers maximise a concave function, whose gradient is the missing dipole moment.
@@ -183,10 +184,10 @@ class CoilMap:
         return held
 
     def linear_shares(self, used: BoolArray) -> FloatArray:
-        """Return the matrix (n, n) from currents to the currents of least heat with the same dipole moment.
+        """Return the matrix (n, n) that converts currents to those of least heat with the same dipole moment.
 
-        Only the coils `used` (n,) carry the currents of least heat, which depend linearly on the given
-        currents because current limits are ignored.
+        Only the coils marked in `used` (n,) carry the currents of least heat, which depend linearly on the
+        given currents because current limits are ignored.
         """
         weights = np.sqrt(self.resistance / self.resistance.max())
         inverse = np.linalg.pinv(self.dipoles * used / weights) / weights[:, None]
@@ -199,7 +200,7 @@ class CoilMap:
         return np.asarray(self.dipoles @ currents)
 
     def per_dipole(self, matrix: FloatArray) -> FloatArray:
-        """Convert derivatives by the currents (k, n) to derivatives by the dipole moment (k, 3)."""
+        """Convert derivatives with respect to currents (k, n) into derivatives by the dipole (k, 3)."""
         if self._strength is not None:
             return np.asarray(matrix / self._strength)
         return np.asarray(matrix @ self._inverse)
@@ -226,10 +227,10 @@ class CoilMap:
         return found.reshape(9, 9)
 
     def _box(self) -> FloatArray:
-        """Return the half lengths (3,) of the largest box of dipole moments that the coils can make.
+        """Return the half lengths (3,), A m^2, of the largest box of dipole moments that the coils can reach.
 
-        The set of dipole moments that the coils can make is a zonotope, whose faces are normal to the cross
-        products of two coils.
+        The set of dipole moments that the coils can produce is a zonotope, and the normal of each face is the
+        cross product of two coil axes.
         """
         if self._strength is not None:
             return np.abs(self._strength) * self.current_limits
@@ -237,8 +238,9 @@ class CoilMap:
         normals = np.array([np.cross(one, other) for one, other in combinations(units.T, 2)])
         normals = normals[np.linalg.norm(normals, axis=1) > _PARALLEL]
         reached = np.abs(normals @ self.dipoles) @ self.current_limits
-        # The product of `use` and the box is the extent of the box towards each face, relative to the face.
-        # Each step scales the multiplier of a face by this extent, as in iterative proportional fitting.
+        # The product of `use` and the box is the extent of the box towards each face of the zonotope, divided
+        # by the distance of the face from the centre. Each iteration scales the multiplier of a face by this
+        # relative extent, as in iterative proportional fitting.
         use = np.abs(normals) / reached[:, None]
         multipliers = np.full(len(use), 3.0 / len(use))
         for _ in range(_STEPS):
@@ -249,7 +251,7 @@ class CoilMap:
 
 
 def limited(dipole: FloatArray, limits: FloatArray) -> FloatArray:
-    """Return a dipole moment (3,), scaled down by one factor to the limits (3,) of the body axes.
+    """Return a dipole moment (3,), scaled down by one factor to satisfy the limits (3,) of the body axes.
 
     The scaling preserves the direction of the dipole moment and of its torque.
     """

@@ -27,7 +27,7 @@ from knightcube.gnc.estimation.field_rate import rate_across
 MAXIMUM_SHARE = 0.5
 _SECOND = 1e-9
 _REACHED_NS = 50_000_000
-"""Largest delay (ns) until a command acts on the coils, equal to two control cycles."""
+"""Largest delay (ns) between a command and its effect on the coils, equal to two control cycles."""
 _NO_CURRENT: FloatArray = np.zeros(3)
 
 
@@ -50,7 +50,7 @@ class WindowSchedule:
         return self.settle_ns + self.measure_ns + self.act_ns
 
     def calm(self, begin_ns: int, length_ns: int) -> int:
-        """Return the first time from `begin_ns` on at which the coils do not switch for `length_ns`.
+        """Return the first time (ns) from `begin_ns` on after which the coils do not switch for `length_ns`.
 
         Windows follow each other without gaps from time zero. If neither the pause nor the driven phase is
         long enough, the result is `begin_ns`.
@@ -156,7 +156,7 @@ class Detumbler:
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # too late: the mean field of this sample's window has been computed
+            return  # the sample is too late: the mean field of its window is already computed
         if window != self._window:
             self._samples.clear()
             self._window = window
@@ -184,7 +184,7 @@ class Detumbler:
 
     @property
     def rate(self) -> FloatArray | None:
-        """The rate (3,) across the field from the last two windows, in body axes, rad/s; None before."""
+        """The rate (3,) across the field from the last two windows, body axes, rad/s; None before."""
         return self._rate
 
     def _close_window(self) -> None:

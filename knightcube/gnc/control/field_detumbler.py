@@ -4,22 +4,22 @@ The field of the coils disturbs the magnetometer. The coils are therefore switch
 until the field of the coils has decayed, then to measure the field. The driven phase between two pauses is
 short while the estimated rate is uncertain, as with the magnetometer alone. The filter
 `knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
-rate and the rotation of the field in inertial axes. A gyro sample gives the rate along the field at once. The
-momentum plan uses a predicted field. If the orbit is known, the field is predicted along the orbit. Without a
-known attitude, the predicted field is rotated so that its direction and its change agree with the measured
-field. Without a known orbit, the measured field is assumed to continue to rotate at the present rate. Near
-the equator, however, the field's direction oscillates by some 20 deg in each orbit. In contrast to B-dot
-control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off until
-`TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the rate
-across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as well.
-The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a restarted
-sensor may give only unusable fields.
+rate and the rotation of the field in inertial axes. A gyro sample shows the rate along the field immediately.
+The momentum plan uses a predicted field. If the orbit is known, the field is predicted along the orbit.
+Without a known attitude, the predicted field is rotated so that its direction and its change agree with the
+measured field. Without a known orbit, the measured field is assumed to continue to rotate at the present
+rate. In an orbit near the equator, however, the field's direction only oscillates by some 20 deg. In contrast
+to B-dot control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off
+until `TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the
+rate across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as
+well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a
+restarted sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
-momentum h obeys h' = m x B, where m is the dipole moment and B the field. This equation contains neither
-inertia nor attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum strength L
-and the direction of -B x y, where the costate y is a constant vector. The momentum can be reduced to at most
-r within the time T if and only if every vector y satisfies
+momentum h obeys h' = m x B, where m is the dipole moment and B the field. The equation h' = m x B contains
+neither inertia nor attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum
+magnitude L and the direction of -B x y, where the costate y is a constant vector. The momentum can be reduced
+to at most r within the time T if and only if every vector y satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
@@ -31,16 +31,16 @@ Momentum along the field can be removed only after the field has rotated. The mi
 momentum across the field, which is removed later. The plan leaves a residual momentum r, because removing the
 last momentum along a slowly rotating field would take most of the time.
 
-The minimum-time plan first accelerates a body that spins along the field, about an axis across the field. The
-settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy. At an upper
-bound, the commanded dipole moment does not increase the bounded quantity. If the bounds equal the initial
-values, detumbling takes longer, because a spin along the field is then stopped only after the field has
-rotated by a right angle.
+If a body spins along the field, the minimum-time plan first accelerates the body about an axis across the
+field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy.
+If the rate or the energy has reached its upper bound, the commanded dipole moment does not increase it. If
+the bounds equal the initial values, detumbling takes longer, because a spin along the field is then stopped
+only after the field has rotated by a right angle.
 
 The magnetometer alone shows the rate along the field only after the field has rotated. Until all components
 of the rate are known, the coils therefore do no positive work. The work of the coils depends on the rate
-across the field, but neither on the rate along the field nor on the inertia tensor. The rate of a body with
-unequal moments of inertia changes without a torque, and its energy does not.
+across the field, but neither on the rate along the field nor on the inertia tensor. Without a torque, the
+rate of a body with unequal moments of inertia changes, but its kinetic energy does not.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ STEEP = 12.0
 mean divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then
 reverse the coils wherever B x y is small."""
 FLAT = 0.02
-"""Lower bound of |B x y| (field B, costate y), relative to the largest, for finite weights of the
-iteration."""
+"""Lower bound of |B x y| (field B, costate y), relative to its largest value, which keeps the weights of the
+iteration finite."""
 FINENESS = 60
-"""Resolution of the search for the minimum time, as the number of steps per minimum time."""
+"""Resolution of the search for the minimum time, as the number of steps into which that time is divided."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,7 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatA
 
 
 def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArray:
-    """Return the dipole moment (3,) without the part that increases a bounded quantity, such as the rate.
+    """Return the dipole moment (3,) without the component that increases a bounded quantity, as the rate.
 
     Each element (3,) of `grows` is the derivative of the growth rate of one quantity with respect to the
     dipole moment. The argument `grows` has at most two elements. No component of the result is larger than
@@ -144,7 +144,7 @@ def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArra
 
 
 def _orthogonal(dipole: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the part (3,) of a dipole moment orthogonal to a vector (3,), with no larger components."""
+    """Return the part (3,) of a dipole moment orthogonal to a vector (3,), scaled to no larger components."""
     square = float(vector @ vector)
     if square == 0.0:
         return dipole
@@ -201,17 +201,17 @@ def aligned_to_change(
 
 
 def _axes(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return orthonormal axes (3, 3), row by row: along a vector (3,), and then towards a second one (3,)."""
+    """Return orthonormal axes (3, 3) as rows, the first along `first` (3,), the second towards `second`."""
     along = first / math.sqrt(float(first @ first))
     across = second - along * float(along @ second)
-    if not across.any():  # any axes serve a field that does not rotate
+    if not across.any():  # for a field that does not rotate, any second axis is suitable
         across = cross_product(along, np.eye(3)[int(np.abs(along).argmin())])
     across /= math.sqrt(float(across @ across))
     return np.array([along, across, cross_product(along, across)])
 
 
 def _agree(predicted: FloatArray, measured: FloatArray) -> bool:
-    """Return whether two fields (3,) have the same strength within `STRENGTH`."""
+    """Return whether the strengths of two fields (3,) differ by less than the fraction `STRENGTH`."""
     ratio = math.sqrt(float(predicted @ predicted) / float(measured @ measured))
     return abs(ratio - 1.0) < STRENGTH
 
@@ -223,7 +223,7 @@ class _FieldPreview:
     Attributes:
         field: (n, 3) T.
         effect: elements (n, 9) of the matrices B^2 I - B B^T, each multiplied by the time step.
-        reach: maximum strength L of the dipole moment, A m^2.
+        reach: maximum magnitude L of the dipole moment, A m^2.
         rest: residual momentum r of the plan, N m s.
     """
 
@@ -270,7 +270,7 @@ OLDEST_NS = 100_000_000
 CHANGED = 30.0
 """Time (s) over which the change of a predicted field is compared with that of the measured field."""
 STRENGTH = 0.2
-"""Relative difference in strength from the measured field that shows that the predicted orbit is wrong."""
+"""Relative difference between predicted and measured field strength above which the orbit counts as wrong."""
 INSTANTS = 150
 DENSER = 1.5
 """Exponent of the power law that makes the times of the field prediction denser at the start. For a
@@ -286,7 +286,7 @@ KNOWN, KNOWN_SHARE = 2e-3, 0.1
 is below KNOWN rad/s, or below KNOWN_SHARE of the rate."""
 _SECOND = 1e-9
 _ROUNDING = 1e-9
-"""Relative rounding error of a product that should be zero."""
+"""Relative rounding error of a scalar product that should be zero."""
 _NO_DIPOLE: FloatArray = np.zeros(3)
 _IDENTITY: FloatArray = np.eye(3)
 
@@ -412,7 +412,7 @@ class FieldDetumbler:
         self._act_ns = round(min(self._schedule.act_ns, max(longest_ns, self._shortest_ns)))
 
     def dipole(self, now_ns: int) -> FloatArray:
-        """Return the present dipole (3,) A m^2, zero while the field is measured or the rate is unknown."""
+        """Return the dipole moment (3,), A m^2: zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
         if self._filter.started:  # a filter that has not started is advanced by samples only
             self._advance(max(now_ns, self._time_ns))
@@ -421,14 +421,14 @@ class FieldDetumbler:
         phase_ns = (now_ns - self._begun_ns) % (self._pause_ns + self._act_ns)
         self._begun_ns = (
             now_ns - phase_ns
-        )  # the driven phases differ in length, so each pause is a new origin
+        )  # the duration of the driven phase varies, so time is counted from the last pause
         acting = phase_ns >= self._pause_ns
         self._commanded_ns = now_ns
         self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the actual dipole moment (3,), A m^2, until the next command, if not the commanded one."""
+        """Set the actual dipole moment (3,), A m^2, until the next command, if it is not as commanded."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole
@@ -470,7 +470,7 @@ class FieldDetumbler:
 
     @property
     def restarts(self) -> int:
-        """Number of restarts of the rate filter after contradicting samples, which a fast spin may cause."""
+        """Number of restarts of the rate filter after contradictory samples, which a fast spin may cause."""
         return self._filter.restarts
 
     def _distrust(self) -> None:
