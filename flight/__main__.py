@@ -5,7 +5,7 @@ import signal
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     # Ctrl-C ends a command at once and without a traceback, even during imports.
-    # A flight installs a signal handler of its own.
+    # The code that runs a flight later installs its own signal handler.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # All matrices are small, so that multithreaded BLAS would slow them down.

@@ -98,7 +98,7 @@ def corrupted_text(request: RunRequest, text: str) -> str:
 
 
 def injected_faults(request: RunRequest, text: str) -> tuple[str, ...]:
-    """Return the faults of a flight as texts, first those of the configuration."""
+    """Return the faults of a flight as texts: the configured faults, followed by the requested faults."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.injected_faults(_simulation_request(request, text))
@@ -126,7 +126,7 @@ def simulated_camera(config_path: Path, text: str, config: Config, rate: FloatAr
 
 
 def emulated_bench(config_path: Path, text: str, config: Config) -> EmulatedBench:
-    """Return the emulated devices of a configuration on a bench, where a hand turns the body."""
+    """Return the emulated devices of a configuration on a test bench, where the body is rotated by hand."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.open_bench(rig.SimulationRequest(config_path, text, Path()), config)
@@ -228,7 +228,7 @@ def check_settings(config: Config) -> None:
 
 
 def real_rig(config: Config, stack: ExitStack, patient: bool = False, exclusive: bool = False) -> Rig:
-    """Return this machine's hardware with nothing opened; `stack` closes whatever a driver opens.
+    """Return this machine's hardware with all devices closed; `stack` closes what a driver opens.
 
     The bus of the coils is locked for this process if `exclusive` is true.
     """
@@ -285,7 +285,7 @@ def open_camera(
     return source
 
 
-# The functions of our own drivers, which their registrations name (`flight.schema.devices`).
+# Functions of the built-in drivers, to which the driver registrations refer (`flight.schema.devices`).
 
 _CHIP_CURE = "check power, wiring and address; `i2cdetect -y` lists the chips that answer"
 _LISTENED_NS = 2_500_000_000
@@ -323,7 +323,7 @@ def files_vn100(unit: InertialUnitSection) -> Sequence[str]:
 
 
 def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
-    """Return the driver of an inertial unit of separate sensors. Raises ConfigError for an unknown sensor."""
+    """Return the driver of an inertial unit of several sensors. Raises ConfigError for an unknown sensor."""
     parts, measured = [], set[str]()
     kind = "magnetometer" if isinstance(unit, MagnetometerSection) else "inertial_unit"
     for number, sensor in enumerate(unit.sensors):
@@ -533,7 +533,7 @@ def open_aravis(rig: Rig, camera: Camera | WideCamera) -> AravisCamera:
 
 
 def probe_v4l2(rig: Rig, camera: Camera | WideCamera) -> str:
-    """Return the text about a camera that `flight.app.devices.open_camera` has opened."""
+    """Return a text that describes an opened camera (`flight.app.devices.open_camera`)."""
     return "the camera can be opened; `knightcube camera` shows its images"
 
 

@@ -119,7 +119,8 @@ def open_flight(
         use_numpy_forms()
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
-    # The stored state is closed after the devices, and opened last, so that only a boot that flies counts.
+    # The stored state is opened last, so that only a boot that reaches flight is counted, and is closed after
+    # the devices.
     after_coils = stack.enter_context(ExitStack())
     guardian = start_guardian(rig, stack)
     devices = open_devices(config, rig, stack, patient)
@@ -325,7 +326,7 @@ BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodi
 
 
 def body_kind(config: Config) -> BodyKind:
-    """Return the kind of body that the configuration names. Raises ConfigError."""
+    """Return the kind of body that the configuration selects. Raises ConfigError."""
     kind = imported("body", config.body, BODIES, os.environ)
     if not isinstance(kind, BodyKind):
         raise ConfigError("body", f"is {config.body!r}: this object is not a BodyKind of flight.loop.body")
@@ -335,10 +336,10 @@ def body_kind(config: Config) -> BodyKind:
 def lens_knowledge(
     config: Config, learned: Mapping[str, Learned], problems: list[str]
 ) -> LensKnowledge | None:
-    """Return the lens from which the star tracker starts, or None if the lens is not learned.
+    """Return the star tracker's initial lens parameters, or None if the lens parameters are not estimated.
 
-    The `learned` parameters of earlier boots are used unless they contradict the configuration, which is
-    added to `problems`.
+    The lens parameters `learned` at earlier boots are used unless they contradict the configuration; a
+    contradiction is added to `problems`.
     """
     camera = config.camera
     if camera is None or camera.star_tracker is None or not camera.learn_lens:
@@ -393,16 +394,16 @@ def imaging_settings(
         calm=body.control.exposure_start,
         kept=kept,
         lens=lens,
-        # The frames that are taken under overload keep the attitude measured.
+        # Under overload, enough frames are still taken to measure the attitude.
         most_every=int(camera.max_age // max(camera.period, camera.fine_period or 0.0)),
     )
 
 
 def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSettings:
-    """Return the times of the horizon cameras; all cameras use those of the most frequent camera."""
+    """Return the timing of the horizon cameras; all cameras use the shortest configured periods."""
     fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
-    margin_ns = min(SECOND_NS // 2, period_ns // 10)  # for a late run of the task
+    margin_ns = min(SECOND_NS // 2, period_ns // 10)  # allows for a late run of the task
     return HorizonCameraSettings(
         [round(camera.exposure * SECOND_NS) for camera in cameras],
         period_ns - margin_ns,

@@ -84,7 +84,7 @@ def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunReq
     Return the request with the path of the new folder, and the folders of the newest earlier runs.
 
     Raises UsageError for a folder that already contains a run, and for a folder that cannot be written. A
-    board with an archive flies in spite of disk trouble, and its logs wait for the disk.
+    flight computer with an archive flies despite disk errors, and its logs wait until the disk works.
     """
     earlier: list[Path] = []
     if request.archive is not None:

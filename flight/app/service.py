@@ -1,11 +1,11 @@
 """The flight as a service: configuration, retries of its start, signals, proof of its release, supervisors.
 
-Nobody can restart a flight or the link on a board, so the start is retried until it succeeds. An invalid
-configuration ends the start, because waiting would not help. Other problems may be temporary: a disk error, a
-missing address or folder, or a bus that another flight uses. After each failed attempt, everything that was
-opened is closed, with the coils at zero. The first pause before the next attempt is 0.2 s, and each later
-pause is twice as long, up to 30 s. An unexpected exception ends the process, and the service manager starts a
-new process.
+Nobody can restart a flight or the link on a flight computer in orbit, so the start is retried until it
+succeeds. An invalid configuration ends the start, because waiting would not help. Other problems may be
+temporary: a disk error, a missing address or folder, or a bus that another flight uses. After each failed
+attempt, everything that was opened is closed, with the coils at zero. The first pause before the next attempt
+is 0.2 s, and each later pause is twice as long, up to 30 s. An unexpected exception ends the process, and the
+service manager starts a new process.
 
 The configuration to fly is the accepted file or, if it is damaged, the last configuration that flew. The
 script `deploy/install.sh` writes the SHA-256 checksum of an accepted configuration beside its file. A flight
@@ -18,12 +18,13 @@ so that there is never a configuration without its checksum.
 
 The signals that end a flight are SIGINT (Ctrl-C), SIGTERM, and SIGHUP when a terminal closes.
 
-Before the flight, the script `deploy/releases.py` chooses the software release, counts its starts in a file
-of the state folder, and passes its name and the reasons of the choice in the environment. After a minute of
-flight, the release is recorded as proven, and the flight reports why another release was abandoned.
+Before the flight, the script `deploy/releases.py` chooses the software release, counts the starts of this
+release in a file of the state folder, and passes the name of the release and the reasons of the choice in
+environment variables. After a minute of flight, the release is recorded as proven, and the flight reports why
+another release was abandoned.
 
 The external supervisors of the flight are the guardian of the coils and the service manager. The loop calls
-`beat` at the end of every control cycle without an error, and `feed` while nothing is stalled. A running loop
+`beat` at the end of every control cycle without an error, and `feed` while no task is stalled. A running loop
 does not prove that commands reach the coils, so heartbeats are passed to the guardian only while the job of
 the coil driver runs. With the first heartbeat, READY is reported to the service manager, because the devices
 are open and the loop runs.
@@ -103,7 +104,7 @@ class StartRetry:
         self._problem = ""
 
     def summary(self) -> str:
-        """Return number and duration of the attempts; empty if the first attempt succeeded."""
+        """Return a text on the number and duration of the attempts; empty if the first attempt succeeded."""
         begun = f"started at attempt {self._failed + 1} after {self._waited:.1f} s"
         return f"{begun}: {self._problem}" if self._failed else ""
 
@@ -132,7 +133,7 @@ class StartRetry:
 def retried_start(
     judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
-    """Return the result of the first attempt that succeeds. Its open resources are closed by `stack`.
+    """Return the result of the first attempt that succeeds; `stack` closes the resources that it opens.
 
     Each attempt reads and validates a configuration with `judge`, and opens it with `attempt`. Raises
     UsageError for an invalid configuration, and StoppedError after a signal.
@@ -370,7 +371,7 @@ class Collector:
 _THROTTLE_NS = 1_000_000_000
 """Shortest time (ns) between events of one kind; a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""Longest gap (ns), three periods, of the coil driver's job for which heartbeats are passed on."""
+"""Longest time (ns, three periods) since the coil driver's job ran, up to which heartbeats are passed on."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,
@@ -425,7 +426,7 @@ class Supervision:
             self._overseer.ready(self._status)
 
     def close(self) -> None:
-        """Write the events that are still held back."""
+        """Write the events that the rate limit still holds back."""
         self._events.flush(self._clock.now_ns())
 
     def feed(self) -> None:

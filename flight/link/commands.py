@@ -423,9 +423,9 @@ def command_of_words(text: str, stored: bool = False) -> Command:
 
     The line consists of the command's name and the values of its fields, in the order of the packet
     definition. A state is written as its label, and an angle of `point` with its unit. Omitted real numbers
-    at the end of the line become NaN, and a text field takes the rest of the line. A line that an earlier
-    release `stored` may have angles in rad without a unit. Raises CommandError for an unknown command, for
-    superfluous words and for values out of range.
+    at the end of the line become NaN, and a text field takes the rest of the line. If `stored` is true, the
+    line may come from an earlier release and have angles in rad without a unit. Raises CommandError for an
+    unknown command, for superfluous words and for values out of range.
     """
     name, *words = text.split() or [""]
     if name not in LAYOUTS:
@@ -553,7 +553,7 @@ _LOOK_EVERY = 10
 
 
 class Channel(Protocol):
-    """Receiver of datagrams that also returns the address of each sender for the answer."""
+    """Receiver of datagrams that also returns each sender's address, to which an answer can be sent."""
 
     name: str
 

@@ -13,7 +13,7 @@ class Mode(IntEnum):
     SAFE = 1
     """A testbed sets its coils to zero; a satellite detumbles and points its solar cells to the Sun."""
     DETUMBLE = 2
-    """The coils reduce the body rate by magnetometer measurements alone."""
+    """The coils reduce the body rate, which requires no attitude estimate."""
     HOLD = 3
     """The body holds an attitude."""
     SLEW = 4

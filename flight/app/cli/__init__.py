@@ -1,8 +1,8 @@
-"""The command line: each command is a module; a user's mistake gives one line and exit status 2.
+"""The command line: each command is a module; a user error prints one line and gives exit status 2.
 
-Only the module of the requested command is imported, because a board in flight does not need the others. A
-command finishes its work even if its output is not read: if its pipe is closed (`| head`), if its terminal is
-gone, or if it was started without one (`>&-`).
+Only the module of the requested command is imported, because a flight computer does not need the other
+commands. A command finishes its work even if its output is not read: if its pipe is closed (`| head`), if its
+terminal is gone, or if it was started without one (`>&-`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The command `knightcube check`, which checks whether a configuration can be flown at present.
 
 The function `probe` looks for the real devices that a configuration names. No device is configured, and no
-coil is driven. A device that does not answer is reported together with the cure. The serial port and the
-camera that a running flight uses are reported as busy.
+coil is driven. A device that does not respond is reported together with the suggested remedy. The serial port
+and the camera that a running flight uses are reported as busy.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # see `flight.app.run`
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A device or file: its name in the configuration, its address, and its answer or the cure."""
+    """Check result of a device or file: its configuration name, address, and response or suggested remedy."""
 
     name: str
     place: str
@@ -53,7 +53,7 @@ def probe(config: Config) -> list[Probed]:
 
 
 def _probed(config: Config, name: str, kind: str, section: Any) -> Probed:
-    """Ask one device for a sign of life, with connections of its own."""
+    """Check whether one device responds, over connections that are opened for this check."""
     camera = isinstance(section, Camera | WideCamera)
     driver = driver_of(kind, section.device if camera else section)
     place = ", ".join(driver.files(section) or driver_of("coils", config.coils).files(config.coils))
@@ -147,10 +147,10 @@ def check(options: argparse.Namespace) -> int:
 
 
 def check_values(config: Config) -> None:
-    """Raise ConfigError for a configuration that cannot be flown, whatever devices answer.
+    """Raise ConfigError for a configuration that cannot be flown, regardless of which devices respond.
 
-    Among others, a satellite needs its position for every target, because plans predict the magnetic field
-    along the orbit.
+    For example, the configuration of a satellite must contain a GPS receiver or two-line elements, because
+    every plan predicts the magnetic field along the orbit.
     """
     from flight.app.devices import check_settings  # noqa: PLC0415
     from flight.app.flight import body_kind  # noqa: PLC0415
@@ -178,7 +178,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _fly(verdict: CheckResult) -> None:
-    """Fly the first seconds in lock-step, in a temporary folder."""
+    """Fly the first seconds of a configuration in lock-step simulation, with logs in a temporary folder."""
     from flight.app.flight import fly  # noqa: PLC0415
 
     duration, begun = min(FLOWN_S, verdict.config.duration), time.perf_counter()

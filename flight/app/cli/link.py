@@ -84,7 +84,7 @@ class _JudgedLink:
 
 @dataclass(frozen=True, slots=True)
 class _OpenedLink:
-    """An opened link, and the names of the communication lines for the log."""
+    """An opened link, and the names of its communication lines, which the log states."""
 
     station: Station
     names: str
@@ -200,7 +200,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
 
 
 def _witness(keys: Path) -> Path:
-    """Return the folder of the witness (`flight.link.security`).
+    """Return the folder that protects against outdated keys, the witness (`flight.link.security`).
 
     The folder is the second state folder of a service, or otherwise a folder beside the keys.
     """
@@ -230,7 +230,7 @@ def _open_lines(section: Link, codes: LinkCodes, clock: SystemClock, stack: Exit
 
 
 class _LoopbackLine:
-    """Line to a ground in the same process; the sandbox in which a release is built has no network."""
+    """Line to a ground station in the same process, because the build sandbox of a release has no network."""
 
     name = "self-test"
 

@@ -265,7 +265,7 @@ class SatelliteEstimation(BodyEstimation):
         return self.orbit_filter.acceleration_psd(time_ns)
 
     def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
-        """Return the filter's slow states, with the time to which they refer, and the coils' factors."""
+        """Return the filter's slow states with their reference time, and the coils' correction factors."""
         coils = self.coil_monitor.correction
         factors = Learned.of(coils.factors, np.diag(coils.deviations**2))
         found = {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
@@ -315,7 +315,7 @@ class SatelliteEstimation(BodyEstimation):
         self.orbit_filter.renew_magnetometer()
 
     def is_accurate(self, estimate: Estimate) -> bool:
-        """Return whether the rate of an estimate is certain to a body that counts as detumbled."""
+        """Return whether the rate of an estimate is accurate enough to decide that the body is detumbled."""
         return float(estimate.covariance.diagonal()[RATE].max()) <= self._low_rate**2
 
     def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
@@ -326,7 +326,7 @@ class SatelliteEstimation(BodyEstimation):
         return estimate.rate
 
     def fastest_by_field(self) -> float:
-        """Return the largest likely body rate (rad/s) by the magnetometer: estimate plus one sigma.
+        """Return the likely maximum of the body rate (rad/s) from the magnetometer: estimate plus one sigma.
 
         The result is infinite while the magnetometer gives no rate.
         """
@@ -341,7 +341,7 @@ class SatelliteEstimation(BodyEstimation):
         return self.environment.velocity(time_ns)
 
     def accept_fix(self, reading: GpsReading) -> FixVerdict:
-        """Accept a GPS fix, and return whether it is used; field and sunlight may contradict it."""
+        """Compare a GPS fix with magnetic field and sunlight, and return whether the fix is used."""
         field, sigma, sunlit = None, math.inf, False
         measured = self.orbit_filter.field_at_rest
         if measured is not None and abs(reading.time_ns - measured[0]) <= LATEST_WITNESS_NS:

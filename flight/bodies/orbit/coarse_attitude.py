@@ -61,7 +61,8 @@ SUNLIT = 0.99
 CONTRADICTED = 3
 """Number of contradicting measurements in a row after which a coarse estimate is discarded."""
 GATE = 30.7
-"""Chi-square threshold (3 degrees of freedom, 1e-6) above which an attitude contradicts the estimate."""
+"""Chi-square threshold (3 degrees of freedom, false alarm probability 1e-6) of the test whether a measured
+attitude contradicts the estimate."""
 START_SIGMA = np.radians(5.0)
 """Largest standard deviation (rad) of the rotation about the field direction at which the filter starts."""
 STRENGTH_SIGMA = 5.0
@@ -91,7 +92,7 @@ class CoarseSunFeed:
         self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
-        """Accept a reading, and return its fault, an empty text if it is good, or None if it is unchecked."""
+        """Accept a reading, and return its fault: empty for a valid, None for an unchecked reading."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
@@ -171,7 +172,8 @@ FIELD_SIGMA = 0.03
 
 Sight = VectorObservation | None
 Compare = Callable[[int, Sight, Sight, Sight], None]
-"""Function of a time (ns) and the directions of Sun, nadir and field, which compares other methods."""
+"""Callback that compares other methods; its arguments are a time (ns) and the Sun, nadir and field
+directions."""
 
 
 class HorizonCameraFeed:
@@ -191,7 +193,8 @@ class HorizonCameraFeed:
 
         The residual lens error after calibration is `lens_error` (rad per axis). The object `sun` holds the
         newest reading of the solar cells. The intensity response of all cameras is `response`, or linear if
-        None is given. The maps `structure` show where the images show the spacecraft, by camera index.
+        None is given. The maps `structure` mark the parts of the images that the spacecraft covers, by camera
+        index.
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
@@ -206,7 +209,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether horizon frames can improve the attitude. In eclipse they improve only a lost attitude."""
+        """Whether horizon frames can improve the attitude; in eclipse, they improve only a lost attitude."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)

@@ -51,7 +51,7 @@ class _MagneticLaw:
         self._law.begin(now_ns)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,), T, and the gyro's rate (3,), rad/s; a stuck field is ignored."""
+        """Accept a field (3,), T, and the gyro's rate (3,), rad/s, unless the magnetometer is stuck."""
         if self._field_check.accept(field):
             self._law.sample(time_ns, field, rate)
 
@@ -135,7 +135,7 @@ class SunAcquisitionLaw(_MagneticLaw):
 
 _NOTHING: FloatArray = np.zeros(3)
 _LARGEST_COIL_ERROR = 0.3
-"""Limit of the errors that are compensated in the elements of the coils' matrix, to keep it invertible."""
+"""Largest compensated error of an element of the coil matrix, which keeps the matrix invertible."""
 
 
 def commanded(dipole: FloatArray, coils: FloatArray) -> FloatArray:

@@ -2,14 +2,14 @@
 
 The position is propagated from the newest GPS fix, or from two-line elements before the first fix. The
 environment is predicted for about 20 s at once, which takes 2 ms, and then interpolated. Predictions for a
-whole revolution belong in a worker, because they take 0.3 ms for each 10 s. The class `StuckFieldCheck`
-detects a magnetometer that repeats the same field.
+whole revolution belong in a worker process, because they take 0.3 ms of computing time per 10 s of orbit. The
+class `StuckFieldCheck` detects a magnetometer that repeats the same field.
 
 A GPS fix that contradicts the elements or the previous fixes is refused. Refused fixes that are consistent
 with one orbit for `CONFIRMED` seconds replace the contradicted knowledge, unless the magnetometer or the Sun
-contradicts them. Fixes that agree with elements of a low accuracy are used after the same time. Fixes that
-agree with accurate elements are used at once, but their accuracy is believed after the same time only. A
-receiver that is deceived consistently, with a possible orbit, cannot be detected.
+contradicts them. Fixes that agree with inaccurate elements are used only after `CONFIRMED` seconds. Fixes
+that agree with accurate elements are used at once, but their stated accuracy is trusted only after
+`CONFIRMED` seconds. Spoofed GPS signals cannot be detected if they consistently simulate a possible orbit.
 """
 
 from __future__ import annotations
@@ -41,16 +41,19 @@ from knightcube.gnc.estimation.free_filter import FilterEnvironment
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """Time spans (s) after and before the requested time that the short prediction covers."""
 GATE, ELEMENTS_GATE = 5.0 * math.sqrt(3.0), 4.0
-"""Largest distances (sigma) of a GPS fix from earlier fixes and from the elements at which it is accepted."""
+"""Gates (standard deviations) for a GPS fix: the first for the distance from earlier fixes, the second for
+the distance from the elements."""
 LEAST_GATE, FIX_GATE = 5e3, 500.0
-"""Deviations (m) of a GPS fix from the elements, and from earlier fixes, that are always accepted."""
+"""Deviations (m) up to which a GPS fix is always accepted: the first from the elements, the second from
+earlier fixes."""
 SPEED_GATE, ORBITAL_RATE = 20.0, 1.2e-3
-"""Deviation (m/s) of a fix's velocity that is always accepted, and rate (rad/s) of the lowest orbit."""
+"""Deviation (m/s) up to which a fix's velocity is always accepted, and orbital rate (rad/s) of the lowest
+orbit."""
 CONFIRMED = 420.0
 """Time (s) over which refused fixes must be consistent with one orbit to replace contradicted knowledge."""
 _LEAST_FIXES, _SEQUENCES, _LONGEST_GAP = 5, 4, 200.0
-"""Minimum number of fixes that replace contradicted knowledge, largest number of assumed orbits, and longest
-time (s) between two fixes of one sequence.
+"""Minimum number of fixes that replace contradicted knowledge, maximum number of fix sequences (candidate
+orbits), and longest time (s) between two fixes of one sequence.
 """
 FIRST_FIXES, TIGHT = 3, 1e4
 """Number of consistent fixes that start an orbit without elements, and largest standard deviation (m) of
@@ -71,7 +74,8 @@ TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
 """Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not know them."""
 WITNESS_GATE, LATEST_WITNESS_NS = 4.0, 20 * SECOND_NS
-"""RMS deviation (standard deviations) at which the field strength refutes an orbit, and largest age (ns)."""
+"""RMS deviation (standard deviations) of the field strength above which an orbit is refuted, and largest age
+(ns) of the measurements used."""
 _SHORTEST = 1.0
 
 
@@ -82,7 +86,7 @@ class Witness:
     Attributes:
         field: strength of the magnetic field, T, or None if unknown.
         field_sigma: standard deviation of the field strength, T.
-        sunlit: whether the solar cells measure the Sun; a shadow is not measured.
+        sunlit: whether the solar cells measure the Sun; false does not prove that the satellite is in shadow.
     """
 
     field: float | None = None
@@ -104,7 +108,7 @@ class FixSequence:
         self.joined = 1
         self._offset_ns = offset_ns
         self._offered = 1
-        self._strength = np.zeros(3)  # sums of squared deviations of the field, and number
+        self._strength = np.zeros(3)  # sums of squared field deviations, both orbits, and their number
         self._is_refuted = False
         self._shadowed = np.zeros(2)  # number of fixes at which the Sun shines in the shadow of both orbits
 
@@ -116,12 +120,12 @@ class FixSequence:
 
     @property
     def is_disputed(self) -> bool:
-        """Whether fixes since the first one disagree with it."""
+        """Whether any later fix disagrees with the first fix."""
         return self._offered > self.joined
 
     @property
     def refuted(self) -> bool:
-        """Whether field or Sun contradict the orbit of the fixes, and agree with the orbit known before."""
+        """Whether field or Sun contradict the orbit of the fixes, but agree with the orbit known before."""
         here, known, number = self._strength.tolist()
         by_field = here > WITNESS_GATE**2 * number > known
         half = 0.5 * self.joined
@@ -143,7 +147,7 @@ class FixSequence:
         return True
 
     def compare(self, witness: Witness, here: OrbitState, known: OrbitState) -> None:
-        """Compare field and Sun with the position of the newest fix, and with the position known before."""
+        """Compare field and Sun with the position of the newest fix and the previously known position."""
         states = here, known
         if witness.field is not None:
             strengths = [float(np.linalg.norm(field(here.julian_date, one.position))) for one in states]
@@ -312,7 +316,7 @@ class EstimatedEnvironment:
         return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
 
     def _state(self, date: float) -> OrbitState | None:
-        """Return the state by the fixes, or else by the elements. A wrong clock leaves both unknown."""
+        """Return the orbit state from a recent fix or else from the elements, None if neither is usable."""
         fix = self._recent(date)
         if fix is not None:
             state = fix.at(date)
@@ -324,7 +328,7 @@ class EstimatedEnvironment:
         return None
 
     def _unconfirmed(self, state: OrbitState) -> OrbitState:
-        """Return a state by a few fixes, whose standard deviation covers the distance to the elements."""
+        """Return a state from a few fixes; its standard deviation covers the distance from the elements."""
         sigma = UNCONFIRMED_SIGMA
         if self._elements is not None:
             with suppress(OrbitError):
@@ -358,7 +362,7 @@ class EstimatedEnvironment:
         return near, np.array([seconds])
 
     def _impossibility(self, fix: GpsFix) -> str:
-        """Return why a fix alone is impossible, or an empty text."""
+        """Return why a fix is impossible in itself, or an empty text if the fix is possible."""
         perigee, radius = fix.at(fix.julian_date).perigee_radius, float(np.linalg.norm(fix.position))
         if not (perigee >= LOWEST_ORBIT and radius >= LOWEST_ORBIT):
             return f"radius {1e-3 * radius:.0f} km, perigee radius {1e-3 * perigee:.0f} km is not an orbit"
@@ -366,7 +370,7 @@ class EstimatedEnvironment:
         return f"the date is {early:.1f} days before the epoch of the elements" if early > EARLIEST else ""
 
     def _judge(self, fix: GpsFix, reading: GpsReading, witness: Witness) -> bool:
-        """Return whether a possible fix agrees with the known orbit or replaces it, and use it then."""
+        """Use a fix that agrees with the known orbit or replaces it, and return whether the fix is used."""
         time_ns, offset_ns = reading.time_ns, reading.utc_ns + GPS_DELAY_NS - reading.time_ns
         last = self._recent(fix.julian_date)
         if last is None and self._fix is not None:
@@ -443,7 +447,7 @@ class EstimatedEnvironment:
         return elements is None or self._enlarged > 1.0 or _agree(elements, fix, LEAST_GATE)
 
     def _has_false_time(self, fix: GpsFix, time_ns: int) -> bool:
-        """Return whether a fix agrees with the elements at the time known before, but not at its own time."""
+        """Return whether a fix agrees with the elements at the known time, but not at the fix's own time."""
         if self._elements is None or self._agrees_with_elements(fix):
             return False
         known = self.julian_date(time_ns - GPS_DELAY_NS)

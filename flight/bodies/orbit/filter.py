@@ -46,12 +46,13 @@ from knightcube.gnc.estimation.measurements import (
 )
 
 FORGOTTEN_NS = 10_000_000_000
-"""Time (ns) without a contradicting gyro after which the commanded dipoles are trusted again."""
+"""Time (ns) without a contradiction by the gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
 _KNOWN_RATE = 0.01
-"""Largest standard deviation (rad/s) of the magnetometer's rate by which a direction is propagated."""
+"""Largest standard deviation (rad/s) of a rate from the magnetometer with which a direction is propagated."""
 _MEASURED_SIGMA = 0.7
-"""Largest standard deviation (rad) of the attitude for which the error is linear in a measured attitude."""
+"""Standard deviation (rad) of the attitude below which the filter's linear update by a measured attitude
+holds."""
 _NEGLIGIBLE = 1e-9
 """Current (A) below which a coil is not driven."""
 _EYE: FloatArray = np.eye(3)
@@ -121,7 +122,7 @@ class StepReplay:
         self.refused_gyros = self.refused_fields = self.contradicted = 0
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
-        self._innovation = "body", 0.0  # what the newest gyro innovation can contradict, and its square
+        self._innovation = "body", 0.0  # states tested by the newest gyro innovation; its square
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
@@ -135,7 +136,7 @@ class StepReplay:
                 self._check_learned(step.end_ns / SECOND_NS)
 
     def _check_learned(self, time: float) -> None:
-        """Learn states again that the gyro contradicts consistently until a time (s)."""
+        """Learn states again if the gyro contradicts them consistently in the steps up to `time` (s)."""
         name, square = self._innovation
         if self._checks[name].add(time, square):
             self.contradictions.append(f"the motion contradicts the learned {name}, which are learned again")
@@ -201,7 +202,7 @@ class StepReplay:
         self.take_again(0)
 
     def renew_magnetometer(self) -> None:
-        """Reset bias and matrix of the magnetometer, and discard the fields that the last one measured."""
+        """Reset bias and matrix of the magnetometer, and discard the fields of the previous magnetometer."""
         for step in self.steps:
             step.field = None
         for block in (states.MAGNET, states.FIELD_MATRIX):
@@ -317,7 +318,7 @@ class StepReplay:
         for begin_ns, end_ns in itertools.pairwise(times_ns):
             part = (end_ns - begin_ns) / SECOND_NS
             dipole, impulse = self._dipoles.mean(begin_ns, end_ns), self._dipoles.impulse(begin_ns, end_ns)
-            # Second integral of the dipole minus the second integral of the mean dipole.
+            # Double time integral of the dipole minus that of a constant dipole with the same mean.
             uneven = part * (0.5 * part * dipole - impulse)
             self.free.advance(part, dipole, step.around, step.doubt, uneven)
 
@@ -326,7 +327,7 @@ class StepReplay:
         free, settings, refused = self.free, self._settings, False
         if step.samples:
             since = (step.end_ns - step.gyro_ns) / SECOND_NS
-            # A coil that acts only during a part of the step changes the rate unevenly.
+            # A coil that is driven only during a part of the step does not change the rate uniformly.
             change = self._rate_change(step, since, step.impulse - free.impulse(since))
             noise = settings.gyro_noise**2 / step.samples
             spread = settings.free.coil_error**2 * float(change @ change) + noise
@@ -467,7 +468,7 @@ class OrbitFilter:
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """The estimated strengths (9,), N m, of the torques (`knightcube.astro.earth.disturbance`)."""
+        """The estimated amplitudes (9,), N m, of the torques (`knightcube.astro.earth.disturbance`)."""
         return self._free.torque_sizes
 
     @property
@@ -562,7 +563,7 @@ class OrbitFilter:
         return self.started and not self.doubts_commands
 
     def _follow_field(self, reading: ImuReading, listens: bool) -> None:
-        """Estimate the rate from the magnetometer; the field is used only if `listens`."""
+        """Estimate the rate from the magnetometer; a field is used only if it is valid (`listens`)."""
         assert self._open is not None
         since_ns, now_ns = self._open.end_ns, reading.time_ns
         self._by_field.advance(self._dipoles.mean(since_ns, now_ns), (now_ns - since_ns) / SECOND_NS)
@@ -570,11 +571,11 @@ class OrbitFilter:
             self._by_field.measure(reading.field)
 
     def rate_by_field(self) -> RateByField | None:
-        """Return the present rate by the magnetometer, or None while it is unknown or the gyro works."""
+        """Return the present rate from the magnetometer, or None while it is unknown or the gyro works."""
         found, settings = self._by_field, self._settings
         if not found.started:
             return None
-        # The coils may change the rate by this amount (rad/s) during a step of a second.
+        # Largest rate change (rad/s) that the coils can cause during a step of one second.
         change = settings.dipole_limit * FIELD_STRENGTH / float(np.linalg.eigvalsh(settings.inertia)[0])
         return RateByField(found.rate, found.covariance[RATE, RATE] + change**2 * _EYE)
 
@@ -616,7 +617,8 @@ class OrbitFilter:
             for m in late:
                 if not isinstance(m, AttitudeMeasurement) or id(m) not in known - used:
                     continue
-                # The rejection of an attitude more accurate than the estimate shows wrong learned dipoles.
+                # If an attitude that is more accurate than the estimate is rejected, the learned dipoles are
+                # wrong.
                 sigma = math.sqrt(float(m.covariance.diagonal().max()))
                 if self.knowledge is Knowledge.FINE and sigma < self._free.worst_sigma:
                     used = self._replay.make_room(m, self._placed_ns)

@@ -288,12 +288,13 @@ class PointingTargets:
 
 
 EFFORT = 0.25
-"""Dipole of unit cost, as a fraction of the coils' limit, while following an object."""
+"""Dipole, as a fraction of the coils' limit, that has unit cost while the satellite follows an object."""
 ROLL = math.radians(20.0)
-"""Roll error (rad) of unit cost about the boresight; the value is large, because roll hardly moves the object
-in the image."""
+"""Roll error (rad) about the boresight that has unit cost; the value is large, because roll hardly moves the
+object in the image."""
 RATE = math.radians(1.0)
-"""Rate error (rad/s) of unit cost, chosen because a fast roll blurs the stars at the edge of the image."""
+"""Rate error (rad/s) that has unit cost, chosen because a fast roll blurs the stars at the edge of the
+image."""
 FORESIGHT = 30.0
 """Time (s) over which a track is predicted to report that its object will leave the field of view."""
 
@@ -440,7 +441,7 @@ class LearnedBody:
 
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
-        sizes: sizes (9,) of the disturbance torques, N m.
+        sizes: amplitudes (9,) of the disturbance torques, N m.
         residual: residual dipole (3,), A m^2.
     """
 
@@ -450,7 +451,7 @@ class LearnedBody:
 
 
 ACROSS = 0.03
-"""Dipole moment that slews may use across the plane of the coils, relative to the weakest coil.
+"""Largest dipole moment of a slew normal to the plane of two remaining coils, relative to the weakest coil.
 
 The limit costs little torque: each torque of two coils needs only moments in the plane of these coils.
 """
@@ -620,7 +621,7 @@ class PointingPlanner:
                 self._events.report(events.SLEW_BEGUN, now_ns, text)
 
     def _continue(self, job: PointingJob, table: PointingTable | None, now_ns: int) -> None:
-        """Follow a plan for the rest of the running slew; without one, the running plan is kept."""
+        """Follow a new plan for the rest of the running slew; without a new plan, keep the present plan."""
         paths = self._paths
         if table is None or paths.astray.since is not None or not paths.is_slewing(now_ns, job.target):
             return

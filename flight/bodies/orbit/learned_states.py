@@ -47,7 +47,7 @@ def _places(*parts: slice) -> IntArray:
 
 
 _TORQUES = slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
-"""Slice of the slow states that holds the sizes of the disturbance torques."""
+"""Slice of the slow states that holds the amplitudes of the disturbance torques."""
 PARTS = {
     ERRORS: _places(GYRO, MAGNET, GYRO_MATRIX, FIELD_MATRIX, CAMERA),
     SOURCES: _places(DIPOLE, SUNLIT, TORQUES),

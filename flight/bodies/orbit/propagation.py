@@ -79,7 +79,8 @@ class _Motion(NamedTuple):
         dipole: mean commanded dipole, A m^2, body axes.
         rotation: quaternion from the body axes at the beginning into those at the end.
         rate: body rate at the end, rad/s.
-        middle, field: body rate, rad/s, and magnetic field, T, in body axes, halfway.
+        middle, field: body rate, rad/s, and magnetic field, T, in body axes, at the middle of the
+            propagation.
     """
 
     seconds: float
@@ -145,7 +146,7 @@ class EstimatePropagation:
 
     def _beginning(self, memory: FreeMemory, around: FilterEnvironment) -> _Beginning:
         constants = memory.constants
-        motion = copy.copy(self._free.motion)  # which later corrections of the inertia do not change
+        motion = copy.copy(self._free.motion)  # a copy, which later corrections of the inertia do not change
         x, y, z = (constants[states.DIPOLE] + around.sunlit * constants[states.SUNLIT]).tolist()
         a, b, c, d = memory.quaternion.tolist()
         u, v, w = memory.rate.tolist()

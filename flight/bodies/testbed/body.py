@@ -72,11 +72,12 @@ _UNKNOWN_RATE = 1.0
 _LEAST_FIELD = 0.5
 """Smallest measured horizontal field that gives a heading, as a fraction of the modelled field."""
 _COILS_DECAYED_NS = 50_000_000
-"""Time (ns) from the end of a coil current until the coil's field has decayed and left the unit's filters."""
+"""Time (ns) after a coil current until the coil's field no longer affects the filtered readings of the
+inertial unit."""
 _CONSTANT_FOR = 5.0
 """Time (s) during which the coils' field at the magnetometer is treated as constant."""
 _REFUSED_TO_RESTART = 8
-"""Number of rejected angles in a row, measured while the coils rest, after which the filter starts again."""
+"""Number of rejected angles in a row, measured with the coils off, after which the filter starts again."""
 _VACUUM_PERMEABILITY = 4e-7 * math.pi  # T m/A
 
 
@@ -85,9 +86,9 @@ class UnitFeed:
 
     The unit's own attitude filter depends on its gyro. While the rate is invalid, the angle about the thread
     therefore follows from the horizontal magnetic field, and the rate from the plant model. The field of the
-    body's own coils at the magnetometer is not known. It is treated as an error as large as the field at the
-    centre of a coil, which stays constant for `_CONSTANT_FOR` seconds. While the coils are driven, star
-    attitudes and streak rates therefore outweigh the magnetometer.
+    body's own coils at the magnetometer is not known. The unknown field is treated as an error that stays
+    constant for `_CONSTANT_FOR` seconds and is as large as the field at the centre of a coil. While the coils
+    are driven, star attitudes and streak rates therefore outweigh the magnetometer.
     """
 
     def __init__(
@@ -245,9 +246,10 @@ class TestbedEstimation(BodyEstimation):
         self._largest = np.array([config.modes.arrived_angle / 3.0, config.modes.arrived_rate])
 
     def is_accurate(self, estimate: Estimate) -> bool:
-        """Return whether three standard deviations of the angle and one of the rate permit an arrival.
+        """Return whether an estimate is accurate enough to verify an arrival at the target.
 
-        An error of the angle moves the body, while the noise of the rate averages out within seconds.
+        The test uses three standard deviations of the angle, but only one of the rate: an angle error
+        displaces the body, while rate noise averages out within seconds.
         """
         variances = estimate.covariance.diagonal()
         largest = np.array([variances[ATTITUDE].max(), variances[RATE].max()])

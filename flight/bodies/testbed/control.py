@@ -4,13 +4,13 @@ Paths are planned by one of three strategies. The strategy GOAL plans the whole 
 every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
 continuation of the step. Near the goal time, the last path is followed to its end. From then on each plan
 holds the target for one replanning period. A body displaced from its path gets a new plan. The strategy
-RECEDING is that of the thesis: each plan reaches the target a whole horizon later (Sease, chapter 5, Optimal
-Path Planning). The strategy STEP makes no plan, so that the controller tracks the target itself.
+RECEDING is that of the thesis: each plan reaches the target one whole planning horizon later (Sease, chapter
+5, Optimal Path Planning). The strategy STEP makes no plan, so that the controller tracks the target itself.
 
 The control laws are B-dot detumbling and a controller of the rotation about the thread. In a Helmholtz cage,
 the magnetic field is that of an orbit, which the flight software predicts. The cage produces the field that a
-satellite would meet in its local orbital frame: x along the flight direction, z down, and y, the axis of the
-thread, opposite to the orbit normal. The rotation about the thread is therefore the pitch of an
+satellite would measure in its local orbital frame: x along the flight direction, z down, and y, the axis of
+the thread, opposite to the orbit normal. The rotation about the thread is therefore the pitch of an
 Earth-pointing satellite, in a field that rotates once per revolution and varies in strength. The cage
 produces only the two field components normal to the thread, multiplied by `scale`. The component along the
 thread would cause no torque about the thread.
@@ -175,7 +175,7 @@ def law_of(target: Target) -> ThreadLaw:
 
 _AGAIN_NS = 1_000_000_000
 _ARRIVED_NS = 100_000_000
-"""Longest time (ns) to the goal time at which a new plan holds the target."""
+"""Time (ns) before the goal time from which on a new plan holds the target."""
 _MAX_HORIZON = 60.0
 """Longest planning horizon (s) of a path."""
 
@@ -218,7 +218,7 @@ class PlanningSettings:
 
 
 class Planning:
-    """Owns the planner's running job, the request for the next job, and the goal time."""
+    """Holds the planner's running job, the request for the next job, and the goal time."""
 
     def __init__(
         self,
@@ -317,7 +317,7 @@ class Planning:
         towards_goal = settings.strategy is Strategy.GOAL
         start_q2, start_rate, horizon = estimate.q2, estimate.rate, settings.horizon
         if self._has_arrived(now_ns):
-            # A plan from the estimate would give up the tracker's stiffness against disturbances.
+            # A plan that starts at the estimated angle would follow disturbances instead of correcting them.
             horizon, held = settings.replan_period, self._guidance.sample(now_ns)
             if held is not None:
                 start_q2, start_rate = q2_of(held.angle), held.rate

@@ -218,7 +218,7 @@ class Activate:
 
 @dataclass(frozen=True, slots=True)
 class _OnRenewal:
-    """Directive about the renewal of one kind of artefact, an index of `KINDS`."""
+    """Directive about the renewal of one kind of artefact, which `kind` gives as an index of `KINDS`."""
 
     kind: int
 

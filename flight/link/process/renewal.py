@@ -42,7 +42,7 @@ def decoded(data: bytes) -> Any:
 
 
 class Renewal:
-    """Exchange of files with the privileged part of the renewal."""
+    """Interface to the privileged part of the renewal, with which it exchanges files."""
 
     def __init__(self, folder: Path, status: Path, command_loss: float) -> None:
         """Use `folder` for requests and records, and read the reports in the file `status`.
@@ -64,7 +64,7 @@ class Renewal:
         """Store a request for the privileged part. Return the reason for a failure, or an empty text.
 
         The request to activate an artefact contains the UTC (s) by the receiver, if a fix was used since the
-        start of the link. The host's clock may be wrong, so expiry dates are not judged by it.
+        start of the link. The host's clock may be wrong, so expiry dates are not compared with it.
         """
         if not self._status.exists():
             return "this board has no renewal: deploy/install.sh installs it"
@@ -85,7 +85,7 @@ class Renewal:
     def followed(self, packet: bytes, now_ns: int, *, live: bool) -> None:
         """Note a fault, a refused configuration, or a reaction to SAFE, in a packet of telemetry.
 
-        The time of a used GPS fix is noted too, if the packet was written a moment ago (`live`).
+        The time of a used GPS fix is also noted if the packet was just written (`live` is true).
         """
         if packet[:2] == _MODE_LAYOUT.identifier.to_bytes(2, "big"):
             (row,) = _MODE_LAYOUT.array(packet)

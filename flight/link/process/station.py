@@ -678,7 +678,7 @@ class Station:
         self._hand_over(sent, admitted.data, now_ns)
 
     def _joined(self, admitted: Admitted) -> Admitted:
-        """Return a frame's content, after the last portion of a packet with the whole packet.
+        """Return a frame's content; after the last portion of a packet, the content has the whole packet.
 
         Raises CommandError for a portion that does not follow the portion before it.
         """
@@ -756,7 +756,7 @@ class Station:
             self._downlink.live(self._log.label)
 
     def _follow_utc(self, label: bytes, mission_offset_ns: int) -> None:
-        """Accept the newest run packet, and the mission time minus the time of the host's clock, ns.
+        """Update the newest run packet, and the offset (ns) of mission time from the host's clock.
 
         Packets are written to the log with a delay, so the largest difference is the most accurate one.
         """
