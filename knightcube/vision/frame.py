@@ -6,14 +6,14 @@ background. Sease, chapter 3, uses the mean of the image as threshold, but noise
 above the mean (errata). The sum over 3 x 3 pixels is nearly the matched filter of a star image one pixel
 wide.
 
-A hot pixel is a bright pixel with dark neighbours, which no optics can produce. If a star's image has a
-standard deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the
-intensity of that pixel. Methods that need an image without gaps replace only those hot pixels that are
-detected with certainty. A fit to pixels excludes hot pixels, which does little harm if a pixel of a star is
-excluded by mistake.
+A hot pixel is a bright pixel with dark neighbours. A point of light cannot cause this pattern, because the
+optics spread its light over several pixels. If a star's image has a standard deviation of more than 0.5 px,
+the four neighbours of its brightest pixel have at least 15 % of the intensity of that pixel. Methods that
+need an image without gaps replace only those hot pixels that are detected with certainty. A fit to pixels
+excludes all suspected hot pixels. Excluding a pixel of a star by mistake does little harm.
 
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
-8-bit counts were stored as 16 bits, and of 16 if 12-bit counts were.
+8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Background:
         return _interpolated(grid, self.shape)
 
     def level_at(self, column: FloatArray | IntArray, row: FloatArray | IntArray) -> FloatArray:
-        """Return the level, interpolated bilinearly at pixels whose columns and rows broadcast together."""
+        """Return the bilinearly interpolated level at pixels; the columns and rows are broadcast."""
         return among_blocks(self.level, self.shape, *np.broadcast_arrays(column, row))
 
     def subtracted(self, pixels: Image) -> tuple[Image, Image]:
@@ -86,7 +86,7 @@ def _interpolated(grid: FloatArray, shape: tuple[int, int]) -> Image:
 
 
 def _subtracted_numpy(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple[Image, Image]:
-    """Return `pixels` minus the interpolated `level`, and the interpolated `variance`, both of blocks."""
+    """Return `pixels` minus the level, and the variance, both interpolated from the values of the blocks."""
     signal = _interpolated(level, (pixels.shape[0], pixels.shape[1]))
     # Arrays are changed in place, because allocating large arrays takes more time than the arithmetic.
     np.subtract(pixels, signal, out=signal)
@@ -109,7 +109,8 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
             of_row[0, block] = (1.0 - share) * level[top, of] + share * level[bottom, of]
             of_row[1, block] = (1.0 - share) * variance[top, of] + share * variance[bottom, of]
         for block in range(-1, across):
-            # The columns from this block's centre to the next one, and those before the first centre.
+            # These columns reach from this block's centre to the next centre, and include the columns before
+            # the first centre.
             first = max(math.ceil(block * width + 0.5 * (width - 1)), 0)
             last = columns if block == across - 1 else math.ceil((block + 1) * width + 0.5 * (width - 1))
             _fill_row(signal[row], floor[row], pixels[row], of_row, max(block, 0), width, first, last)
@@ -127,7 +128,7 @@ def _fill_row(
     first: int,
     last: int,
 ) -> None:
-    """Compute the columns from `first` to `last` of a row of `_subtracted` from the block values `of_row`."""
+    """Write the columns `first` to `last` of a row of signal and variance from the block values `of_row`."""
     centre, scale = np.float32(block * width + 0.5 * (width - 1)), np.float32(1.0 / width)
     level, slope = of_row[0, block], of_row[0, block + 1] - of_row[0, block]
     variance, rise = of_row[1, block], of_row[1, block + 1] - of_row[1, block]
@@ -137,9 +138,10 @@ def _fill_row(
         floor[column] = variance + share * rise
 
 
-# Minimum fraction of blocks whose level changes smoothly by more than the noise, under stray light.
+# Minimum fraction of blocks with a smooth change of the level above the noise from which stray light is
+# assumed.
 _LEAST_UNEVEN = 0.25
-# Largest ratio of second to first differences of the levels of blocks, for a smooth change.
+# Largest ratio of the second to the first difference of the levels of neighbouring blocks in a smooth change.
 _SMOOTH = 0.5
 
 
@@ -152,9 +154,10 @@ def estimate_background(
     per block give the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block
     that is filled by a bright object gets the median noise of the surrounding 3 x 3 blocks.
 
-    Stray light changes the level within a block. Blocks and stride are then halved, and the moments are those
-    of the differences from the level that is interpolated between the centres of the larger blocks. Stray
-    light is assumed if many neighbouring blocks differ, unless `stray_light` states it.
+    Under stray light, the level varies within a block. In this case, the block size and the stride are
+    halved, and the moments are computed from the differences between the pixels and the level interpolated
+    between the centres of the larger blocks. Stray light is assumed if many neighbouring blocks differ,
+    unless `stray_light` states it.
     """
     coarse = _of_blocks(pixels, block, stride, None)
     if not (_is_uneven(coarse) if stray_light is None else stray_light):
@@ -163,7 +166,7 @@ def estimate_background(
 
 
 def _of_blocks(pixels: Image, block: int, stride: int, coarse: Background | None) -> Background:
-    """Return the background in blocks, by differences from the interpolated background `coarse` if given."""
+    """Return the background in blocks, from the differences to the background `coarse` if it is not None."""
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
     rows, columns = pixels.shape
@@ -207,7 +210,8 @@ def _clipped_moments_numpy(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     median = _median_of_blocks(values)
     apart = np.abs(values - median)
     spread = MAD_TO_SIGMA * _median_of_blocks(apart)
-    # Quantisation can make the median deviation zero. A clipping limit of 1.5 counts keeps adjacent counts.
+    # Quantisation can make the median deviation zero. A minimum clipping limit of 1.5 counts keeps pixels
+    # that differ by one count from the median.
     kept = apart <= _CLIP * np.maximum(spread, 0.5)
     count = kept.sum(axis=-1)
     level = np.where(kept, values, 0.0).sum(axis=-1) / count
@@ -238,15 +242,15 @@ def _clipped_moments(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 _SAMPLES, _FEW = 16, 24
-"""Number of values from which a pivot is chosen, and number of values that are sorted."""
+"""Number of sampled values from which a pivot is chosen, and maximum number of values sorted directly."""
 
 
 @loop_helper
 def _ordered(values: FloatArray, place: int, scratch: FloatArray) -> float:
     """Return the value that has the index `place` in ascending order; `scratch` is overwritten.
 
-    The pivot of this quickselect is taken from a sorted sample, and the values on its other side are omitted
-    without unpredictable branches.
+    This quickselect takes the pivot from a sorted sample of the values. It discards the values on the wrong
+    side of the pivot without branches, which the processor could not predict.
     """
     current, size, few = values, len(values), np.empty(_SAMPLES)
     while size > _FEW:
@@ -299,10 +303,11 @@ def _median(values: FloatArray, scratch: FloatArray) -> float:
 def _places_in_blocks_numpy(
     sample: Float32Array, level: FloatArray, noise: FloatArray, low: int, high: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the values with the indices `low` and `high` in the ascending order of each block's pixels.
+    """Return two order statistics of the pixels of each block: the values of ranks `low` and `high`.
 
     The pixels `sample` (rows, columns) are divided into the blocks of `level` and `noise` (down, across). The
-    values (down, across) are relative to level and noise.
+    pixels are normalised: the level of the block is subtracted, and the difference is divided by the noise.
+    The two returned arrays have the shape (down, across).
     """
     (rows, columns), (down, across) = sample.shape, level.shape
     block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
@@ -345,10 +350,10 @@ def _median_of_blocks(values: FloatArray) -> FloatArray:
 
 
 def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
-    """Return the index (n,) of the last block centre before `pixel` (n,), and the distance to it in blocks.
+    """Return the index (n,) of the last block centre before each `pixel` (n,), and its distance in blocks.
 
-    A side of the frame of length `pixels` is divided into `blocks` of equal length. Pixels beyond the
-    outermost block centres are treated like these centres.
+    A side of the frame of length `pixels` is divided into `blocks` of equal length. A pixel beyond the
+    outermost block centres gets the value of the nearest centre.
     """
     width = pixels // blocks
     place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)
@@ -373,7 +378,7 @@ def among_blocks(
 
 
 def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
-    """Return weights (pixels, blocks) that interpolate linearly between block centres along one side."""
+    """Return the weights (pixels, blocks) of linear interpolation between block centres along one side."""
     first, share = place_among_blocks(np.arange(pixels, dtype=float), pixels, blocks)
     weights = np.zeros((pixels, blocks))
     weights[np.arange(pixels), first] += 1.0 - share
@@ -382,7 +387,7 @@ def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
 
 
 _STRETCH = 32_768
-"""Number of pixels that are summed at once, small enough for the cache of the processor."""
+"""Number of pixels that are summed in one step, small enough for the processor's cache."""
 
 
 def box_sum(image: Image) -> Image:
@@ -395,7 +400,8 @@ def _box_sum_numpy(image: Image) -> Image:
     columns, flat = image.shape[1], image.reshape(-1)
     total = np.empty(image.shape, dtype=image.dtype)
     sums = total.reshape(-1)
-    # In the flat array, successive rows join, which falsifies only the sums at the border.
+    # In the flat array, the end of each row adjoins the start of the next row, so that only the sums at the
+    # border are wrong.
     for start in range(columns + 1, flat.size - columns - 1, _STRETCH):
         stop = min(start + _STRETCH, flat.size - columns - 1)
         down = flat[start - columns - 1 : stop - columns + 1] + flat[start - 1 : stop + 1]
@@ -440,15 +446,15 @@ def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Ima
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
-    """The light of n regions.
+    """The moments of the brightness of n regions.
 
     Attributes:
-        flux: light (n,), counts.
+        flux: sum of the counts above the background in each region (n,).
         centre: centroid of each region (n, 2), x and y, px.
         length: length of the uniform line that has the same second moments as each region (n,), px. The
             length is about 0 for a round region.
         thickness: rms width of each region across its long axis (n,), px.
-        direction: angle from the pixel rows to the long axis of each region (n,), rad.
+        direction: angle from the x axis to the long axis of each region (n,), rad.
     """
 
     flux: FloatArray
@@ -467,8 +473,8 @@ def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
 def _label_pixels_numpy(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
     """Return the result of `label_pixels`.
 
-    Each run of pixels is linked to an earlier run of its region, and the links are shortened until all runs
-    of a region share one root (Shiloach and Vishkin 1982). The same connection of regions with scipy.sparse
+    Each run of adjacent pixels is linked to an earlier run of the same region, and the links are shortened
+    until all runs of a region share one root (Shiloach and Vishkin 1982). An implementation with scipy.sparse
     would need 12 MiB more memory.
     """
     # An empty column is added, so that no run of pixels continues in the next row.
@@ -525,7 +531,8 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
             above += 1
     count = 0
     for run in range(runs):
-        # The root of a region is its first run, whose number is already that of the region.
+        # The root of a region is its first run, and the number of this run is already the number of the
+        # region.
         if root[run] == run:
             start[run] = count
             count += 1
@@ -546,7 +553,7 @@ def _root_of(root: IntArray, run: int) -> int:
 
 
 def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int) -> Moments:
-    """Return the moments of `count` regions from region index, position and counts of each of m pixels.
+    """Return the moments of `count` regions from the region index, the position and the counts of m pixels.
 
     The moments of a region with zero flux are zero.
     """
@@ -566,7 +573,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 def _moment_sums_numpy(
     owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
 ) -> FloatArray:
-    """Return flux, centroid (x, y) and second moments (xx, yy, xy) of `count` regions (6, count).
+    """Return the moments (6, count) of `count` regions: flux, centroid (x, y), second moments (xx, yy, xy).
 
     The arguments are those of `moments`.
     """
@@ -622,25 +629,26 @@ def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> 
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
 """Limits for the neighbours of a hot pixel.
 
-A neighbour of a hot pixel must be below two limits: a fraction of the hot pixel plus standard deviations of
-the noise, and a maximum fraction of the hot pixel.
+Each neighbour of a hot pixel must satisfy two conditions. It is below the first value times the hot pixel's
+brightness plus the second value times the noise. It is also below the third value times the hot pixel's
+brightness.
 """
 _PAIR, _PAIR_NOISE = 20.0, 1.0
-"""Limits (standard deviations) for the recognition of two adjacent hot pixels.
+"""Thresholds (noise standard deviations) for the recognition of two adjacent hot pixels.
 
-For two adjacent hot pixels, the first limit is the minimum brightness of both pixels. For two adjacent hot
-pixels, the second limit is the number of standard deviations by which noise may raise the third brightest
-pixel.
+The first value is the minimum brightness of the brightest pixel. The second value is the number of standard
+deviations by which noise may raise the third brightest pixel.
 """
 _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
-"""Minimum brightness (standard deviations) of hot pixels that are replaced, and of excluded hot pixels."""
+"""Minimum brightness (noise standard deviations) of replaced hot pixels, and of excluded hot pixels."""
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
 def repair_hot_pixels(signal: Image, noise: Image) -> int:
     """Replace hot pixels of `signal` (rows, columns) by their neighbours' median, and return their number.
 
-    Only pixels well above the standard deviation `noise` (rows, columns) of the noise are tested.
+    Only pixels well above the noise are tested. The array `noise` (rows, columns) is the standard deviation
+    of the noise.
     """
     row, column = find_hot_pixels(signal, np.square(noise))
     bright = signal[row, column] > _REPAIR_SIGMAS * noise[row, column]
@@ -683,7 +691,7 @@ def _hot_places(signal: Image, variance: Image, least: float) -> tuple[IntArray,
 
 @loop_helper
 def _is_hot(signal: Image, row: int, column: int, noise: float) -> bool:
-    """Return whether a pixel inside the frame is hot, see `are_hot` and `_hot`."""
+    """Return whether one pixel, not at the border of the frame, is hot, by the criteria of `are_hot`."""
     own = signal[row, column]
     if own <= _HOT_SIGMAS * noise:
         return False
@@ -706,8 +714,9 @@ def _is_hot(signal: Image, row: int, column: int, noise: float) -> bool:
 def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[IntArray, IntArray]:
     """Return rows and columns of the hot pixels of a frame (rows, columns), as `find_hot_pixels` does.
 
-    Only the pixels that exceed the lowest limit of the surrounding blocks are tested, so that the background
-    is not computed for every pixel. If at most `most` pixels exceed it, the returned arrays are empty.
+    Only the pixels that exceed the lowest threshold of the surrounding blocks are tested, so that the
+    background is not interpolated at every pixel. The returned arrays are empty if at most `most` pixels
+    exceed this threshold.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -716,7 +725,8 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
     limit = background.level + _HOT_SIGMAS * background.noise
     lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
     if np.issubdtype(pixels.dtype, np.integer):
-        # Integer pixels are compared in their own type, which is four times as fast.
+        # Integer pixels are compared with an integer threshold, which is four times as fast as in floating
+        # point.
         lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
     lowest = lowest.astype(pixels.dtype)
     row, column = np.divmod(_bright_indices(np.ascontiguousarray(pixels), lowest), columns)
@@ -732,7 +742,7 @@ def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[
 
 
 def _bright_indices_numpy(pixels: Image, lowest: Image) -> IntArray:
-    """Return the ascending flat indices (m,) of the pixels that are at least `lowest` (down, across).
+    """Return the flat indices (m,) of the pixels that reach the threshold `lowest` of their block.
 
     Rows and columns beyond the last whole block belong to the last blocks.
     """
@@ -763,10 +773,10 @@ def _bright_indices(pixels: Image, lowest: Image) -> IntArray:
 
 
 def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
-    """Return whether each of n windows of nine pixels contains only one or two hot pixels and noise.
+    """Return whether each of n windows of nine pixels contains one or two hot pixels, but no point of light.
 
-    The counts above the background `light` (9, n) are those of the pixels of each window, and `noise` (n,) is
-    the noise of a pixel.
+    The array `light` (9, n) contains the counts above the background of the pixels of each window, and
+    `noise` (n,) the standard deviation of the noise of one pixel.
     """
     third, second, highest = np.partition(light, (6, 7, 8), axis=0)[6:]
     alone = second < np.minimum(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
@@ -786,27 +796,26 @@ def _hot(
     row, column, noise = row[inside], column[inside], noise[inside]
     around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND]) - level
     own = signal[row, column] - level
-    # Of two adjacent hot pixels, both are tested, but a pixel with two brighter neighbours is not hot.
+    # A hot pixel has at most one brighter neighbour, because up to two adjacent pixels can be hot.
     hot = are_hot(np.concatenate([around, own[None]]), noise) & (np.count_nonzero(around > own, axis=0) <= 1)
     return row[hot], column[hot], around[:, hot]
 
 
 _DEAD_FRACTION = 1e-4
-"""Largest fraction of pixels, such as hot pixels, that differ from the common value in a dead frame."""
+"""Largest fraction of pixels, such as hot pixels, that differ from the median in a dead frame."""
 _PLATEAU = 6
-"""Minimum number of saturated pixels in a frame of streaks from which saturation is recognised."""
+"""Minimum number of pixels with the highest count in a saturated frame of streaks."""
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
-"""Limits for saturation in a frame of points.
+"""Limits by which saturation is recognised in a frame of point stars.
 
-The first limit for saturation is the minimum number of pixels with the highest count. The second limit for
-saturation is the minimum ratio of the number of pixels with the highest count to that with slightly smaller
-counts. The third limit for saturation is the width of the range just below the highest count, as a fraction
-of the range of all counts.
+The first value is the minimum number of pixels with the highest count. The second value is the minimum ratio
+of this number to the number of pixels with slightly smaller counts. The third value is the width of the range
+of slightly smaller counts, as a fraction of the difference between the highest count and the median.
 """
 
 
 class FrameState(Enum):
-    """Whether a frame contains a scene, and the reason if it does not."""
+    """The state of a frame: usable, or the reason why it shows no scene."""
 
     USABLE = "usable"
     BLACK = "black"
@@ -816,8 +825,8 @@ class FrameState(Enum):
 def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> FrameState:
     """Return whether a frame (rows, columns) is usable, dead (all pixels are equal) or overexposed.
 
-    A frame is overexposed if at least a fraction `saturated_fraction` of its pixels reaches `saturation`
-    counts.
+    A frame is overexposed if at least the fraction `saturated_fraction` of its pixels reaches the count
+    `saturation`.
     """
     if np.count_nonzero(at_least(pixels, saturation)) >= saturated_fraction * pixels.size:
         return FrameState.SATURATED
@@ -836,9 +845,9 @@ def saturation_level(pixels: Image, given: float | None) -> float:
 
 
 def saturation_count(pixels: Image) -> float:
-    """Return the saturation count: the highest count if several pixels have it, or else the type's maximum.
+    """Return the saturation count: the highest count if several pixels have it, otherwise the type's maximum.
 
-    For frames of streaks, in which bright stars cover many pixels, this function finds the saturation.
+    This function is for frames of streaks, in which a bright star covers many pixels.
     """
     highest = pixels.max()
     # A frame with only one value is dead, unless the value is the maximum of its type.
@@ -848,11 +857,12 @@ def saturation_count(pixels: Image) -> float:
 
 
 def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None) -> float:
-    """Return the saturation count: `given`, or the highest of `counts` (m,) if frequent, or the maximum.
+    """Return the saturation count of a frame of point stars from any camera.
 
-    For frames of point stars from any camera, this function finds the saturation. In a dim frame, the highest
-    counts are due to noise, and the higher a count, the fewer pixels have it. In a saturated frame, more
-    pixels have the highest count than the counts just below.
+    The result is `given` if it is not None, otherwise the highest of the `counts` (m,) if it is frequent,
+    otherwise the maximum of the pixels' type. In a dim frame, the highest counts are due to noise, and the
+    higher a count, the fewer pixels have it. In a saturated frame, more pixels have the highest count than
+    the counts just below.
     """
     top = saturation_level(pixels, given)
     highest = counts.max(initial=-np.inf)
@@ -868,7 +878,7 @@ def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None)
 def at_least(pixels: Image, level: float) -> BoolArray:
     """Return which `pixels` reach a `level`, counts.
 
-    Integer pixels are compared with the level in their own type.
+    If the pixels are integers, the level is rounded up to an integer of the same type.
     """
     if not np.issubdtype(pixels.dtype, np.integer) or not 0.0 <= level <= np.iinfo(pixels.dtype).max:
         return np.asarray(pixels >= level)
@@ -878,13 +888,13 @@ def at_least(pixels: Image, level: float) -> BoolArray:
 _STRIDE = 16
 """Distance (px) between the pixels that are sampled to estimate the step between counts."""
 _MOST_BETWEEN = 0.01
-"""Largest fraction of pixels whose counts are not multiples of the step, as after a repair of hot pixels."""
+"""Largest fraction of pixels, such as repaired hot pixels, whose counts are not multiples of the step."""
 
 
 def in_steps(pixels: Image) -> tuple[Image, int, int]:
     """Return `pixels` (rows, columns) divided by the step between their counts, the step, and the offset.
 
-    Unsigned pixels without a common step are returned unchanged, with the step 1 and the offset 0.
+    If the counts have no common step, the pixels are returned unchanged, with the step 1 and the offset 0.
     """
     values = np.unique(pixels[::_STRIDE, ::_STRIDE]).astype(np.int64)
     step = int(np.gcd.reduce(values - values[0]))

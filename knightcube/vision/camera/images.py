@@ -4,7 +4,7 @@
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
     write_picture(Path("found.png"), grey_stretch(pixels))
 
-Row 0 of an image array is the top row. A photograph is rotated as the orientation in its EXIF data states.
+Row 0 of an image array is the top row. A photograph is rotated according to the orientation in its EXIF data.
 In a FITS file, the first row is the top row unless the keyword ROWORDER is 'BOTTOM-UP'. An image read in the
 wrong row order is a mirror image of the sky.
 
@@ -45,11 +45,12 @@ SIGNATURE = b"SIMPLE  ="
 BLOCK = 2880
 CARD = 80
 _GZIP, _MOST_BYTES, _MOST_AXES = b"\x1f\x8b", 1 << 30, 999
-"""First bytes of a gzip file, largest decompressed size (bytes), and largest NAXIS of the FITS Standard."""
+"""First bytes of a gzip file; largest accepted decompressed size (bytes); largest NAXIS of the FITS Standard.
+"""
 KINDS = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 """NumPy types of the pixels of a FITS file by the value of its BITPIX keyword."""
 UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
-"""BZERO of unsigned integers that are stored as signed ones (FITS Standard 4.0, section 4.4.2.5)."""
+"""BZERO and type of unsigned integers that FITS stores as signed integers (FITS Standard 4.0, 4.4.2.5)."""
 
 
 def fits_image(content: bytes, name: str) -> Image:
@@ -58,7 +59,8 @@ def fits_image(content: bytes, name: str) -> Image:
     The image is the primary image or, if the primary image is empty, the first image extension. Integer
     pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO value of unsigned integers
     become unsigned. Pixels with any other BZERO or BSCALE value become float64. Three planes of colour are
-    converted to luminance. Raises UsageError, with the file's `name`, if the image is not supported.
+    converted to luminance. Raises UsageError with a message that begins with the file's `name` if the image
+    is not supported.
     """
     header, axes, start = _first_image(content, name)
     bits = _whole(header, "BITPIX", name)
@@ -79,7 +81,7 @@ def fits_image(content: bytes, name: str) -> Image:
 
 
 def _first_image(content: bytes, name: str) -> tuple[dict[str, str], list[int], int]:
-    """Return header, axes (columns, rows and possibly 3) and offset of the first image of a FITS file."""
+    """Return header, axes (columns, rows, perhaps 3) and data offset of the first image of a FITS file."""
     place, empty = 0, ""
     while place == 0 or content.startswith(b"XTENSION=", place):
         header, start = _header(content, name, place)
@@ -104,7 +106,7 @@ def _first_image(content: bytes, name: str) -> tuple[dict[str, str], list[int], 
 
 
 def _axes(header: dict[str, str], name: str) -> list[int]:
-    """Return the sizes of the axes of a FITS image: columns, rows and further axes."""
+    """Return the lengths of the axes of a FITS image: columns, rows and any further axes."""
     count = _whole(header, "NAXIS", name)
     if not 0 <= count <= _MOST_AXES:
         raise UsageError(f"{name}: NAXIS = {count}: give 2 axes, or 3 for colour")
@@ -121,7 +123,7 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
     A grey image (rows, columns) is returned unchanged. Colours (rows, columns, 3) in the order red, green and
     blue, with or without a fourth channel of transparency, are converted to luminance (ITU-R BT.601) of the
     same type; transparency is ignored. A third axis of length 1, or of 2 for grey and transparency, is
-    removed. Raises ValueError for other shapes.
+    removed. Raises ValueError for an array of any other shape.
     """
     if isinstance(pixels, (str, Path)):
         raise ValueError(f"{pixels}: give an array of pixels, such as read_image({str(pixels)!r})")
@@ -197,7 +199,7 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
 def _header(content: bytes, name: str, begin: int) -> tuple[dict[str, str], int]:
     """Return the values of a FITS header by keyword, as text, and the byte offset of the first pixel.
 
-    The header begins at the byte `begin`.
+    The byte with the index `begin` is the first byte of the header.
     """
     header: dict[str, str] = {}
     for place in range(begin, len(content) - CARD + 1, CARD):
@@ -234,7 +236,7 @@ FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 EXTRA = "pip install pillow"
 
 PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
-"""The TIFF tag PhotometricInterpretation and its value WhiteIsZero (TIFF 6.0, section 8)."""
+"""Number of the TIFF tag PhotometricInterpretation, and the tag's value WhiteIsZero (TIFF 6.0, section 8)."""
 GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16}
 """NumPy types of grey images by the name of their Pillow mode."""
 COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
@@ -255,9 +257,9 @@ def read_image(path: Path | str) -> Image:
 
     The format is recognised by the file's content, not by its name. Pixels are uint8 or uint16, and those of
     FITS files may also be signed, 32-bit or floating-point. Colour images are converted to luminance (ITU-R
-    BT.601). Photographs are rotated as their EXIF data state. All formats but FITS need Pillow. Raises
-    UsageError if the file is missing, damaged or of another format, if pixels are not finite, or if Pillow
-    is missing.
+    BT.601). Photographs are rotated according to the orientation in their EXIF data. All formats but FITS
+    need Pillow. Raises UsageError if the file is missing, damaged or in an unsupported format, if pixels are
+    not finite, or if Pillow is not installed.
     """
     path = Path(path)
     content = _fits_content(path)
@@ -267,7 +269,7 @@ def read_image(path: Path | str) -> Image:
 def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
     """Return the image (rows, columns) of a file of raw pixels, of 8 bits or of 16 bits little-endian.
 
-    In the file, the pixels are stored row by row at the end. Any header before the pixels is skipped. Raises
+    The pixels are stored row by row at the end of the file. Any header before the pixels is skipped. Raises
     UsageError if the file is missing or too short.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
@@ -340,15 +342,15 @@ def _through_pillow(path: Path) -> Image:
 
 
 _ON_SIDE = (5, 6, 7, 8)
-"""Values of the tag Orientation for which the stored rows are columns of the displayed image."""
+"""Values of the EXIF tag Orientation for which the stored rows are columns of the displayed image."""
 _ORIENTATION = 0x0112
-"""The tag Orientation of EXIF 2.3 and TIFF 6.0: where row 0 and column 0 of the stored pixels belong."""
+"""Number of the tag Orientation (EXIF 2.3, TIFF 6.0), which gives the sides of row 0 and column 0."""
 
 
 def _upright(image: Image, picture: Picture) -> Image:
-    """Return an image (rows, columns) rotated and mirrored as the EXIF data of its file states."""
+    """Return an image (rows, columns) rotated and mirrored according to the EXIF data of its file."""
     orientation: object = 1
-    # Pillow itself rotates TIFF images by half a turn or mirrors them. Damaged metadata are ignored.
+    # Pillow itself rotates TIFF images by 180 deg or mirrors them. Damaged metadata are ignored.
     with suppress(OSError, SyntaxError, ValueError, TypeError, LookupError, struct.error):
         orientation = picture.getexif().get(_ORIENTATION, 1)
     if orientation not in range(1, 9):
@@ -365,8 +367,8 @@ def _upright(image: Image, picture: Picture) -> Image:
 def _check_kept(path: Path, picture: Picture) -> None:
     """Raise UsageError for images that Pillow misreads.
 
-    Pillow truncates 16-bit colour, ignores the TIFF value WhiteIsZero, and mixes up the rows of TIFF images
-    that are stored on their side.
+    Pillow truncates 16-bit colour, ignores the TIFF value WhiteIsZero, and reorders the rows incorrectly in
+    TIFF images that are stored rotated by 90 deg.
     """
     deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
     if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):
@@ -380,7 +382,7 @@ def _check_kept(path: Path, picture: Picture) -> None:
 
 
 def _raw_mode(args: object) -> str:
-    """Return the raw mode of a Pillow image tile, which is the first argument of the tile's decoder."""
+    """Return the raw mode of a Pillow image tile, the first of the arguments `args` of the tile's decoder."""
     return str(args[0]) if isinstance(args, tuple) and args else str(args)
 
 
@@ -391,7 +393,7 @@ def _is_deep(picture: Picture) -> bool:
 
 
 def _low_bytes(args: Any) -> Any:
-    """Return the arguments of a Pillow decoder with swapped byte order, which makes it keep the low bytes."""
+    """Return the arguments of a Pillow decoder for the swapped byte order, so that it keeps the low bytes."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
 

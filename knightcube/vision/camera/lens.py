@@ -4,14 +4,14 @@ In the camera frame, the boresight is +z, x points right along the rows and y do
 (0, 0) is the centre of the top-left pixel. The pinhole camera follows Sease, eq. (2.1) to (2.4), except that
 stars behind the camera are dropped and pixel coordinates start at 0.
 
-The lens maps a direction with tangents u = (x/z, y/z) to the pixel f A d + centre with the distorted tangents
-d = u (1 + k1 |u|^2 + k2 |u|^4) + (2 p1 u_x u_y + p2 (|u|^2 + 2 u_x^2), p1 (|u|^2 + 2 u_y^2) + 2 p2 u_x u_y)
-(Brown 1966, radial and tangential terms). The matrix A = ((1 + aspect, shear), (shear, 1 - aspect)) describes
-pixels that are not square. Beyond the field angle at which the distorted radius stops growing, the distortion
-polynomial folds back on itself. A `Lens` images no direction beyond the fold of its distortion, and raises
-LensError if the fold lies within the detector.
+The lens projects a direction with tangents u = (x/z, y/z) onto the pixel f A d + centre with the distorted
+tangents d = u (1 + k1 |u|^2 + k2 |u|^4) + (2 p1 u_x u_y + p2 (|u|^2 + 2 u_x^2), p1 (|u|^2 + 2 u_y^2) + 2 p2
+u_x u_y) (Brown 1966, radial and tangential terms). The matrix A = ((1 + aspect, shear), (shear, 1 - aspect))
+describes pixels that are not square. Beyond the field angle at which the distorted radius reaches its
+maximum, the distortion polynomial folds back: two field angles give the same pixel. A `Lens` images no
+direction beyond the fold of its distortion, and raises LensError if the fold lies within the detector.
 
-The class `Exposures` gives the exposure at which streaks are long enough for an accurate rate.
+The class `Exposures` computes the exposure time at which streaks are long enough for an accurate rate.
 """
 
 from __future__ import annotations
@@ -90,19 +90,22 @@ class Pinhole:
 _MOST_STEPS, _LAST_STEP = 60, 1e-8
 """Maximum number of Newton steps that invert the distortion, and step (tangent) that ends the iteration."""
 _NO_FOLD = 1e-12
-"""Minimum denominator in the formula for the distortion's fold; folds at tangents above 1e6 are ignored."""
+"""Minimum denominator in the formula for the fold of the distortion.
+
+Folds at tangents above 1e6 are ignored.
+"""
 
 
 SHAPE_TERMS = ("aspect", "shear", "p1", "p2")
-"""Names of the lens terms without symmetry about the optical axis."""
+"""Names of the lens parameters that are not symmetric about the optical axis."""
 _MOST_SHAPE = 0.3
 """Largest magnitude of aspect and shear."""
 _MOST_TANGENTIAL, _TANGENTIAL_STEPS = 0.5, 40
-"""Largest slope of the tangential distortion at a corner, and maximum number of steps that invert it."""
+"""Largest derivative of the tangential distortion at a corner, and maximum number of steps that invert it."""
 
 
 class LensError(FlightError):
-    """Error raised for a lens whose size is not positive or whose distortion cannot be inverted."""
+    """Error raised for a lens with invalid detector size, focal length or distortion parameters."""
 
 
 class CameraModel(Protocol):
@@ -130,7 +133,7 @@ class CameraModel(Protocol):
 
     @property
     def ideal(self) -> Pinhole:
-        """The pinhole camera of the same focal length with its axis in the image centre."""
+        """The pinhole camera of the same focal length with its optical axis in the image centre."""
 
     def rescaled(self, factor: float) -> Self:
         """Return the camera with its focal length multiplied by `factor`."""
@@ -153,7 +156,8 @@ class Lens:
         focal_length: focal length on the axis, px.
         centre: pixel (x, y) of the optical axis.
         k1, k2: radial distortion coefficients of the second and the fourth power of the undistorted tangent.
-        aspect, shear: relative stretching along the columns against the rows, and shear of the pixels.
+        aspect, shear: relative difference of the image scale between x and y, halved, and shear of the
+            pixels.
         p1, p2: tangential distortion coefficients along y and along x.
         reach: largest undistorted tangent of the field angle that is imaged; infinite if the distortion never
             folds back.
@@ -218,7 +222,7 @@ class Lens:
 
     @property
     def ideal(self) -> Pinhole:
-        """The pinhole camera of the same focal length with its axis in the image centre."""
+        """The pinhole camera of the same focal length with its optical axis in the image centre."""
         return Pinhole(self.columns, self.rows, self.focal_length)
 
     def rescaled(self, factor: float) -> Lens:
@@ -250,7 +254,7 @@ class Lens:
         if self.p1 == self.p2 == 0.0:
             return self._radial_rays(stretched)
         rays = self._radial_rays(stretched)
-        # Each step reduces the remaining error at least by the slope of the tangential distortion.
+        # Each step multiplies the error by at most the largest derivative of the tangential distortion.
         for _ in range(_TANGENTIAL_STEPS):
             before, rays = (
                 rays,
@@ -268,11 +272,11 @@ class Lens:
         return np.stack([right, self.p1 * (square + 2.0 * y * y) + self.p2 * cross], axis=-1)
 
     def _pixels(self) -> FloatArray:
-        """Return the symmetric matrix (2, 2) that converts distorted tangents to those of square pixels."""
+        """Return the symmetric matrix (2, 2) that maps distorted tangents to non-square pixels."""
         return np.array([[1.0 + self.aspect, self.shear], [self.shear, 1.0 - self.aspect]])
 
     def _radial_rays(self, stretched: FloatArray) -> FloatArray:
-        """Return unit vectors (..., 3) of tangents (..., 2) with radial distortion only."""
+        """Return unit vectors (..., 3) of distorted tangents (..., 2) that contain only radial distortion."""
         radius = np.hypot(stretched[..., :1], stretched[..., 1:])
         square = self._undistorted(radius) ** 2
         v = np.empty((*stretched.shape[:-1], 3))
@@ -326,14 +330,16 @@ class Lens:
 
 
 def _reach(k1: float, k2: float) -> float:
-    """Return the smallest tangent r of the field angle at which the distorted radius stops growing.
+    """Return the smallest tangent r of a field angle at which the distorted radius has a maximum.
 
-    The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if none exists.
+    The tangent r is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if the equation
+    has no positive root.
     """
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
         return np.inf
-    # This formula for the smaller positive root r^2 avoids cancellation and also holds for k2 = 0.
+    # This formula for the smaller positive root r^2 avoids the loss of digits by cancellation and also holds
+    # for k2 = 0.
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
 
@@ -377,10 +383,11 @@ class MountedCamera:
 
 
 FOURTH_AS = -0.3, 1.2
-"""Constant and quadratic term that approximate a fourth power of the radius (least squares over an image)."""
+"""Constant and quadratic coefficient of the least-squares approximation of r^4 over an image."""
 
 UNSTATED = 30e-6
-"""Standard deviation (s) of an unknown line time of a rolling shutter; rows of one image often span 30 ms."""
+"""Standard deviation (s) of an unknown line time of a rolling shutter, for a typical readout time of 30 ms.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,7 +404,8 @@ class CameraKnowledge:
         line_time: standard deviation of the delay between the exposures of successive rows, s. A `line_time`
             of None means 0 if the camera's line time is stated, otherwise `UNSTATED`.
         covariance: covariance (5, 5) of relative focal length, optical axis along x and y, distortion and
-            line time, in the units above, if the lens was learned from frames. None: independent errors.
+            line time, in the units above, if the lens parameters were estimated from frames. If the
+            covariance is None, the errors are independent.
     """
 
     focal_length: float = 0.0
@@ -412,9 +420,12 @@ EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
 
 
 _STREAK = 20.0
-"""Desired streak length (px): rates are inaccurate below 5 px, and faint stars are lost above 100 px."""
+"""Desired streak length (px).
+
+Rates are inaccurate below 5 px, and faint stars are undetectable above 100 px.
+"""
 _POINT = 1.0
-"""Motion (px) of a star during the usual exposure below which the star counts as a point."""
+"""Motion (px) of a star during the usual exposure time below which the star is treated as a point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -422,8 +433,8 @@ class Exposures:
     """The exposure times of a camera.
 
     Attributes:
-        usual: exposure used while stars appear as points, s.
-        least, most: shortest and longest exposure used while stars appear as streaks, s.
+        usual: exposure time while stars appear as points, s.
+        least, most: shortest and longest exposure time while stars appear as streaks, s.
         scale: image scale at the boresight, px/rad.
     """
 
@@ -433,7 +444,7 @@ class Exposures:
     scale: float
 
     def at(self, rate: float) -> float:
-        """Return the exposure, s, for an angular rate across the boresight, rad/s."""
+        """Return the exposure time, s, for an angular rate about axes normal to the boresight, rad/s."""
         speed = rate * self.scale
         if speed * self.usual < _POINT:
             return self.usual
