@@ -1,9 +1,9 @@
 """The body interface, through which the loop uses the body that it flies.
 
 A body is a vehicle of some kind, such as a satellite or the testbed. The loop itself uses only attitudes,
-rates and dipoles. The body defines its targets, the planning and tracking of paths to a target, and packets
-of its own. The bodies of this repository are in `flight.bodies`. A `BodyKind` of another package is named in
-the configuration as `module:object`.
+rates and dipoles. The body defines its targets, the planning and tracking of paths to a target, and its own
+telemetry packets. The bodies of this repository are in `flight.bodies`. A `BodyKind` of another package is
+named in the configuration as `module:object`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class TargetLaw(Protocol):
 class Target:
     """A target and its number in packets.
 
-    The number is that of a configured step, a number from COMMANDED on, or KEPT.
+    The number is the index of a configured step, at least COMMANDED for a commanded target, or KEPT.
     """
 
     index: int
@@ -143,7 +143,7 @@ class ReadingAgreement:
 
 @dataclass(frozen=True, slots=True)
 class FixVerdict:
-    """Use of a GPS fix by the body. A fix without use or refusal awaits further fixes.
+    """Use of a GPS fix by the body; a fix that is neither used nor refused awaits further fixes.
 
     Attributes:
         used: whether the fix updates the orbit.
@@ -192,7 +192,7 @@ class Filter(Protocol):
 
 
 class ReadingFeed(Protocol):
-    """Passes the quantities of a reading that a kind of body uses to its filter."""
+    """Passes to the filter those quantities of a reading that the body uses."""
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
         """Start the filter from a reading, or apply the reading to a filter that runs."""
@@ -243,7 +243,7 @@ class FlownPaths(Protocol):
         """Return the reference motion at a time, or None without a path."""
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether a path is being followed; at its end, the attitude is held instead."""
+        """Return whether a path is being followed, as opposed to an attitude held after its end."""
 
     def is_adrift(self, now_ns: int) -> bool:
         """Return whether an attitude is held because no plan arrived in time."""
@@ -305,7 +305,7 @@ class BodyTargets(Protocol):
         """Return the angle (rad) between body and target."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle (rad) between body and due attitude, or None while no attitude is due."""
+        """Return the angle (rad) of the body from the attitude that is due now, or None while none is due."""
 
 
 class BodyView(Protocol):
@@ -374,7 +374,7 @@ class BodyEstimation(Protocol):
         return learned_of(estimate)
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Accept that the coil monitor multiplied the described dipoles of the coils by `change` (n,).
+        """Adapt the estimation to a correction, which multiplies the described coil dipoles by `change` (n,).
 
         The relative standard deviations of the corrected dipoles are `deviations` (n,). The default method
         does nothing, for a filter that does not estimate the coils separately.
@@ -382,14 +382,14 @@ class BodyEstimation(Protocol):
         del change, deviations
 
     def coils_used(self, used: BoolArray) -> None:
-        """Accept that the coils `used` (n,) are in use now, while the others are isolated.
+        """Adapt the estimation to the coils in use, flagged by `used` (n,); the other coils are isolated.
 
         The default method does nothing, for a body whose estimation does not depend on the allocation.
         """
         del used
 
     def magnetometer_changed(self) -> None:
-        """Accept that later magnetic fields come from another magnetometer.
+        """Adapt the estimation to another magnetometer, from which the later magnetic fields come.
 
         The default method does nothing, for a body that estimates no errors of the magnetometer.
         """
@@ -402,12 +402,12 @@ class BodyEstimation(Protocol):
     def rate_without_gyro(self, time_ns: int) -> FloatArray | None:
         """Return the rate (3,), rad/s, that replaces the gyro's rate, or None without an accurate rate.
 
-        The default method returns None, for a body whose control laws without an estimate need no rate.
+        The default method returns None, which suits a body whose control laws need no rate.
         """
         return None
 
     def fastest_by_field(self) -> float:
-        """Return the largest likely body rate (rad/s) by the magnetometer while the gyro gives no rate.
+        """Return the largest likely body rate (rad/s) from the magnetometer while the gyro gives no rate.
 
         The default method returns infinity, for a body whose rate is not estimated from the magnetometer.
         """

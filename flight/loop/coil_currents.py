@@ -1,4 +1,4 @@
-"""Supply currents of healthy and of broken coils.
+"""Prediction of the supply current of healthy and broken coils.
 
 For each hypothesis, which is that all coils are healthy or that one axis has one fault, the supply current is
 predicted from the commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive
@@ -65,7 +65,7 @@ PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
-"""Largest fraction of readings that may contradict a hypothesis, because they precede the fault."""
+"""Largest fraction of readings that may contradict a true hypothesis, because they precede the fault."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,8 @@ class Sampling:
 
 
 NEWEST = Sampling(0.2, 1.0)
-"""Error bounds of one ADC sample at an unknown time in its window: 18 % by chopping (`hal.drivers.ina219`).
+"""Error bounds of one ADC sample at an unknown time in its window. Chopping alone causes 18 %
+(`hal.drivers.ina219`).
 """
 MEAN = Sampling(0.02, 0.25)
 """Error bounds of the mean of five ADC samples.
@@ -196,5 +197,5 @@ def fits(
 
 @cache
 def _scales(gain: float) -> FloatArray:
-    """Return nine factors (9, 1, 1) between the bounds of the gain error."""
+    """Return nine equally spaced factors (9, 1, 1) from the lower to the upper bound of the gain error."""
     return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]

@@ -8,36 +8,38 @@ reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `pro
 The current monitor measures the sum of |I| over all H-bridges. The current monitor cannot detect a
 reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
 prediction of each hypothesis (`flight.loop.coil_currents`). A hypothesis is that all coils are healthy, or
-that one axis is open, shorted, or has one leg of an input stuck. A verdict is given when the hypothesis
-`healthy` is rejected and all hypotheses that explain the later readings name the same axis. Several axes
-remain possible if no axis or several axes are driven. Each of these axes is then driven alone by a small
-probe current, one after another. The other coils carry no current for the 1.6 s of a probe, so that one probe
-shows whether its coil draws current. A reversed coil is detected from the angular acceleration, which also
-distinguishes a wrong current monitor from a broken coil. Averaged over longer bins, the acceleration reveals
-missing torque at currents that are too small for the current monitor. The probe then shows whether the coil
-is open.
+that one axis is open, shorted, or has one leg of an input stuck. A verdict on a broken coil is given when the
+hypothesis `healthy` is rejected and all hypotheses that explain the later readings concern the same axis.
+Several axes remain possible if no axis or several axes are driven. Each of these axes is then driven alone by
+a small probe current, one after another. The other coils carry no current for the 1.6 s of a probe, so that
+one probe shows whether its coil draws current. A reversed coil is detected from the angular acceleration,
+which also distinguishes a faulty current monitor from a broken coil. Averaged over longer bins, the
+acceleration reveals missing torque at currents that are too small for the current monitor. The probe then
+shows whether the coil is open.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
 far too large or too small, all coils are commanded to zero. If current still flows at zero commands, there is
-a fault. If current still flows at zero commands, all bridges are braked at once. If braking stops the
-current, the bridges are released one by one. If the current returns when a bridge is released, that bridge is
-broken. During the search for a stuck leg, no healthy coil carries current, and no other verdict is given. The
-search ends if neither zero commands nor braking change the current, as with a shorted coil or a wrong current
-monitor. If the commands change continuously, as in the windows of B-dot detumbling, the command that was in
-force during an ADC sample is ambiguous. While commands change continuously, all coils are commanded to zero
-every few seconds as a check, even without a suspicion.
+a fault, and all bridges are braked at once. If braking stops the current, the bridges are released one by
+one. If the current returns when a bridge is released, that bridge is broken. During the search for a stuck
+leg, no healthy coil carries current, and no other verdict is given. The search ends if neither zero commands
+nor braking change the current, as with a shorted coil or a faulty current monitor. If the commands change
+continuously, as in the windows of B-dot detumbling, the command that was in force during an ADC sample is
+ambiguous. While commands change continuously, all coils are commanded to zero every few seconds as a check,
+even without a suspicion.
 
-A reversed coil draws the same supply current as a healthy coil, so only the motion can show it. A coil that
-rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil whose torque
-is too small is used with its estimated gain. The class `CoilCorrection` holds sign and gain of each coil, and
-converts between the currents on the wire, which determine the supply current, and the effective currents,
-which determine the torque. A correction made in a tumble is reviewed when the body is slower than
-`tumble_rate`. The motion then confirms the coil's sign, or the sign is changed again. A coil whose sign
-changes more than twice in ten minutes is kept at zero current until the body is slow, or for ten minutes.
+A reversed coil draws the same supply current as a healthy coil, so only the motion of the body can reveal it.
+A coil that rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil
+whose torque is too small is used with its estimated gain. The class `CoilCorrection` holds sign and gain of
+each coil, and converts between the actual coil currents, which determine the supply current, and the
+effective currents, with which healthy coils would cause the same torque. A correction made in a tumble is
+reviewed when the body is slower than `tumble_rate`. The motion then confirms the coil's sign, or the sign is
+changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current until the body
+is slow, or for ten minutes.
 
 A verdict on a broken coil is not final. While the body is slow, a broken coil is used again for a trial ten
-minutes after its verdict, and at most three times. If the fault persists, the coil is found broken again.
+minutes after its verdict, and at most three times. If the fault persists, the coil is diagnosed as broken
+again.
 
 The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
 and 18 % for a single ADC sample of the chopped current (`hal.drivers.ina219`).
@@ -79,11 +81,11 @@ from hal.interfaces.devices import COIL_NAMES, NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 _SURE = 2
-"""Number of consecutive ADC samples that must agree."""
+"""Number of consecutive ADC samples that must agree in a step of the search for a stuck leg."""
 _PATIENCE = 12
 """Number of ADC samples without agreement after which a step of the search is abandoned."""
 _PAUSE = 50
-"""Number of ADC samples from a check at zero command that found no fault to the next check."""
+"""Number of ADC samples between a check at zero command without a finding and the next check."""
 _UNCLEAR = 20
 """Number of consecutive ADC samples with ambiguous commands after which the coils are checked at zero."""
 
@@ -239,7 +241,7 @@ def _reason(supplied: Supplied) -> str:
 
 
 _PROOFS = 2
-"""Number of consecutive ADC samples that must agree."""
+"""Number of consecutive ADC samples that must agree before braking is confirmed or refuted."""
 
 
 class BrakeProof:
@@ -297,15 +299,15 @@ class CoilMonitorSettings:
         gain_error: relative error bound due to resistance, supply voltage and sampling of the chopped
             current.
         monitor_noise: error bound (A) of the current monitor at any current.
-        window_ns: time (ns) over which the current monitor averages. A longer gap between readings discards
-            the evidence.
+        window_ns: time (ns) over which the current monitor averages. After a longer gap between readings, the
+            evidence is discarded.
         persistence: number of consecutive readings that raise a suspicion if they contradict a healthy
             circuit.
         settle: number of further readings until the averaging window begins after the fault.
         evidence: number of readings that are needed for a verdict.
         probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
-        response: settings for judging coils by the body's motion, or None if the motion is not evaluated.
+        response: settings for evaluating the coils from the body's motion, or None if the motion is not used.
         slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
         trial_after_ns: time (ns) from the verdict on a coil to its next trial.
@@ -385,7 +387,7 @@ _LEAST_SHORT = 0.02
 """Smallest excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
 _IN_DOUBT = 5
-"""Number of readings after which a verdict may name an axis with an uncertain kind of fault."""
+"""Number of readings after which a verdict may identify the axis while the kind of fault is uncertain."""
 _AGAIN_NS = 60_000_000_000
 """Shortest time (ns) between two series of probes for missing torque."""
 
@@ -415,11 +417,9 @@ class CoilMonitor:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # time (ns) after which a verdict may name an axis without the kind of fault
+        self._judge_ns = 0  # time (ns) after which a verdict may leave the fault uncertain
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
-        self._unmixed_ns = (
-            0  # time (ns) since which the circuit has not changed, as far as a reading can show
-        )
+        self._unmixed_ns = 0  # time (ns) of the last change of the circuit
         self._evidence = Evidence(self._bounds)
         coils = len(settings.full_current)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns, coils)
@@ -432,7 +432,7 @@ class CoilMonitor:
         self._weak = ""  # text about a coil without the expected torque
         self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes for missing torque
         self._prime: int | None = None  # axis to probe first
-        # Fault that the motion contradicts, while another coil is probed for comparison.
+        # Suspected fault that the motion contradicts, while another coil is probed for comparison.
         self._compared: tuple[int, CoilFault] | None = None
         self._verdicts: dict[int, CoilVerdict] = {}
         self.correction = CoilCorrection(coils)
@@ -531,7 +531,7 @@ class CoilMonitor:
     ) -> None:
         """Record the currents (n,), A, and brakes in force at `time_ns`, written at `written_ns` if given.
 
-        The currents are those on the wire.
+        The currents are the actual coil currents, not the effective currents.
         """
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
@@ -596,7 +596,7 @@ class CoilMonitor:
             self._rests[axis] = now_ns, why
 
     def _apply(self, axis: int, seen: str, now_ns: int) -> None:
-        """Report a change of the correction, and judge the motion again without the earlier evidence."""
+        """Report a change of the correction, and discard the earlier evidence from the motion."""
         self._tell(axis, seen)
         self._weak = ""
         if self._prime is not None:
@@ -666,11 +666,11 @@ class CoilMonitor:
 
     @property
     def probe(self) -> FloatArray | None:
-        """Currents (n,), A, on the wire that replace all commands during a probe, or None."""
+        """Actual coil currents (n,), A, that replace all commands during a probe, or None without a probe."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     def test_wave(self, wanted: FloatArray) -> FloatArray | None:
-        """Return the currents (n,), A, on the wire that test a coil now, or None without a test.
+        """Return the actual coil currents (n,), A, of a self-test of a coil, or None without a test.
 
         The test replaces the `wanted` effective currents (n,), A, which are small.
         """
@@ -692,7 +692,7 @@ class CoilMonitor:
 
     @property
     def monitor_doubted(self) -> str:
-        """The reason why the current monitor is considered wrong; empty while it is trusted."""
+        """The reason why the current monitor is considered faulty; empty while it is trusted."""
         return self._witness.doubt
 
     @property
@@ -725,7 +725,7 @@ class CoilMonitor:
             self.interrupted(reading.time_ns)
 
     def _predictions(self, reading: PowerReading) -> list[Predicted]:
-        """Predict the newest ADC sample and, if the circuit did not change in its window, the mean."""
+        """Predict the newest ADC sample and, if the circuit did not change in the window, its mean."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
         begin_ns = reading.time_ns - self._settings.window_ns
         if begin_ns >= self._unmixed_ns:
@@ -763,7 +763,7 @@ class CoilMonitor:
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
-        """Give a verdict if all evidence names one axis; drop the suspicion if readings are normal again."""
+        """Give a verdict if all evidence concerns one axis; end the suspicion if readings are normal."""
         evidence = self._evidence
         if len(evidence) < self._settings.evidence:
             return
@@ -807,7 +807,7 @@ class CoilMonitor:
         """Probe another coil, and return whether the probe began.
 
         If the current monitor measures the current of the other coil, the monitor works, and its reading of
-        the suspected coil is believed.
+        the suspected coil is trusted.
         """
         ends_ns = self._probe.begin(set(range(len(self._trials))) - {axis} - self._known.keys(), now_ns)
         if ends_ns is None or self._compared is not None:
@@ -826,7 +826,7 @@ class CoilMonitor:
     def _look_further(self, axes: set[int], now_ns: int) -> None:
         """Apply the probe to the next suspected axis; after the last axis, collect new evidence.
 
-        New evidence is needed, because no hypothesis explains an intermittent fault or a wrong current
+        New evidence is needed, because no hypothesis explains an intermittent fault or a faulty current
         monitor.
         """
         ends_ns = self._probe.begin(axes, now_ns, self._prime)

@@ -1,32 +1,33 @@
-"""Responses of the coils to commands, as the body's motion and the supply current show them.
+"""Evaluation of the coils' responses to commands from the body's motion and the supply current.
 
 The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
 seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
-over short bins. Differences of neighbouring bins are accelerations. A generalised least squares fit over the
-last bins estimates the gain of each coil, together with a constant disturbance, a torsion and a damping about
-each free axis. The fit accounts for the correlated noise of neighbouring differences. The gain is 1 for a
-healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the commands vary too little, the
-standard deviation of the gain is large, and the axis is not judged. A gain larger than `LARGEST_GAIN` is
-physically impossible. A gain larger than `LARGEST_GAIN` shows that the model is wrong, and no axis is judged.
+over short bins. Differences of neighbouring bins yield accelerations. A generalised least squares fit over
+the last bins estimates the gain of each coil, together with a constant disturbance, a torsion and a damping
+about each free axis. The fit accounts for the correlated noise of neighbouring differences. The gain is 1 for
+a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the commands vary too little, the
+standard deviation of the gain is large, and no finding about the axis is made. A gain larger than
+`LARGEST_GAIN` is physically impossible and shows that the model is wrong, so that no finding about any axis
+is made.
 
 The torques of the coils are normal to the field, so that their gains can hardly be separated from each
 other within a short time. The gain of each coil is therefore estimated under the assumption that the other
-coils are healthy. Their gains may differ from 1 by the accuracy of their description. An axis is judged only
-if a fault of this axis explains the motion clearly better than a fault of another axis. A coil is considered
-reversed if this hypothesis is far more likely than that of healthy coils.
+coils are healthy. The gains of healthy coils may differ from 1 by the accuracy with which the coils are
+described. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of
+another axis. A coil is considered reversed if this hypothesis is far more likely than that of healthy coils.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
-that an inertia error of 2 % can make healthy coils look reversed. The fit therefore subtracts the gyroscopic
-acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
-(`knightcube.gnc.estimation.rigid_body`). The torques by air drag and by the residual dipole change while the
-body rotates, and the commands of pointing counteract them, so that healthy coils can look weak or reversed.
-The fit therefore admits a random walk of the disturbance, whose size follows from the largest expected
-disturbance. If the coils' own field at the magnetometer is comparable with the Earth's field, the fit uses
-the field measured in the last pause of the coils, rotated with the body.
+that an inertia error of 2 % can make healthy coils appear reversed. The fit therefore subtracts the
+gyroscopic acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
+(`knightcube.gnc.estimation.rigid_body`). The aerodynamic torque and the torque of the residual dipole change
+while the body rotates, and the commands of pointing counteract them, so that healthy coils can appear weak or
+reversed. The fit therefore admits a random walk of the disturbance, whose magnitude follows from the largest
+expected disturbance. If the coils' own field at the magnetometer is comparable with the Earth's field, the
+fit uses the field measured in the last pause of the coils, rotated with the body.
 
 The residual accelerations, computed for healthy coils, are stored for a longer time. If the residual
 accelerations change together with the supply current, a coil is broken; otherwise the current monitor is
-wrong (`observed_share`). The class `MotionWitness` checks verdicts on broken coils by the residual
+faulty (`observed_share`). The class `MotionWitness` checks verdicts on broken coils by the residual
 accelerations.
 """
 
@@ -145,7 +146,7 @@ class ResponseSettings:
         torsion, damping: prior standard deviations of torsion (1/s^2) and damping (1/s) about each free axis.
         errors: largest errors of the coils' gains, and of inertia and gyro of a body that is free about three
             axes.
-        sure: standard deviation of a gain below which the gain is used for judgements.
+        sure: standard deviation of a gain below which the gain is used to assess a coil.
         persistence: number of consecutive fits that must agree.
         lowest_sound, highest_feeble, highest_reversed: gain limits for a healthy coil (minimum), a coil
             without torque (maximum) and a reversed coil (maximum).
@@ -196,8 +197,8 @@ _WEAK_GAIN, _SIGMAS = 0.7, 2.5
 """Largest gain of a coil that is reported as weak, and number of standard deviations by which the estimate
 must be below this gain."""
 _USED_WEAK_GAIN = 0.6
-"""Upper limit of the gain of a weak coil that is used with its gain. Misaligned coils, neglected in the fit,
-can make the gain of a healthy coil of 0.8 look as small as 0.5."""
+"""Gain of a weak coil below which the coil is used with its estimated gain. Coil misalignments, which the fit
+neglects, can make a true gain of 0.8 appear as small as 0.5."""
 _STRONG_GAIN = 1.25
 """Lower limit of the gain of a coil that is stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
@@ -517,14 +518,14 @@ class CoilResponse:
             alone: whether a fault of this axis explains the motion, clearly better than that of another axis.
             is_reversed: whether a reversed coil on this axis explains the motion clearly better than a fault
                 of another axis, and far better than healthy coils.
-            is_steady: whether the newest half of the bins shows the gain of all bins.
+            is_steady: whether the newest half of the bins yields the same gain as all bins.
         """
         settings, gain, sigma = self._settings, float(self.gain[axis]), float(self.sigma[axis])
         judged = possible and abs(gain) <= float(self.largest[axis])
         sure = judged and sigma < settings.sure
         weak = alone and gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
         exact = judged and alone and is_steady and sigma < _EXACT
-        # The dipole of a coil that was corrected before may be several times the assumed one.
+        # The dipole of a coil that was corrected before may be several times the dipole assumed at present.
         corrected = float(self.largest[axis]) > LARGEST_GAIN
         wrong = is_reversed or (corrected and exact and gain + 3.0 * sigma < -LEAST_GAIN)
         findings = {
@@ -553,7 +554,7 @@ class CoilResponse:
     def _disturbance_walk(self) -> float:
         """Return the variance per second, (rad/s^2)^2/s, of the random walk of the disturbance.
 
-        Within the time in which the body rotates by 1 rad, the disturbance changes by its own size. The
+        Within the time in which the body rotates by 1 rad, the disturbance changes by its own magnitude. The
         result is rounded to a power of two, so that few whitening matrices are needed.
         """
         largest = 0.0 if self._settings.disturbance is None else self._settings.disturbance(self._last_ns)
@@ -584,7 +585,7 @@ def _whitening(count: int, independent: float, variance: float, walk: float) -> 
 
 
 class Finding(Enum):
-    """Findings of a fit about a coil."""
+    """Kinds of findings about a coil that a fit can yield."""
 
     REVERSED = auto()
     FEEBLE = auto()
@@ -703,7 +704,7 @@ class CoilCorrection:
         return True
 
     def weigh(self, axis: int, gain: float, sigma: float = 0.0) -> bool:
-        """Multiply the gain of a coil by `gain` +- `sigma`, to at most 1, and return whether it changed."""
+        """Multiply the gain of a coil by `gain` +- `sigma`, up to a gain of 1; return whether it changed."""
         size = abs(float(self.factors[axis]))
         factor = min(gain, 1.0 / size)
         if factor == 1.0:
@@ -753,7 +754,7 @@ class MotionWitness:
     """Checks verdicts from the supply current against the torque observed in the body's motion.
 
     Attributes:
-        doubt: the reason why the current monitor is considered wrong; empty while it is trusted.
+        doubt: the reason why the current monitor is considered faulty; empty while it is trusted.
     """
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, ...]) -> None:
@@ -768,11 +769,11 @@ class MotionWitness:
         self.doubt = ""
 
     def doubt_monitor(self, why: str, now_ns: int) -> None:
-        """Consider the current monitor wrong from now on."""
+        """Consider the current monitor faulty from now on."""
         self.doubt, self._doubted_ns = why, now_ns
 
     def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
-        """Return whether the coil's torque has not changed, so that the current monitor must be wrong.
+        """Return whether the coil's torque has not changed, so that the current monitor must be faulty.
 
         The coil last drew the expected current at `begun_ns`, so that the fault began later. The fault was
         suspected at `suspected_ns`, and the newest reading was made at `now_ns`.
@@ -786,7 +787,7 @@ class MotionWitness:
         if observed is None:
             return fault not in _DRIVEN and self._response.is_healthy(axis)
         if math.isnan(observed):
-            # Without data from before the fault, judge by the present torque of the coil.
+            # Without data from before the fault, the present torque of the coil decides.
             return fault in _DRIVEN or self._response.is_healthy(axis)
         return observed < _LITTLE_RESPONSE
 
@@ -798,8 +799,8 @@ _MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 class Evidence:
     """Predictions of the readings since a suspicion. Each probe begins a new segment.
 
-    A hypothesis must explain the readings of each segment. Otherwise, the few readings of the probe that
-    rejects a hypothesis would be outliers among the readings that do not depend on the hypothesis.
+    A hypothesis must explain the readings of each segment. Otherwise, the few readings of a probe that reject
+    a hypothesis would be treated as outliers among the many readings that do not depend on the hypothesis.
     """
 
     def __init__(self, bounds: Bounds) -> None:

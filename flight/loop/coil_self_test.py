@@ -1,13 +1,13 @@
-"""Self-test of coils that are hardly used, by short currents to which the motion of the body responds.
+"""Self-test of rarely used coils by short test currents, whose effect on the body's motion is measured.
 
-While a satellite points, currents of a few mA show neither an open nor a reversed coil. A coil about which
-the motion has shown nothing for an interval is therefore driven alone by a known current with the signs +, -,
--, + in four equal quarters. After these four quarters, neither the rate nor the attitude has changed.
-Duration and current of a test follow from the gyro's noise, so that a test measures the gain of a healthy
-coil with a standard deviation of 1/`_SHOWN`. The largest rotation during a test is the angular acceleration
-times the square of the duration of a quarter. `CoilResponse` judges the response, with the errors of the
-inertia as nuisance parameters. The current monitor compares the supply current with the command, as at any
-other time.
+While a satellite points, its coil currents of a few mA reveal neither an open nor a reversed coil. A coil
+that the motion has not confirmed for `interval_ns` is therefore driven alone by a known current with the
+signs +, -, -, + in four equal quarters. After these four quarters, neither the rate nor the attitude has
+changed. Duration and current of a test follow from the gyro's noise, so that a test measures the gain of a
+healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation during a test is the angular
+acceleration times the square of the duration of a quarter. `CoilResponse` evaluates the response, with the
+errors of the inertia as nuisance parameters. The current monitor compares the supply current with the
+command, as at any other time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class SelfTestSettings:
 _SHOWN = 8.0
 """Gain of a healthy coil divided by the standard deviation with which a self-test measures the gain."""
 _EFFICIENCY = 0.7
-"""Standard deviation of a gain without, divided by that with an estimated constant torque."""
+"""Standard deviation of a gain without estimation of a constant torque, divided by that with this
+estimation."""
 _SHORTEST_QUARTER, _LONGEST_QUARTER = 1.0, 4.0
 """Minimum and maximum duration (s) of each of the four quarters of a test."""
 _GAP_NS = 400_000_000

@@ -1,6 +1,6 @@
 """Commanding: executes and answers the commands that arrive on channels or are due on the time line.
 
-The dispatcher is one of the named containment boundaries: no command can end the control loop.
+The dispatcher is one of the documented containment boundaries: no command can end the control loop.
 
 A command replaces the whole table of onboard parameters, and the new table is stored for later boots. Before
 a table takes effect, its values are checked against their ranges and against the bounds of the configuration.

@@ -2,12 +2,12 @@
 
 Each rate group has a fixed grid of time slots. The executive runs the groups one at a time, in the order in
 which they are due. A slot is run if it starts less than half a period late; otherwise it is skipped and
-counted. Two cycles of a group are therefore never closer than half a period, and missed cycles are not made
-up in a burst. The number of slots that were run or skipped always equals the number of slots elapsed.
+counted. Two cycles of a group are therefore never closer than half a period, and missed cycles are not run
+later in a burst. The number of slots that were run or skipped always equals the number of slots elapsed.
 
 Rate groups are listed in order of importance. If several groups are due at the same time, the most important
-one runs first. The executive's task runner is one of the named containment boundaries: an exception in a task
-is reported, and the loop continues.
+one runs first. The executive's task runner is one of the documented containment boundaries: an exception in a
+task is reported, and the loop continues.
 
 The control thread submits a job and later collects its result; it never waits for a job. In a lock-step
 simulation, `LockStepRunner` runs a job at once when it is submitted, and delivers its result after the

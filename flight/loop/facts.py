@@ -57,7 +57,7 @@ class EventLog:
         self.first_texts: dict[EventKind, str] = {}
 
     def react_by(self, react: Reactor) -> None:
-        """Call `react` for every event with a reaction beyond its record, including events held back."""
+        """Call `react` for every event whose reaction is more than a record, including events held back."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
@@ -88,9 +88,9 @@ _DRIVEN = STEERING | {Mode.DETUMBLE}
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A row of the fact table, with the conditions and events of the begin and end of a fact.
+    """A row of the fact table: the conditions and events of the beginning and end of a fact.
 
-    Facts that the 40 Hz control cycle updates are counted in cycles, other facts in runs of the health task.
+    Facts are updated either in every control cycle (40 Hz) or in every run of the health task.
 
     Attributes:
         after: number of consecutive updates with a true condition that make the fact active.

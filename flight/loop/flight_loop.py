@@ -325,7 +325,7 @@ class FlightLoop:
         self._show(progress)
 
     def _keep_state(self, now_ns: int) -> None:
-        """Pass the state for the next boot to the keeper and report the keeper's events; no disk access."""
+        """Pass the state for the next boot to the keeper, and report its events, without disk access."""
         keeper = self._supervisors.keeper
         if keeper is None:
             return

@@ -595,10 +595,10 @@ class ShedLevel:
     """Reduced work of a level.
 
     Attributes:
-        every_reading: whether all readings of the inertial unit are used, not the newest of each cycle alone.
+        every_reading: whether all readings of the inertial unit are used, not only the newest of each cycle.
         search: whether frames are searched for objects.
-        frame_every: number of due exposures of the star camera of which one is made.
-        plan_every: number of due periodic plans of which one is made.
+        frame_every: number n such that every n-th due exposure of the star camera is made.
+        plan_every: number n such that every n-th due periodic plan is made.
         text: description of the reduced work for events.
     """
 
@@ -627,12 +627,13 @@ _SETTLE_NS = 10 * SECOND_NS
 """Shortest time (ns) from a change of the level to the next raise, in which the change takes effect."""
 _SHORTEST_QUIET_NS = 60 * SECOND_NS
 _LONGEST_QUIET_NS = 960 * SECOND_NS
-"""Times (ns) without a sign after which the level falls: the first one, and the last one after doublings."""
+"""Times (ns) without a sign of overload after which the level falls: initial value, and maximum after
+repeated doubling."""
 
 
 @dataclass(eq=False)
 class OverloadSign:
-    """A sign of overload, which a counter shows.
+    """A sign of overload, which is detected from a counter.
 
     Attributes:
         text: name of the sign for events.
@@ -667,7 +668,7 @@ class OverloadSign:
 
 
 class BusyPeriods:
-    """Counts the times at which a job has been running for longer than a limit."""
+    """Counts the jobs that have run for longer than a limit."""
 
     def __init__(self, busy_since_ns: Callable[[], int | None], limit_ns: int) -> None:
         """Watch the worker whose job began at `busy_since_ns`, which is None while the worker is idle."""
@@ -684,7 +685,7 @@ class BusyPeriods:
 
 
 class Shedding:
-    """Task that reduces the workers' jobs while they exceed the processor; run once a second.
+    """Task that reduces the workers' jobs while they exceed the processor's capacity; runs once a second.
 
     Attributes:
         plans_shed: number of periodic plans that were not made since start.
@@ -723,7 +724,7 @@ class Shedding:
         return made
 
     def run(self, lost_cycles: int, now_ns: int) -> None:
-        """Judge the load, change the level by one at most, and record changes.
+        """Evaluate the load, change the level by at most one, and record changes.
 
         The number of control cycles lost since start is `lost_cycles`.
         """

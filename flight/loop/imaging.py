@@ -89,7 +89,7 @@ class ImagingSettings:
         late_ns: time (ns) after the end of an exposure from which its frame counts as late.
         max_rate: body rate (rad/s) above which no exposure is made.
         slow_ns: processing time (ns) of a frame above which vision is reported as slow.
-        most_every: largest number of due exposures of which one must be made under overload.
+        most_every: largest permitted n if only every n-th due exposure is made under overload.
         mounting: quaternion (4,) from body axes to camera axes.
         angular_acceleration_psd: function of a time that returns the power spectral density (3, 3),
             rad^2/s^3, of the body's white angular acceleration.
@@ -98,7 +98,7 @@ class ImagingSettings:
         velocity: function of a time that returns the velocity (3,), m/s, relative to the Sun, or None if the
             velocity in `tracker` is used.
         knowledge: function that returns how well the attitude is known.
-        lens: lens from which the star tracker starts to learn, or None if the lens is not learned.
+        lens: initial lens parameters of the star tracker, or None if the lens parameters are not estimated.
     """
 
     camera: CameraModel
@@ -322,7 +322,7 @@ class FrameReport:
         )
 
     def lens(self, frame: Frame, before: LensKnowledge, lens: LensKnowledge, now_ns: int) -> None:
-        """Record the learned lens, and report that a frame has contradicted the lens `before` it."""
+        """Record the lens parameters, and report if the frame contradicted the parameters `before` it."""
         if lens.contradictions > before.contradictions:
             text = f"frame {frame.sequence}: learned from {before.frames} frames, now learned again"
             self._events.report(events.LENS_CHANGED, now_ns, text)
@@ -468,7 +468,8 @@ class ObjectTracks:
         unknown = np.full(len(directions), np.nan)
         common = turn @ place.covariance @ turn.T
         sighted = MeasuredObjects(seen.points[kept], directions, covariance, unknown, common)
-        # Without an attitude, the axes of the field are recorded, whose direction is unknown.
+        # Without an attitude, the directions are recorded in the axes of the star field, whose orientation is
+        # unknown.
         known = CameraAttitude(place.quaternion, np.eye(3)) if attitude is None else attitude
         to_estimate = attitude_matrix(known.quaternion).T @ turn.T
         self._track(sequence, middle_ns, sighted, now_ns, to_estimate)
@@ -479,7 +480,7 @@ class ObjectTracks:
             self._body.control.accept_tracks(tracks, now_ns)
 
     def _predicted(self, middle_ns: int, motion: FrameMotion, attitude: CameraAttitude | None) -> FloatArray:
-        """Return the attitude (4,) relative to the field, from the estimate or the rate of the streaks."""
+        """Return the attitude (4,) relative to the star field, from the estimate or the streaks' rate."""
         if self._located is None:
             return np.array([0.0, 0.0, 0.0, 1.0]) if attitude is None else attitude.quaternion
         then_ns, quaternion, before = self._located
@@ -584,7 +585,7 @@ def _padded(values: FloatArray) -> list[float]:
 
 WORKER = "vision"
 LENS = "lens"
-"""Name of the learned lens among the parameters that are stored for the next boot."""
+"""Name of the estimated lens parameters among the parameters that are stored for the next boot."""
 
 
 class Imaging:
@@ -630,7 +631,7 @@ class Imaging:
         return self._frames, self._report.accepted
 
     def learned(self) -> dict[str, Learned]:
-        """Return the learned lens for the next boot; empty before it is learned."""
+        """Return the estimated lens parameters for the next boot; empty before there is an estimate."""
         if self._lens is None or not self._lens.frames:
             return {}
         return {LENS: Learned.of(*self._lens.learned)}
@@ -752,7 +753,7 @@ class Imaging:
             self._events.report(events.VISION_FAILED, now_ns, "the worker is busy or not running")
 
     def _job(self, frame: Frame) -> FrameJob:
-        """Return the worker's job for a frame, with the learned lens."""
+        """Return the worker's job for a frame, with the estimated lens parameters."""
         job = self._measurer.job(frame, self._last_checksum, self._spare and self._searches)
         if self._lens is None:
             return job
@@ -760,7 +761,7 @@ class Imaging:
         return replace(job, lens=(self._lens, elapsed))
 
     def _keep_lens(self, frame: Frame, lens: LensKnowledge | None, now_ns: int) -> None:
-        """Accept the lens after a frame for the next frames. A frame without stars has no effect."""
+        """Use the lens parameters after a frame for the next frames; a frame without stars has no effect."""
         before = self._lens
         if lens is None or before is None or lens.frames == before.frames:
             return

@@ -615,7 +615,7 @@ class ModeControl:
             self._enter(change, reason, now_ns)
 
     def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
-        """Enter a mode: reset timers, discard an old path, and set the coils to zero without steering."""
+        """Enter a mode: reset timers, discard an old path, and zero the coils unless the mode steers."""
         self._facts.enter(change.after)
         self._returns = None
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):

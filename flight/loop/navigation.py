@@ -39,7 +39,7 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
-"""Number of filter updates that one control cycle repeats after a late measurement, in a few ms.
+"""Number of filter updates that one control cycle repeats after a late measurement, which takes a few ms.
 
 Repeating the filter updates of one second takes a few control cycles.
 """
@@ -156,8 +156,8 @@ class Navigation:
         self.speed = 0.0
         """Body rate (rad/s) of the newest reading, including the gyro bias.
 
-        Without a gyro, the value is the rate of the estimate, or the largest likely rate by the magnetometer,
-        or infinity while the rate is unknown.
+        Without a gyro, the value is the rate of the estimate, or the largest likely rate from the
+        magnetometer, or infinity while the rate is unknown.
         """
 
     def begin(self, time_ns: int) -> None:
@@ -427,7 +427,7 @@ class Positioning:
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
 
     def _watch_line(self, now_ns: int) -> GpsLink:
-        """Record the counters of the serial line, report what they show, and return them."""
+        """Record the counters of the serial line, report the problems that they indicate, and return them."""
         link, before = self._receiver.link(), self._link
         self._link = link
         if link.refused > before.refused:

@@ -23,7 +23,8 @@ CORRECTION_TIME = 1800.0
 VOLTAGE_TIME = 60.0
 """Time constant (s) of the correction without the battery's current, or after a contradiction."""
 CONTRADICTION = 0.25
-"""Difference of the state of charge from that of the voltage, above which the voltage is believed."""
+"""Difference between the integrated state of charge and that from the voltage, above which the latter is
+used."""
 LONGEST_STEP = 5.0
 """Longest time (s) over which one current is integrated, and largest age (s) of a reading."""
 STUCK_FOR, STUCK_RANGE = 10.0, 0.02
@@ -59,7 +60,7 @@ class ChargeEstimate:
 
 
 class MonitorWatch:
-    """Judges the readings of one monitor by its errors, its range and the voltage of the other monitor."""
+    """Checks the readings of one monitor by its errors, its range and the voltage of the other monitor."""
 
     def __init__(self, name: str, monitor: PowerMonitor, cells: int) -> None:
         self.name = name

@@ -5,8 +5,9 @@ direction of the torque is preserved. The sent commands are compared with the su
 motion (`flight.loop.coil_monitor`). A verdict that a coil is broken activates a fact. The fact reports an
 event, whose reaction excludes the axis.
 
-All currents in the loop are effective currents: those of healthy coils with the same dipole. The coil
-drive converts effective currents to wire currents by the signs and gains that the coil monitor has found.
+All currents in the loop are effective currents: those of healthy coils with the same dipole. The coil drive
+converts effective currents to actual coil currents by the signs and gains that the coil monitor has
+estimated.
 """
 
 from __future__ import annotations
