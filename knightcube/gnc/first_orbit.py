@@ -2,12 +2,12 @@
 
 The six unknowns at the middle of the arc are two angles of the direction, the relative velocity divided by
 the distance, and the logarithm of the distance. The sightings of one pass determine the distance poorly and
-the other unknowns well. The distance of an object in free fall near the observer can be determined only from
-the curvature of the path that gravity causes. The distance is therefore scanned (as over the admissible
+the other five unknowns well. The distance of an object in free fall near the observer can be determined only
+from the curvature of the path that gravity causes. The distance is therefore scanned (as over the admissible
 region of Milani et al., Celestial Mechanics 90, 2004). For each distance the other five unknowns are fitted
 by the Gauss-Newton method, and all six unknowns of the best fit are then refined. The arc is long enough for
-an orbit if the 95 % confidence interval of the distance, found from chi-square, is short. Gauss's method
-finds the same distance, but uses only three sightings and is therefore noisier.
+an orbit if the 95 % confidence interval of the distance, which follows from chi-square, is short. Gauss's
+method finds the same distance, but uses only three sightings and is therefore noisier.
 
 The forces are the gravity of a spherical Earth and J2. The directions of an object are compared with
 catalogue directions of stars, so light time and aberration shift the apparent direction according to the
@@ -93,18 +93,20 @@ def _derivative(state: FloatArray) -> FloatArray:
 
 MINIMUM_SIGHTINGS = 6
 RATIO = 1.5
-"""Largest ratio of the ends of the distance's confidence interval for which an orbit is returned."""
+"""Largest ratio of the upper to the lower end of the distance's confidence interval for which an orbit is
+returned."""
 GROUND_CLEARANCE = 80e3
-"""Smallest perigee height (m) of an orbit that is clear of the Earth."""
+"""Smallest perigee height (m) of an orbit that does not hit the Earth."""
 _NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
 """Nearest and farthest distance (m) of the scan, and the number of logarithmically spaced distances."""
 _DEGREES_95 = 3.841
-"""95 % bound of chi-square with one degree of freedom."""
+"""95 % quantile of chi-square with one degree of freedom."""
 _STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
 """Steps of the six unknowns in central differences: direction (rad), velocity per distance (1/s), log
 distance."""
 _LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
-"""Longest Gauss-Newton steps of the six unknowns, which keep poor hypotheses from diverging."""
+"""Longest Gauss-Newton steps of the five unknowns other than the distance, which keep poor hypotheses from
+diverging."""
 _ROUNDS, _FINAL_ROUNDS = 6, 20
 _MISFIT = 1e-6
 """Smallest accepted probability of the chi-square of a fit. A smaller probability means that the object is
@@ -146,9 +148,8 @@ class FirstOrbit:
             orbit are not included.
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
-        lasts: whether the orbit is bound to the Earth and does not hit the Earth. If this most likely orbit
-            is unbound or hits the Earth, another orbit in the distance interval is bound and does not hit the
-            Earth.
+        lasts: whether this most likely orbit is bound to the Earth and does not hit the Earth. If `lasts` is
+            false, another orbit in the distance interval is bound and does not hit the Earth.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """
@@ -211,7 +212,7 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
 def _within(
     logarithms: FloatArray, chi_square: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the interval of distances in which chi-square is within `_DEGREES_95` of its minimum.
+    """Return the interval of distances in which chi-square is less than `_DEGREES_95` above its minimum.
 
     The first result is the pair of the outermost scanned distances inside the interval, and the second result
     is the pair of the interpolated ends of the interval.
@@ -273,7 +274,7 @@ class _ArcFit:
         way = way - distance * (states[..., 3:] + seen.earth) / SPEED_OF_LIGHT
         way /= np.linalg.norm(way, axis=2, keepdims=True)
         off = np.einsum("nij,nkj->kni", self._across, way)
-        # Without a lower bound of the cosine, directions behind the observer would have small offsets.
+        # Without the lower bound of the cosine, directions behind the observer would have small residuals.
         facing = np.einsum("nj,nkj->kn", seen.directions, way)
         off = off / np.maximum(facing, 1e-3)[:, :, None]
         return np.asarray((off / seen.sigma[:, None]).reshape(len(unknowns), -1))
@@ -295,7 +296,7 @@ class _ArcFit:
         return np.asarray((energy < 0.0) & clear)
 
     def scan(self, logarithms: FloatArray) -> FloatArray:
-        """Return the best unknowns (k, 6) for each logarithm (k,) of the distance."""
+        """Return the best-fit unknowns (k, 6) for each logarithm (k,) of the distance."""
         unknowns = np.zeros((len(logarithms), 6))
         unknowns[:, 5] = logarithms
         times = self._seen.times - self.time
@@ -327,7 +328,7 @@ class _ArcFit:
         return np.asarray(((ahead - behind) / (2.0 * _STEPS[:, None])).T)
 
     def _linear(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals (k, m), and the derivatives (k, m, 6) of the residuals by the unknowns."""
+        """Return the residuals (k, m), and their derivatives (k, m, 6) with respect to the unknowns."""
         shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STEPS), -np.diag(_STEPS)])
         many = (unknowns[None] + shifts[:, None]).reshape(-1, 6)
         found = self.residuals(many).reshape(13, len(unknowns), -1)

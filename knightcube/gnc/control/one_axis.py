@@ -9,27 +9,29 @@ corrected) are
     e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
 
 The regulator demands e'' = v = -K (e', e), with the gain K from the Riccati equation. The expression for the
-second derivative e'' is solved for the angular acceleration w', from which the plant model gives the current.
+second derivative e'' is solved for the angular acceleration w', and the plant model converts w' into the
+current.
 
 The tracker extends the controller of Sease's thesis by two features, which the option `as_in_thesis` switches
-off. As the first feature, the estimated disturbance is fed forward, so that a constant torque causes no
+off. The first feature is a feedforward of the estimated disturbance, so that a constant torque causes no
 offset. The disturbance estimator integrates the acceleration that the plant model did not predict. Integrator
-windup cannot occur, because the disturbance estimator uses the limited current. As the second feature, the
-rate at which an angle error is reduced is limited, so that the coil can decelerate the body in time and the
-angle does not overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A /
-s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. The rate limit is that of
-the proximate time-optimal servomechanism (Workman 1987), but with a continuous slope.
+windup cannot occur, because the disturbance estimator uses the limited current. The second feature limits the
+rate at which an angle error is reduced, so that the coil can decelerate the body in time and the angle does
+not overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A / s^2 at the
+rate sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. The rate limit is that of the proximate
+time-optimal servomechanism (Workman 1987), but with a continuous slope.
 
 The error e = sin(d) is monotonic in d only up to 90 degrees. The angle error d is therefore clamped to
 `largest_error`. With the clamped angle error, the demanded acceleration stays bounded and does not decrease
 for larger errors.
 
 The excitation manoeuvres do not follow a path. Before the first manoeuvre, the tracker brings the body to
-rest. Long and short current pulses rotate the body out and back, and the response identifies torque constant
-and delay. Further pulses displace the body, which then oscillates with the coils off, and the oscillation
-identifies stiffness and damping. All pulses are repeated with the opposite sign. Between manoeuvres the
-tracker brings the body to rest again. The tracker also takes over whenever the body could otherwise not be
-stopped within the allowed angle. If the tracker cannot bring the body to rest, the current stays zero.
+rest. Long and short current pulses rotate the body away from rest and back, and the torque constant and the
+delay are identified from the response. Further pulses displace the body, which then oscillates with the coils
+off, and stiffness and damping are identified from the oscillation. All pulses are repeated with the opposite
+sign. Between manoeuvres the tracker brings the body to rest again. The tracker also replaces a manoeuvre if
+the body could otherwise not be stopped within the allowed angle. If the tracker cannot bring the body to
+rest, the current stays zero.
 """
 
 from __future__ import annotations
@@ -230,11 +232,11 @@ class _Phase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ExcitationSettings:
-    """Amplitudes of the excitation.
+    """Current, angle and duration of the excitation manoeuvres.
 
     Attributes:
-        current_share: current of pulses and tracker, as a fraction of the coil's limit. At the current limit
-            itself, the true current would differ from the commanded current.
+        current_share: largest current of the pulses and of the tracker, as a fraction of the coil's current
+            limit. At a fraction of one, the true current would differ from the commanded current.
         largest_q2: largest quaternion component q2 to which the excitation may rotate the body.
         swing: duration of each free oscillation, s.
     """
@@ -275,7 +277,7 @@ class ExcitationController:
 
     @property
     def gave_up(self) -> bool:
-        """Whether the tracker failed to bring the body to rest."""
+        """Whether the excitation has ended because the tracker failed to bring the body to rest."""
         return self._phase is _Phase.GIVEN_UP
 
     def command(
@@ -283,7 +285,7 @@ class ExcitationController:
     ) -> CurrentCommand:
         """Return the command for an estimated angle (rad), rate (rad/s) and disturbance (rad/s^2).
 
-        The motion `wanted` contains the angle at which the body rests between manoeuvres. Raises UsageError
+        The argument `wanted` contains the angle at which the body rests between manoeuvres. Raises UsageError
         if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
@@ -291,7 +293,8 @@ class ExcitationController:
             return CurrentCommand.without_authority(error)
         if self._phase is _Phase.MOVING:
             pulse = self._pulse()
-            # The body has enough room if it can still be stopped within the angle bound or moves inwards.
+            # A manoeuvre may continue if the body can still be stopped within the angle bound or moves
+            # inwards.
             outward = rate if angle >= 0.0 else -rate
             braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
             has_room = abs(angle) + 0.5 * max(outward, 0.0) ** 2 / braking < self._bound
@@ -309,7 +312,7 @@ class ExcitationController:
         return self._tracker.command(wanted, angle, rate, disturbance)
 
     def reset(self) -> None:
-        """Bring the body to rest again and skip a manoeuvre that has begun."""
+        """Bring the body to rest again and abort a manoeuvre that has begun."""
         if self._phase is _Phase.MOVING:
             self._come_to_rest()
         self._resting = 0.0

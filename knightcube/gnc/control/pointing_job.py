@@ -2,16 +2,16 @@
 
 Field and torques are predicted along the orbit for a revolution and a quarter, because the gains at the end
 of the table depend on the following revolution. The pointing table covers a third of a revolution of the
-orbit. A passing object is near for minutes only, so tables for an object are short, have short steps, and are
-recomputed after each sighting.
+orbit. A passing object is near only for some minutes, so pointing tables for an object are short, have short
+time steps, and are recomputed after each sighting.
 
 From a distant attitude, the body can approach the commanded attitude by a slew of minimum heat. The module
 `slew_plan`, or `slew_vmc` on request, plans the slew with the disturbance torques that the attitude filter
-estimates. The planned dipole moments of the slew are used as feedforward. During the slew, the rest of the
-slew is planned again from the newest estimate of motion, body and torques, with the running path as the
-initial guess (`rest_table`). The gains come from linear-quadratic tracking along the slew and the following
-attitude law, and errors at the end of the slew have the highest cost. The pointing table also contains the
-change of the dipole moment per change of the estimated torques.
+estimates. The planned dipole moments of the slew are used as feedforward. During the slew, the remaining slew
+is replanned from the newest estimates of motion, body and torques, with the present path as the initial guess
+(`rest_table`). The gains come from linear-quadratic tracking along the slew and the following attitude law,
+and errors at the end of the slew have the highest cost. The pointing table also contains the change of the
+dipole moment per change of the estimated torques.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, end_law, plan_near, plan_task
 
 PlanTask = Callable[[SlewTask, SlewPath | None], SlewPlan]
-"""Function from a task, and from the path of a similar task, to a plan (`slew_plan.plan_task`)."""
+"""Function that plans a task, starting from the path of a similar task if given (`slew_plan.plan_task`)."""
 PlanNear = Callable[[SlewTask, SlewPath], SlewPlan | None]
-"""Function from a task and the path of a similar task to a plan near this path (`slew_plan.plan_near`)."""
+"""Function that plans a task near the path of a similar task, or returns None (`slew_plan.plan_near`)."""
 
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Ratio of the dipole moment of unit cost during a slew to the dipole moment of unit cost otherwise."""
+"""Factor by which the dipole moment that has a cost of one is larger during a slew than otherwise."""
 LONGEST = 1_500.0
 """Longest duration of a slew, s. A slew must be shorter than a table, which also includes some time after the
 slew."""
@@ -90,13 +90,13 @@ END = 2_000.0
 for this time. The weight is high because disturbance torques are poorly known before the slew, and the errors
 that they cause should be corrected by the end of the slew."""
 HOTTER = 1.1
-"""Largest ratio of the heat of a new plan to the heat of the running plan for the rest of a slew. A hotter
-plan would correct a deviation for which the remaining time is too short."""
+"""Largest ratio of the coil heat of a new plan to that of the present plan, for the remaining slew. A plan
+with more heat would correct a deviation for which the remaining time is too short."""
 _INSIDE = 1e-6
-"""Margin (rad) by which a violated exclusion cone is narrowed in addition to the depth of the violation."""
+"""Angle (rad) by which a violated exclusion cone is narrowed in addition to the depth of the violation."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""Additional factor by which a slew that rotates too fast is lengthened, largest total factor, and largest
-number of trials."""
+"""If a slew rotates too fast, its duration is multiplied by the ratio of the rates and the first factor, but
+at most by the second factor. The third value is the largest number of trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +140,7 @@ class SlewStart:
         kept: number of steps in the pointing table.
         inertia: (3, 3) kg m^2.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
-        sizes: estimated sizes (9,) of the disturbance torques, N m.
+        sizes: estimated components (9,) of the disturbance torques, N m.
         areas: relative areas (3,) of the faces on which air and sunlight act.
     """
 
@@ -156,7 +156,7 @@ class SlewStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunningSlew:
-    """A slew that the body follows while the rest of it is planned again.
+    """A slew that the body follows while the remaining part is replanned.
 
     Attributes:
         path: path of the slew as last planned.
@@ -194,7 +194,7 @@ def slew(
         found = _slow_enough(wish, task, fastest)
     if found is None or not begin.sizes.any():
         return found
-    # The areas on which air and sunlight act depend on the path, so the slew is planned again.
+    # The areas exposed to air and sunlight depend on the path, so the slew is planned again.
     pressed = along(ahead, first, begin.areas, found)
     again = replace(task, along=pressed, horizon=found.horizon)
     return _slow_enough(wish, again, fastest, found) or found
@@ -254,10 +254,10 @@ def slew_table(
 ) -> PointingTable:
     """Return the pointing table for a slew and the following attitude law.
 
-    A step of this table is a fifth of a step of `begin.times`.
+    The time step of this table is a fifth of the time step of `begin.times`.
 
-    The path was planned with the residual dipole moment `residual` (3,), A m^2. From `expected`, only the
-    environment is used, which is given at the times of `begin`.
+    The path was planned with the residual dipole moment `residual` (3,), A m^2. Only the environment in
+    `expected` is used, which is given at the times of `begin`.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -294,7 +294,7 @@ def slew_table(
 
 
 def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
-    """Return a path interpolated at `times` (n,), s; the first `count` instants are placeholders."""
+    """Return a path interpolated at `times` (n,), s, with placeholders at the first `count` instants."""
     rest = [path.at(float(time)) for time in times[count:]]
     whole = [*[rest[0]] * count, *rest]
     return AttitudeReferences(
@@ -323,7 +323,7 @@ def _tracking(
     begin: SlewStart,
     weights: PointingWeights,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the tracking gains (n, 3, 6), and dipole moments per unit of torque size (n, 3, sizes).
+    """Return tracking gains (n, 3, 6), and dipole moments (n, 3, 9) per unit of each disturbance component.
 
     The motion `tracked` (n + 1,) contains the slew, for which `dipole` is planned, and the time after it.
     """
@@ -346,12 +346,12 @@ def _tracking(
 
 
 def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> PointingTable | None:
-    """Return the table for the rest of a running slew, or None if the running plan should be kept.
+    """Return the table for the remaining part of a slew, or None if the present plan should be kept.
 
-    The rest is planned from the newest estimate, with the arrival time of the running plan. The new path is
-    the optimum to which the running path converges. The running plan is kept if no such path is found, or if
-    the new path rotates too fast or is hotter than the running path by more than the factor `HOTTER`. The
-    table ends TAIL s after the slew.
+    The remaining slew is planned from the newest estimate, with the arrival time of the present plan. The new
+    path is the optimal path to which the search converges from the present path. The present plan is kept if
+    no such path is found, or if the new path rotates too fast or causes more than `HOTTER` times the heat of
+    the present path. The table ends TAIL s after the slew.
     """
     near = running.path.since(running.since + LEAD, NODES)
     ahead = predict(job.orbit, LEAD + near.horizon + TAIL + 4.0 * STEADY.step)
@@ -387,9 +387,9 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
 
 
 def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, FloatArray]:
-    """Return the attitude (4,) and the rate (3,), rad/s, expected LEAD s after the origin of a job.
+    """Return the attitude (4,) and rate (3,), rad/s, predicted for LEAD s after the origin of a job.
 
-    The body is expected to keep its present attitude error and rate error relative to the running path.
+    The body is expected to keep its present attitude error and rate error relative to the present path.
     """
     now, then = running.since, running.since + LEAD
     path = running.path.references(np.array([now, then]))
@@ -400,7 +400,7 @@ def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, Flo
 
 
 def _narrowed(cone: Cone, path: SlewPath, start: FloatArray) -> Cone:
-    """Return an exclusion cone, narrowed if the path or the attitude `start` (4,) violates it."""
+    """Return an exclusion cone, narrowed if a path or its initial attitude `start` (4,) violates it."""
     room = min(
         float(cone.clearance(path.quaternion, path.times).min()),
         float(cone.clearance(start[None], np.zeros(1))[0]),
@@ -418,9 +418,10 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Durations and steps of tables for lasting goals, and for a passing object."""
+"""Durations and steps of tables for permanent targets (first value), and for a passing object (second
+value)."""
 _COVERED = 1.25
-"""Shortest prediction for a lasting goal, in revolutions of the orbit."""
+"""Shortest prediction for a permanent target, in revolutions of the orbit."""
 _LONGEST = 10_000.0
 """Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0
@@ -456,11 +457,11 @@ class PointingJob:
 
     Attributes:
         inertia: (3, 3) kg m^2.
-        sizes: estimated sizes (9,) of the disturbance torques, N m.
+        sizes: estimated components (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         areas: relative areas (3,) of the faces on which air and sunlight act.
         slew: parameters of slews, or None if the body always approaches the attitude law without a slew.
-        running: the running slew whose rest is planned again, or None for a new path.
+        running: the slew in progress whose remaining part is replanned, or None if a new path is planned.
         sight: the sighted object to which to point instead of `target`; None for the target.
     """
 
@@ -494,10 +495,10 @@ def prepare() -> None:
 def run(job: PointingJob) -> PointingTable | None:
     """Return the pointing table, whose times are in s after the origin of the job.
 
-    The result is None if the rest of a running slew was requested and the running plan should be kept. The
-    computation takes about one second, two seconds with a slew, and a tenth of a second for the rest of a
-    slew. Raises FlightError if the magnetic field is unknown, and UsageError if the target does not define an
-    attitude.
+    The result is None if the remaining part of a slew was to be replanned and the present plan should be
+    kept. The computation takes about one second, two seconds with a slew, and a tenth of a second for the
+    remaining part of a slew. Raises FlightError if the magnetic field is unknown, and UsageError if the
+    target does not define an attitude.
     """
     if job.running is not None and job.slew is not None:
         return rest_table(job, job.slew, job.running)
@@ -505,7 +506,7 @@ def run(job: PointingJob) -> PointingTable | None:
 
 
 def new_table(job: PointingJob) -> PointingTable:
-    """Return the pointing table of a new path, with a slew if the target is far (`run`)."""
+    """Return the pointing table of a new path, which begins with a slew if the target is far (see `run`)."""
     span = job.span
     preview = span.preview
     if span is STEADY:

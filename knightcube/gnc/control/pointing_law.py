@@ -3,8 +3,8 @@
 The pointing law is linear in small rotations. With a large error, the pointing law would saturate the coils
 and could make a light body rotate faster than before. A new path is therefore planned if the body leaves the
 planned path. Far from the planned path, the body is first damped until its rate is low. The damping torque
-removes energy in any attitude. It is the component of -2 w J rate that is normal to the magnetic field, with
-bandwidth w and inertia J.
+removes energy in any attitude. The damping torque is the component of -2 w J rate that is normal to the
+magnetic field, with bandwidth w and inertia J.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
-"""Largest rotation error (rad) that the pointing law uses. Larger errors are reduced to this error, because
-the pointing law is linear."""
+"""Largest rotation error (rad) that the pointing law uses. Larger errors are scaled down to this value,
+because the pointing law is linear."""
 LARGEST_RATE = math.radians(1.0)
-"""Largest rate error (rad/s) that the pointing law uses, and to which larger errors are reduced."""
+"""Largest rate error (rad/s) that the pointing law uses; larger errors are scaled down to this value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,14 +86,15 @@ class PointingLaw:
 
         The magnetic field `field` (3,), T, is in body axes. The estimated residual dipole moment
         `residual_dipole` (3,) A m^2 is cancelled directly, as far as it is normal to the field. The effects
-        of disturbance torques of the estimated `sizes` (n,) are reduced as far as the field allows.
+        of the disturbance torques with the estimated components `sizes` (n,), N m, are reduced as far as the
+        field allows.
         """
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
         # Both rates are expressed in body axes, which differ from the reference axes by the rotation error.
         missed = rate - attitude_matrix(from_rotation_vector(rotation)) @ wanted.rate
         cut_rotation, cut_rate = _cut(rotation, LARGEST_ROTATION), _cut(missed, LARGEST_RATE)
-        # The gains are for the body rate in body axes minus the reference rate in reference axes.
+        # The gains apply to the body rate in body axes minus the reference rate in reference axes.
         error = np.concatenate([cut_rotation, cut_rate - np.cross(cut_rotation, wanted.rate)])
         k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes

@@ -55,7 +55,8 @@ class LinearErrorModel:
 
     Attributes:
         transition: (n, 6, 6).
-        by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2 for a coil.
+        by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2 for a
+            dipole.
         by_torque: change of the errors (n, 6, 3) per N m of torque in each axis.
         missing: torque f (n, 3) that the reference motion requires in addition to the modelled torques, N m.
         field: magnetic field (n, 3) in the axes of the reference motion, T.
@@ -107,8 +108,8 @@ def linearised(
 
     The magnetic field (n, 3), T, and the position (n, 3), m, are in ICRS axes. The dipole moment `dipole` (n,
     3), A m^2, is fixed in body axes, so the torque of this dipole depends on the rotation error. Each element
-    of `pressed` is a torque by air or sunlight, as a vector (3,) in body axes (N m) and a direction (n, 3) in
-    ICRS axes whose cross product is the torque.
+    of `pressed` describes an aerodynamic or solar radiation torque by a vector (3,) in body axes (N m) and a
+    direction (n, 3) in ICRS axes, whose cross product is the torque.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -133,7 +134,7 @@ def acceleration_slopes(
     dipole: FloatArray | None = None,
     pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the derivatives (n, 3, 6) of angular accelerations by rotation and rate.
+    """Return the derivatives (n, 3, 6) of angular accelerations with respect to rotation and rate.
 
     The second and third results are the magnetic field and the position (n, 3) in body axes. The motion has
     attitudes (n, 4) and rates (n, 3) rad/s. The remaining arguments are those of the function `linearised`.
@@ -164,7 +165,7 @@ def sweep(
 
     (count, controls), columns = cost.control.shape, affine.shape[2]
     feedback = np.empty((count, controls, 6 + columns))
-    # Side by side: the matrices that multiply errors, and those of the affine part.
+    # The matrices that multiply the errors, and the affine parts, are concatenated to save operations.
     ahead = np.concatenate([linear.transition, affine], axis=2)
     weights = np.concatenate([cost.state, cost.state_slope], axis=2)
     square, slope = end.square, end.slope
@@ -176,9 +177,7 @@ def sweep(
         later[:, 6:] += slope
         sides = push.T @ later
         sides[:, 6:] += cost.control_slope[k]
-        *_, feedback[k], singular = dgesv(
-            spread, sides
-        )  # numpy.linalg.solve checks its small arguments longer
+        *_, feedback[k], singular = dgesv(spread, sides)  # numpy.linalg.solve is slower for small matrices
         if singular:
             raise np.linalg.LinAlgError("the costs of the controls are singular")
         found = drive.T @ later - sides[:, :6].T @ feedback[k] + weights[k]
@@ -188,7 +187,7 @@ def sweep(
 
 
 def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the gravity gradient torque (n, 3) and its derivatives (n, 3, 3) by a rotation of the body.
+    """Return the gravity gradient torque (n, 3), and its derivatives (n, 3, 3) with respect to rotations.
 
     The position relative to the Earth's centre is `up` (n, 3), m, in body axes.
     """
@@ -202,7 +201,7 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return the transition matrices exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of their integrals.
+    """Return transition matrices exp(F dt) (n, 6, 6), and the rate columns (n, 6, 3) of their integrals.
 
     Transition matrices and integrals are computed to third order in dt.
     """
@@ -214,8 +213,8 @@ def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Ratios between successive costs of a torque along the field. The cost ratios are tried in turn until a path
-settles, because different ratios lead to different optima."""
+"""Factors by which the cost of a torque along the field is increased from stage to stage. The factors are
+tried in turn until a path settles, because different factors lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
 """Costs of a torque along the field, relative to the cost of the same torque across the field. The cost is
 increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
@@ -225,14 +224,15 @@ SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even without convergence."""
 SAVED = (0.05, 2e-3)
-"""Relative improvements by a sweep. Below the first improvement, the cost of a torque along the field is
-increased. Below the second improvement, the sweeps at the largest cost end."""
+"""Relative improvements of the cost by a sweep below which a stage ends. If a sweep improves the cost by less
+than the first value, the cost of a torque along the field is increased. If a sweep improves the cost by less
+than the second value, the sweeps at the largest cost end."""
 NEAR = math.radians(10.0)
 """Angle (rad) from the attitude law up to which the first sweeps do not need a torque along the field."""
 EXCESS = 3e-5
-"""Excess of the body rate (rad/s) over the rate limit that has a cost of one."""
+"""Amount (rad/s) by which the body rate exceeds the rate limit at a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
-"""Fractions of the change proposed by a sweep that are tried in turn."""
+"""Fractions of the change computed by a sweep, which are tried in this order."""
 RUN_AWAY = 100.0
 """Rate (rad/s) above which a diverging motion is not propagated further."""
 
@@ -244,7 +244,7 @@ class PathConditions:
     Attributes:
         wanted: motion commanded by the attitude law.
         field, position: magnetic field (T) and position (m), each (n + 1, 3), ICRS.
-        pressures: pressures of air and sunlight, which determine the sizes of the torques.
+        pressures: pressure vectors of air and sunlight, to which the torques are proportional.
         sizes: estimated sizes (9,) of the disturbance torques, N m.
         inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and the inverse of this tensor.
         limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
@@ -275,7 +275,7 @@ class PathConditions:
         return found
 
     def pressed(self, count: int) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the air and sunlight torques at the first `count` instants, as arguments of `linearised`."""
+        """Return aerodynamic and solar radiation torques at the first `count` instants, for `linearised`."""
         air, light = self.pressures.air[:count], self.pressures.light[:count]
         return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
 
@@ -334,9 +334,9 @@ class PathCriterion:
         state: weights (6, 6) of rotation and rate errors relative to the attitude law.
         dipole: weight of the squared dipole moment of each axis.
         end: cost-to-go of following the attitude law after the path. The first column of the linear part of
-            `end` is for the attitude law and the expected torques, and each further column is for one
-            disturbance torque of unit size.
-        shape: disturbance torques of unit size (n + 1, 3, sizes), in the axes of the commanded attitude.
+            `end` is for the attitude law and the expected torques, and each further column is for a unit of
+            one disturbance torque component.
+        shape: disturbance torques (n + 1, 3, 9) per unit of each component, axes of the commanded attitude.
         fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.
     """
 
@@ -349,7 +349,7 @@ class PathCriterion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedMotion:
-    """A motion with attitudes (n + 1, 4), rates (n + 1, 3), rad/s, and controls (n, 4) constant in a step.
+    """A motion: attitudes (n + 1, 4), rates (n + 1, 3), rad/s, and controls (n, 4) constant in each step.
 
     A control consists of a dipole moment (A m^2, body axes) and a torque along the field (N m).
     """
@@ -369,7 +369,7 @@ class MotionGains:
     """Feedback gains K (n, 4, 6) about a motion, and affine parts k (n, 4, columns) of the control.
 
     The first column of the affine parts is the change of the controls that improves the motion. Each further
-    column of the affine parts compensates one disturbance torque.
+    column of the affine parts compensates a unit of one disturbance torque component.
     """
 
     gain: FloatArray
@@ -421,7 +421,7 @@ def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) ->
 def _improved(
     expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> PlannedMotion:
-    """Return the best motion near a feasible motion, for the cost `multiple` of a torque along the field."""
+    """Return the best motion near a feasible motion, if a torque along the field has the cost `multiple`."""
     cost = _cost(expected, motion, criterion, multiple)
     enough = SAVED[multiple == PROHIBITIVE]
     for _ in range(SWEEPS):
@@ -548,7 +548,7 @@ def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathC
 
 
 def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return the derivatives (n + 1, 6, 6) of the attitude and rate errors by small changes of the motion.
+    """Return the derivatives (n + 1, 6, 6) of attitude and rate errors with respect to changes of the motion.
 
     The rotation block of the derivatives is the inverse left Jacobian of the rotation group, for scalar-last
     quaternions from inertial into body axes.

@@ -4,15 +4,15 @@ The motion is found by multiple shooting with linear-quadratic steps. Each step 
 improves a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization,
 algorithm 18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The
 defect of a time step is the difference between the propagated state at the end of the step and the state at
-the next instant. All defects vanish in the course of the iterations (Bock & Plitt 1984, IFAC 9th World
-Congress). Multiple shooting prevents errors from growing along a revolution. Without multiple shooting,
-errors could grow, because coils cause no torque about the field and the body may rotate far about the
-pointing axis. An iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated by the
-midpoint rule, and derivatives are computed of this discrete rule. With derivatives of the continuous motion,
-the iteration would stall for bodies that rotate by degrees per time step.
+the next instant. The defects of all steps converge to zero during the iterations (Bock & Plitt 1984, IFAC 9th
+World Congress). Multiple shooting prevents errors from growing along a revolution. Without multiple shooting,
+errors could grow, because coils cause no torque about the field and the body may rotate by a large angle
+about the pointing axis. An iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated
+by the midpoint rule, and the derivatives are those of this discrete rule. With derivatives of the continuous
+motion, the iteration would stall for bodies that rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
-the module `pointing_path` instead. The cost of an error at the end of this path is computed by a backward
+the module `pointing_path` instead. The cost of an error at the end of the path is computed by a backward
 Riccati sweep along the attitude law over one more revolution.
 """
 
@@ -71,7 +71,7 @@ def defects(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
 
 
 def derivative(expected: PathConditions, motion: PlannedMotion) -> LinearErrorModel:
-    """Return the derivatives of the state after each step by the previous state, dipole and torque."""
+    """Return the derivatives of the state after each step with respect to old state, dipole and torque."""
     step, count = expected.step, len(motion.control)
     q, w, dipole = motion.quaternion[:count], motion.rate[:count], motion.control
     half, middle = _halfway(expected, motion)
@@ -106,14 +106,14 @@ def _halfway(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArra
 
 
 def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 6) of angular accelerations by dipole moment and torque, body axes."""
+    """Return the derivatives (n, 3, 6) of angular accelerations with respect to dipole and torque."""
     return np.concatenate(
         [-inverse @ cross_matrices(shown), np.broadcast_to(inverse, (len(shown), 3, 3))], axis=2
     )
 
 
 def _rotation_jacobian(vector: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 3) of rotations by the rotation vectors (n, 3).
+    """Return the derivatives (n, 3, 3) of rotations with respect to the rotation vectors (n, 3).
 
     The derivatives are left Jacobians of the rotation group, for scalar-last quaternions from inertial into
     body axes.
@@ -129,14 +129,15 @@ def _rotation_jacobian(vector: FloatArray) -> FloatArray:
 STEPS = 40
 """Maximum number of iterations of multiple shooting."""
 FARTHEST = math.radians(30.0)
-"""Largest rotation (rad) of an attitude by one iteration; a larger change is scaled down to this rotation."""
+"""Largest rotation (rad) by which an iteration changes an attitude; larger changes are scaled down."""
 HALVES = 6
-"""Largest number of times that the change of an iteration is halved."""
+"""Largest number of times that a step is halved in the line search."""
 DEARER = 1.2
-"""Weight of the defects in the merit function, relative to the largest derivative of the cost by a defect."""
+"""Weight of the defects in the merit function, relative to the largest derivative of the cost with respect to
+a defect."""
 DONE = math.radians(0.05)
-"""Rotation (rad) by an iteration below which multiple shooting ends. Multiple shooting also ends if an
-iteration improves the merit by less than the fraction SAVED."""
+"""Multiple shooting ends if an iteration rotates all attitudes by less than this angle (rad). Multiple
+shooting also ends if an iteration improves the merit by less than the fraction SAVED."""
 SAVED = 1e-4
 ENOUGH = 0.01
 """Largest accepted sum of the weighted defects of a motion, divided by 1 + cost of the motion."""
@@ -149,8 +150,8 @@ class _ShootingStep:
     Attributes:
         change: change (n + 1, 6) of rotation and rate.
         control: change (n, 3) of the dipole moment, A m^2.
-        gains: feedback gains about the motion at which the step starts.
-        linear: linear error model about the motion at which the step starts.
+        gains: feedback gains for the motion from which the step starts.
+        linear: linear error model for the motion from which the step starts.
         rotated: largest rotation of any attitude by the step, rad.
         sensitivity: largest derivative (6,) of the cost with respect to a defect at any instant.
     """
@@ -203,8 +204,8 @@ def best_course(
 class _Merit:
     """The merit function by which motions are compared: the cost plus the weighted defects.
 
-    The weights `state` (6, 6) and `dipole` are for the errors and the dipole moment of a step. The weights
-    `dear` (6,) are for the defects of a step.
+    The errors of a step have the weights `state` (6, 6), and the dipole moment has the weight `dipole`. The
+    defects of a step have the weights `dear` (6,).
     """
 
     expected: PathConditions
@@ -291,7 +292,7 @@ new table is shorter, the previous table is kept."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointingWeights:
-    """Weights of the errors. Each weight is given as the size of an error that has a cost of one.
+    """Weights of the errors. Each weight is given as the magnitude of an error that has a cost of one.
 
     Attributes:
         turn: rotation error about one axis that has a cost of one, rad.
@@ -320,11 +321,11 @@ class PointingTable:
         wanted: motion commanded by the attitude law at n + 1 instants.
         dipole: feedforward dipole moment (n, 3), held until the next instant, A m^2.
         gain: feedback gains K (n, 3, 6), in A m^2 per rad and per rad/s.
-        torque_part: change of the dipole moment per change of each disturbance size (n, 3, sizes), A m^2/(N
-            m).
-        sizes: sizes of the disturbance torques with which the path was planned, N m.
-        slew: slew path at the start of the table, with times from the start of the path, or None without a
-            slew.
+        torque_part: change of the dipole moment (n, 3, 9) per change of each disturbance torque component, A
+            m^2/(N m).
+        sizes: components (9,) of the disturbance torques with which the path was planned, N m.
+        slew: slew path at the start of the table, with times from the start of the path, or None if the table
+            begins without a slew.
     """
 
     path: AttitudeReferences
@@ -373,8 +374,8 @@ class PointingPreview:
         initial: initial guess (n + 1,) of the motion from the body's state to the attitude law, not
             necessarily feasible.
         field, position: magnetic field (T) and position (m), each (m, 3), ICRS.
-        pressures: pressures of air and sunlight at the m instants.
-        sizes: present estimates (9,) of the sizes of the disturbance torques, N m.
+        pressures: pressure vectors of air and sunlight at the m instants.
+        sizes: present estimates (9,) of the components of the disturbance torques, N m.
     """
 
     wanted: AttitudeReferences

@@ -2,16 +2,16 @@
 
 The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
 the gyro. The law demands the torque J (w^2 e - 2 z w rate), with bandwidth w, damping ratio z, and the
-rotation e from the body axis to the Sun. The coils can produce only the component of this torque across the
-field (Lovera & Astolfi 2004, Automatica 40(8)). A torque about the direction of the Sun is therefore added,
-such that the sum has no component along the field. A torque about the Sun disturbs the pointing of the body
-axis least. Unless the field is normal to the direction of the Sun, both axes across this direction are
-controlled simultaneously, while the body may roll about the direction. The torque about the direction of the
-Sun is reduced for a body that rolls fast. The direction of the Sun is propagated through an eclipse
-(`PropagatedSun`). If the direction of the Sun is unknown, the rate of the body is only damped. The residual
-dipole moment, which causes the largest torque on a light body, is estimated and cancelled (`ResidualDipole`).
-The coils are off while the field is measured. The coils are driven only after the fields measured in two
-consecutive pauses agree.
+rotation e from the body axis to the Sun. The coils can produce only the component of the demanded torque
+across the field (Lovera & Astolfi 2004, Automatica 40(8)). A torque about the direction of the Sun is
+therefore added, such that the sum has no component along the field. A torque about the Sun disturbs the
+pointing of the body axis least. Unless the field is normal to the direction of the Sun, both axes across this
+direction are controlled simultaneously, while the body may roll about the direction. The added torque about
+the direction of the Sun is reduced if the body rolls fast. The direction of the Sun is propagated through an
+eclipse (`PropagatedSun`). If the direction of the Sun is unknown, the rate of the body is only damped. The
+residual dipole moment, which causes the largest torque on a light body, is estimated and cancelled
+(`ResidualDipole`). The coils are off while the field is measured. The coils are driven only after the fields
+measured in two consecutive pauses agree.
 """
 
 from __future__ import annotations
@@ -27,17 +27,19 @@ from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.detumble import WindowSchedule
 
 MEMORY = 2400.0
-"""Longest time (s) for which the Sun is propagated, which covers the longest eclipse of a low orbit."""
+"""Longest time (s) over which the Sun direction is propagated, which covers the longest eclipse of a low
+orbit."""
 SMOOTHED, DRIFT = 10.0, 6.5e-4
-"""Averaging time (s) of measured directions, and gain (rad/s^2) from a direction error to the gyro bias."""
+"""Averaging time (s) of measured directions (first value), and gain (1/s^2) with which a direction error
+changes the estimated gyro bias (second value)."""
 JUMP = 0.5
-"""Sine of the smallest angle between the propagated and a measured direction at which the measurement
-replaces the propagated direction."""
+"""Sine of the angle between propagated and measured direction above which the measurement replaces the
+propagated direction."""
 LARGEST_BIAS = 3e-3
 """Largest estimated gyro bias per axis, rad/s."""
 LONGEST_DELAY = 0.5
-"""Longest age (s) of the last gyro reading with which the propagated and the measured direction are
-compared."""
+"""Longest age (s) of the last gyro reading at which a measured direction is compared with the propagated
+direction."""
 LONGEST_GAP = 3.0
 """Longest gap (s) between gyro readings over which the direction can be propagated."""
 _SECOND = 1e-9
@@ -95,8 +97,8 @@ class ResidualDipole:
 
     A Luenberger observer predicts the rate from the dipole moments of coils and body and follows the measured
     rate. The difference is attributed to a residual dipole moment across the field. The component along the
-    field becomes observable when the field rotates in body axes. Gravity-gradient and air torques across the
-    field are also attributed to the residual dipole moment, and are therefore cancelled as well.
+    field becomes observable when the field rotates in body axes. Gravity-gradient and aerodynamic torques
+    across the field are also attributed to the residual dipole moment, and are therefore cancelled as well.
     """
 
     def __init__(self, inertia: FloatArray, bound: float | FloatArray) -> None:
@@ -118,8 +120,8 @@ class ResidualDipole:
     def follow(self, seconds: float, rate: FloatArray, field: FloatArray, coils: FloatArray) -> None:
         """Accept a rate (3,) rad/s measured `seconds` after the previous rate.
 
-        In this interval the dipole moment of the coils was `coils` (3,), A m^2, and the magnetic field
-        `field` (3,), T.
+        In the interval since the previous rate, the dipole moment of the coils was `coils` (3,), A m^2, and
+        the magnetic field was `field` (3,), T.
         """
         square = float(field @ field)
         if self._rate is None or seconds > LONGEST_INTERVAL or square == 0.0:
@@ -134,14 +136,16 @@ class ResidualDipole:
 
 
 AGREES = 0.2
-"""Largest relative difference between the fields of two pauses, after propagation by the body's rotation."""
+"""Largest relative difference between the fields of two coil pauses, after correction for the body's
+rotation."""
 ROLL = 150.0
 """Cost of a torque normal to the Sun direction, relative to the cost of a torque about the Sun direction."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
-"""Total rate, and rate across the direction of the Sun (rad/s), above which the body is only damped. The two
-rate limits are below the rates at which the flight software starts detumbling."""
+"""Total rate (rad/s, first value) and rate (rad/s) across the Sun direction (second value) above which the
+body is only damped. The two rate limits are below the rates at which the flight software starts
+detumbling."""
 FASTEST_ROLL = 0.0105
-"""Roll rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
+"""Roll rate (rad/s) about the Sun direction above which a torque about that direction is not preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
 """Bandwidth w (rad/s) and damping ratio z of the Sun pointing law. At one radian from the Sun, the pointing
 law demands at most the fraction `SHARE` of the torque that the coils can produce."""
@@ -210,7 +214,7 @@ class SunAcquisition:
         self._sun.measure(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the actual dipole moment (3,), A m^2, until the next command, if not the commanded one."""
+        """Set the actual dipole moment (3,), A m^2, until the next command, if it is not as commanded."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:

@@ -10,15 +10,16 @@ The torsion and the damping of the thread are known or estimated. The filter can
 torques from the estimated disturbance, because these torques depend on the angle and the rate.
 
 The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
-broken, the model predicts an acceleration that does not occur. The innovations of the gyro then exceed their
-covariance within a few samples. In a healthy flight they do not. After such innovations, the filter treats
-the coil currents as unknown and follows the gyro. The currents of the last half second are also treated as
-unknown. A change of the rate that is too large for any coil current is not evidence against the commands,
-because the gyro may be faulty. The commands are trusted again when the rate follows the commands. The model z
-= b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate that the
-commands should cause. The response g must be determined well, be 1 within its uncertainty, and leave white
-residuals. The commands are therefore never trusted again while the coils are not driven. If the gyro is
-noisier than assumed, the check widens its limits and does not raise an alarm.
+broken, the model predicts an acceleration that does not occur. With a broken coil, the innovations of the
+gyro exceed their covariance within a few samples. While the coils work, the innovations of the gyro stay
+within their covariance. After such innovations, the filter treats the coil currents as unknown and follows
+the gyro. The currents of the last half second are also treated as unknown. A change of the rate that no coil
+current can cause is not evidence of wrong coil currents, because the gyro may be faulty. The commands are
+trusted again when the rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the
+last second, where c is the change of the rate that the commands should cause. The commands are confirmed if
+the response g is well determined and is 1 within its uncertainty, and if the residuals are white. While the
+coils are not driven, the commands therefore cannot become trusted again. If the gyro is noisier than assumed,
+the check widens its limits and does not raise an alarm.
 """
 
 from __future__ import annotations
@@ -61,12 +62,12 @@ from knightcube.gnc.estimation.replay import (
 from knightcube.gnc.estimation.rigid_body import LONGEST_STEP, ProcessNoise, RigidBody
 
 _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
-"""Largest mean innovation of the gyro, in standard deviations, for each number of samples that are averaged.
-A strong fault is detected in one sample, a weak fault only in the mean of many samples. Healthy flights reach
-2.8, 4.0 and 7.0 standard deviations in the means of 1, 4 and 16 samples."""
+"""Largest accepted mean innovation of the gyro, in standard deviations, by the number of averaged samples. A
+strong fault is detected in one sample, a weak fault only in the mean of many samples. In flights without a
+fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
 _BEFORE_NS = 500_000_000
-"""Time (ns) by which the currents are treated as unknown before the first contradicting sample. The earlier
-start undoes the effects that a weak fault has on the other states before the fault is detected."""
+"""Time (ns) before the first contradictory sample from which the currents are treated as unknown. The earlier
+start corrects the effects of a weak fault on the other states before its detection."""
 _MAXIMUM_CHANGE = 3.0
 """Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
 coils. A reversed coil causes twice the change of the rate, and the uncertain age of a sample adds to this."""
@@ -78,8 +79,9 @@ _PROOF = 1.0
 _SHARE_SIGMA = 0.2
 """Largest standard deviation of the fitted response g at which the commands can be confirmed."""
 _WHITE = 0.5
-"""Minimum ratio, for white residuals, of half their mean squared successive difference to their mean square.
-This ratio of the residuals is one for white noise (von Neumann 1941) and near zero for a drift."""
+"""Minimum ratio of half the mean squared successive difference of the residuals to their mean square, for
+which they count as white. The expected ratio is one for white noise (von Neumann 1941) and near zero for a
+drift."""
 _SCALE_OVER = 64.0
 """Number of gyro samples over which the scale of the gyro noise is averaged."""
 _SHARE_ERROR = 0.15
@@ -91,7 +93,7 @@ class CommandCheck:
 
     Attributes:
         active: whether the coils are suspected to carry other currents than commanded.
-        ended_ns: time at which the commands were last trusted again.
+        ended_ns: time at which the commands last became trusted again, ns.
     """
 
     def __init__(self, model: PropagationModel) -> None:
@@ -106,9 +108,9 @@ class CommandCheck:
         self._commanded: FloatArray = np.zeros(1)
 
     def judge(self, newest: Checkpoint) -> int | None:
-        """Return the time (ns) since which the currents are unknown if the newest checkpoint raises an alarm.
+        """Return the time (ns) from which the currents are unknown, if the newest checkpoint raises an alarm.
 
-        Return None if there is no alarm, or if the checkpoint holds no gyro rate.
+        Return None without an alarm, and for a checkpoint of a measurement other than a gyro rate.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
@@ -187,7 +189,7 @@ class CommandCheck:
         self._natural = self._commanded = np.zeros(1)
 
     def _changes(self, state: FilterState, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Return the modelled changes of the rate (rad/s) by the coil commands and by all other causes."""
+        """Return the modelled changes of the rate (rad/s) due to coil commands, and due to other causes."""
         commanded, natural = np.zeros(3), np.zeros(3)
         for torquing, span_ns in self._model.commands.spans(from_ns, to_ns):
             found = self._model.body.accelerate(state.quaternion, state.rate, state.parameters, torquing)
@@ -220,16 +222,16 @@ class FilterSettings:
             known.
         damping_start: initial standard deviation of the thread's damping, 1/s; zero if the damping is known.
         gain_start: initial standard deviation of the coils' gain; zero if the gain is known.
-        latency_start: initial standard deviation of the age of the inertial unit's samples, s; zero if the
-            age is known.
+        latency_start: initial standard deviation of the age that the inertial unit's samples have at their
+            time stamps, s; zero if the age is known.
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
         field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
         rate_walk: random walk of the rate due to white torques other than those of the coils, rad/s per
             sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
-        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
-            rejected.
+        gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
+            component by this many standard deviations.
         history_ns: largest delay of a measurement that is still used, ns.
         longest_step: longest step of propagation, s; a slowly rotating body permits longer steps.
     """
@@ -260,7 +262,7 @@ def free_axes(body: RigidBody) -> FloatArray:
 
 
 def error_state(body: RigidBody, settings: FilterSettings, prior: SlowPrior) -> ErrorState:
-    """Return the declared error state of `body`. A block with a prior covariance of zero is not estimated."""
+    """Return the error state for `body`. A block with a prior covariance of zero is not estimated."""
     free = free_axes(body)
     latency = np.array([[prior.latency_variance]])
     disturbance, walk = settings.disturbance_start * free, settings.disturbance_walk * free
@@ -278,7 +280,7 @@ def error_state(body: RigidBody, settings: FilterSettings, prior: SlowPrior) -> 
 
 
 def process_noise(body: RigidBody, settings: FilterSettings, layout: ErrorState) -> ProcessNoise:
-    """Return the process noise of `body` with the declared error state `layout`."""
+    """Return the process noise of `body` for the error state `layout`."""
     return ProcessNoise(
         settings.current_noise**2 * settings.control_period,
         np.diag(settings.rate_walk**2 * free_axes(body)),
@@ -307,7 +309,7 @@ def first_checkpoint(
 ) -> Checkpoint:
     """Return the filter's first checkpoint, at the time of the later of the two measurements.
 
-    For a suspended body, only the angle about the thread is taken from the measured attitude.
+    For a suspended body, only the angle about the thread is used of the measured attitude.
     """
     suspended, free = model.body.suspended, free_axes(model.body)
     a, b, c, d = attitude.quaternion.tolist()
@@ -368,7 +370,7 @@ class AttitudeFilter:
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
         """Create a filter that has not started.
 
-        The prior of the slow states follows from the settings by default, and after each restart.
+        By default, and after each restart, the prior of the slow states follows from the settings.
         """
         self._settings = settings
         self._prior = prior or slow_prior(body, settings)
@@ -392,8 +394,8 @@ class AttitudeFilter:
         """Record coil currents (3,) A that flow from `time_ns` on, and the field (3,) T, reference axes.
 
         Commands must be recorded in order of time, each before the measurements that follow it. The default
-        of `field` is the constant field of the body description. Pass `known=False` if the coils may carry
-        other currents.
+        of `field` is the constant field of the body description. The argument `known` is false if the coils
+        may carry other currents.
         """
         check = self._check
         self._commands.record(max(time_ns, check.ended_ns), currents, field, known and not check.active)
@@ -435,7 +437,7 @@ class AttitudeFilter:
         return self._history.newest_used.time_ns
 
     def measure(self, measurement: Measurement) -> bool:
-        """Apply a measurement at its own time; return False if it failed the gate or was too late."""
+        """Apply a measurement at its own time, and return False if it failed the gate or was too late."""
         self.nis = math.nan
         if self._branch is not None:
             if self._is_newest(measurement) and not isinstance(measurement, MeanRateMeasurement):
@@ -480,7 +482,7 @@ class AttitudeFilter:
         self._branch = _Branch(base, Replay(self._model, base, again), late, applied)
 
     def catch_up(self, maximum: int | None = None) -> None:
-        """Continue an unfinished replay by `maximum` measurements, by default to its end."""
+        """Apply the next `maximum` measurements of an unfinished replay, by default all of them."""
         branch = self._branch
         if branch is None:
             return
@@ -555,7 +557,8 @@ class AttitudeFilter:
         enough = min(max(accepted, self.REJECTIONS_AT_THE_START), self.REJECTIONS_TO_RESTART)
         if kind is not MeanRateMeasurement and in_a_row >= enough:
             self._history.restart(None)
-            # The measurements contradict the prior, which an earlier boot may have learned wrongly.
+            # The measurements contradict the prior, which a filter before the last boot may have estimated
+            # wrongly.
             self._prior = slow_prior(self._model.body, self._settings)
             self._layout = error_state(self._model.body, self._settings, self._prior)
             self._refused_in_a_row = {}

@@ -69,7 +69,7 @@ class ErrorState:
     """
 
     def __init__(self, blocks: Sequence[StateBlock]) -> None:
-        """Place the blocks one after the other. Raises UsageError for two blocks with one name."""
+        """Concatenate the blocks. Raises UsageError if two blocks have the same name."""
         self.sizes = {block.name: len(block.prior) for block in blocks}
         if len(self.sizes) < len(blocks):
             raise UsageError(f"two blocks of the error state have the same name: {[b.name for b in blocks]}")
@@ -122,8 +122,8 @@ def weigh(covariance: FloatArray, value: FloatArray, rows: FloatArray, noise: Fl
 def updated(covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread: FloatArray) -> FloatArray:
     """Return the covariance (n, n) of the states after a correction with any gain (n, k).
 
-    The arguments `cross` and `spread` are attributes of `Weighed`. The result equals Joseph's form, also for
-    a gain that is not optimal, such as one with zero rows for considered elements.
+    The arguments `cross` and `spread` are the attributes of `Weighed` with these names. The result equals
+    Joseph's form, also for a gain that is not optimal, such as one with zero rows for considered elements.
     """
     half = gain.dot((cross - 0.5 * gain.dot(spread)).T)
     covariance = covariance - half - half.T
@@ -135,10 +135,11 @@ def propagated(
 ) -> FloatArray:
     """Return the covariance (n, n) after a step of `seconds`, for dynamics of attitude and rate.
 
-    The first six states are attitude and rate. The error dynamics F of attitude and rate are `flow` (6, k),
-    for the first k states. The spectral density of the angular acceleration is `density` (3, 3), rad^2/s^3.
-    The random walks of the first k states have the variances `walks` (k,) per second. States beyond the first
-    k do not change. The transition matrix is I + F dt + (F dt)^2 / 2.
+    The first six states are attitude and rate. The argument `flow` (6, k) contains the rows of the error
+    dynamics F for attitude and rate, and the columns for the first k states. The spectral density of the
+    angular acceleration is `density` (3, 3), rad^2/s^3. The random walks of the first k states have the
+    variances `walks` (k,) per second. States beyond the first k do not change. The transition matrix is I + F
+    dt + (F dt)^2 / 2.
     """
     size = flow.shape[1]
     flow = seconds * flow
@@ -148,7 +149,7 @@ def propagated(
     transition[:, _MOTION] += _IDENTITY
     moved = transition.dot(covariance[:size])
     among = moved[:, :size].dot(transition.T)
-    # White angular acceleration adds to the covariance of attitude and rate.
+    # White noise of the angular acceleration adds to the covariance of attitude and rate.
     of_attitude, of_both = seconds**3 / 3.0, 0.5 * seconds * seconds
     over = np.array((of_attitude, of_both, of_both, seconds)).reshape(2, 1, 2, 1)
     among += (over * density[:, np.newaxis]).reshape(6, 6)
@@ -159,7 +160,7 @@ def propagated(
 
 
 def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
-    """Rotate the remaining error of an attitude to the axes after its correction, in place.
+    """Transform, in place, the covariance of an attitude error to the axes after the correction.
 
     The slice `at` of the error state is the attitude error, which was corrected by `rotation` (3,), rad. To
     first order, the remaining error rotates by half the correction (Markley and Crassidis 2014, section
@@ -174,12 +175,13 @@ def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
 
 
 def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: FloatArray) -> None:
-    """Keep the uncertainty of the common scale of some states in a correction of these states, in place.
+    """Preserve, in place, the uncertainty of the common scale of some states when these are corrected.
 
-    If no measurement shows the common scale, the unobservable direction is that of the states themselves,
-    which the correction `change` (n,) moves. The covariance is moved with this direction. Otherwise each
-    correction would make the uncertainty of the scale smaller. The slice `at` of the error state, with the
-    values (m,) before the correction, measures the scale.
+    If no measurement depends on the common scale, the unobservable direction in state space is the direction
+    of the states themselves, which the correction `change` (n,) rotates. The covariance is therefore adjusted
+    to the corrected direction. Without this adjustment, each correction would reduce the uncertainty of the
+    scale. The slice `at` of the error state contains the scaled states, whose `values` (m,) are those before
+    the correction.
     """
     along = values / (values @ values)
     covariance += np.outer(change, along @ covariance[at])
@@ -192,7 +194,7 @@ _IDENTITY: FloatArray = np.eye(6)
 
 
 def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) at the start, if attitude and rate depend on the other states.
+    """Return the initial covariance (n, n) if attitude and rate depend on the other states.
 
     The derivatives of the errors of attitude and rate with respect to the states are `by_states` (6, n). The
     covariance of attitude and rate for exactly known other states is `first` (6, 6).
@@ -205,26 +207,27 @@ def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> 
 
 
 PLAUSIBLE = 4.0
-"""Largest plausible deviation of a learned state from its configured value, in standard deviations."""
+"""Largest plausible deviation of an estimated state from its configured value, in standard deviations."""
 
 
 def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:
-    """Return flags (k,): whether each learned state is plausible for its variance at the start."""
+    """Return flags (k,): whether each estimated state is plausible for its initial variance."""
     return np.asarray(np.abs(values) <= PLAUSIBLE * np.sqrt(variances))
 
 
 CONTRADICTED, PAUSE = 60.0, 600.0
-"""Time (s) over which innovations are judged, and time (s) after a contradiction in which none is judged."""
+"""Time (s) over which innovations are evaluated, and time (s) after a contradiction without evaluation."""
 _LARGEST, _MEAN, _LEAST = chi_square.bound(0.001, 3), 5.0, 40
-"""Largest counted square of an innovation, largest mean of consistent ones, and minimum number of them."""
+"""Upper limit to which squared innovations are clipped, largest mean of consistent squared innovations, and
+minimum number of innovations."""
 
 
 class PriorCheck:
-    """Detects that consistent measurements contradict learned states.
+    """Detects that mutually consistent measurements contradict the estimated states.
 
-    Learned states are contradicted if the normalised squares of the innovations in `CONTRADICTED` seconds
-    have a mean above 5 instead of 3. Each square is limited to a value that is exceeded once in a thousand,
-    so that a few outliers cause no contradiction.
+    The states are contradicted if the normalised squared innovations in `CONTRADICTED` seconds have a mean
+    above 5; the expected mean is 3. Each squared innovation is clipped at a value that is exceeded once in a
+    thousand, so that a few outliers cause no contradiction.
     """
 
     def __init__(self) -> None:
@@ -234,7 +237,8 @@ class PriorCheck:
     def add(self, time: float, square: float) -> bool:
         """Add the normalised square of an innovation with three components at a time (s).
 
-        Return whether the innovations contradict the learned states. A contradiction is followed by a pause.
+        Return whether the innovations contradict the estimated states. After a contradiction, innovations are
+        ignored for `PAUSE` seconds.
         """
         if not time >= self._least_time or math.isnan(square):
             return False
@@ -252,7 +256,8 @@ class PriorCheck:
 def gate_bounds(sigma: float) -> dict[int, float]:
     """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 
-    A larger square is less likely than a deviation of one component by `sigma` standard deviations.
+    A larger squared innovation is less likely than a deviation of one component by `sigma` standard
+    deviations.
     """
     chance = math.erfc(sigma / math.sqrt(2.0))
     return {components: chi_square.bound(chance, components) for components in (1, 2, 3)}

@@ -22,13 +22,13 @@ BLOCKS = {
     "latency": 1,
     "field_bias": 3,
 }
-"""Sizes of the blocks of the error state, in order."""
+"""Number of elements of each block of the error state, in order."""
 ATTITUDE, RATE, BIAS, DISTURBANCE, PARAMETERS, _AGE, FIELD_BIAS = slices(BLOCKS)
 """Indices of the blocks of the error state in the covariance (19, 19)."""
 LATENCY = _AGE.start
-"""Index of the age of the inertial unit's samples in the error state."""
+"""Index, in the error state, of the age of the inertial unit's samples."""
 SIZE = FIELD_BIAS.stop
-"""Size of the error state."""
+"""Number of elements of the error state."""
 
 
 class Parameters(NamedTuple):
@@ -64,7 +64,7 @@ class Estimate:
         quaternion: attitude (4,), from reference axes into body axes.
         rate: body rate (3,) in body axes, rad/s.
         bias: gyro bias (3,) in body axes, rad/s.
-        disturbance: angular acceleration (3,) that the model does not contain, rad/s^2.
+        disturbance: unmodelled angular acceleration (3,), rad/s^2.
         parameters: estimated torsion and damping of the thread, and gain of the coils.
         covariance: covariance (19, 19) of the error state, whose attitude error is a rotation vector in body
             axes.
@@ -110,11 +110,11 @@ class FilterState(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowPrior:
-    """Prior of the slowly changing and constant states; a state with zero variance is not estimated.
+    """Prior of constant and slowly changing states; a state with a prior variance of zero is not estimated.
 
     Attributes:
-        bias: gyro bias (3,), rad/s, with covariance `bias_covariance` (3, 3).
-        parameters: parameters of the body's model, with covariance `parameters_covariance` (3, 3).
+        bias: gyro bias (3,), rad/s, with the covariance `bias_covariance` (3, 3).
+        parameters: parameters of the body's model, with the covariance `parameters_covariance` (3, 3).
         latency: age of the inertial unit's samples at the time of their time stamps, s.
     """
 

@@ -2,11 +2,11 @@
 
 Relative to a rotating body, the field direction moves on a cone about the rate vector. The motion of the
 field direction therefore gives all three components of the rate, including the component along the field. A
-spin exactly along the field is observable only after the field direction has changed, which it does by about
-two revolutions per orbit. A gyro sample resolves a spin along the field at once. The states, in body axes,
-are the rate w, the field B, the inertial time derivative v of the field, and the errors j of the six elements
-of the inertia tensor. In a fast tumble, an inertia that is wrong by a few per cent causes the largest error
-of the torque model. The equations of motion are
+spin exactly along the field is observable only after the field direction has changed. In a polar orbit, the
+field direction rotates by about two revolutions per orbit. A gyro sample shows a spin along the field
+immediately. The states, in body axes, are the rate w, the field B, the inertial time derivative v of the
+field, and the errors j of the six elements of the inertia tensor. In a fast tumble, an error of a few per
+cent of the inertia is the largest error of the torque model. The equations of motion are
 
     J(j) w' = m x B - w x J(j) w,    B' = v - w x B,    v' = -w x v,    j' = 0.
 
@@ -43,10 +43,10 @@ SIZE = 15
 LARGEST_ROTATION = 0.15
 """Largest rotation (rad) of the body in one integration step."""
 COVARIANCE_STEP, COVARIANCE_ROTATION = 0.1, 0.03
-"""Longest time (s), and largest rotation (rad) of the body, of one step of the covariance."""
+"""Longest time (s) and largest rotation (rad) of the body in one propagation step of the covariance."""
 _LINEARISED = 0.2
-"""Fraction of the inertia's standard deviation that is added as noise for a known rate, because the filter is
-linearised."""
+"""Fraction of the standard deviation of the inertia that is added as noise while the rate is known, because
+the filter is linearised."""
 _AGREEING = 3
 """Number of consecutive consistent field samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)
@@ -65,11 +65,10 @@ class FieldRateSettings:
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
         torque_walk: random walk of the rate per axis due to unmodelled torques, rad/s per sqrt(s).
-        errors: largest errors of the description of the body, of which only the errors of the inertia are
-            used.
+        errors: largest errors of the body's description; only the errors of the inertia are used.
         inertia_walk: random walk of the inertia, relative to its trace, per sqrt(s).
-        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
-            rejected.
+        gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
+            component by this many standard deviations.
         refusals: number of consecutively rejected measurements after which the filter restarts, or the gyro
             is excluded.
         gyro_sigma: assumed bound of the gyro bias per axis, rad/s.
@@ -115,7 +114,7 @@ class FieldRate:
         self._prior = inertia_covariance(self._assumed, settings.errors)
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
-        self._is_reset = False  # whether nothing has changed since the last reset
+        self._is_reset = False  # whether the filter is unchanged since the last reset
         self.restart()
 
     def restart(self) -> None:
@@ -132,9 +131,11 @@ class FieldRate:
         self._field = self._change = _NONE
         self._set_inertia(np.zeros(6))
         self._covariance = np.zeros((SIZE, SIZE))
-        self._pending = 0.0  # time (s) by which the covariance is behind the state
-        self._pending_impulse = np.zeros(3)  # integral of the dipole since the covariance's time, A m^2 s
-        self._pending_start = _NONE, _NONE, _NONE  # rate, field and field change at the covariance's time
+        self._pending = 0.0  # age (s) of the covariance relative to the state
+        # Integral of the dipole since the time of the covariance, A m^2 s.
+        self._pending_impulse = np.zeros(3)
+        # Rate, field and field derivative at the time of the covariance.
+        self._pending_start = _NONE, _NONE, _NONE
 
     @property
     def started(self) -> bool:
@@ -198,7 +199,7 @@ class FieldRate:
             self._propagate_covariance()
 
     def measure(self, field: FloatArray, age: float = 0.0) -> bool:
-        """Apply a field (3,) T measured `age` s ago with the coils off; return whether it passed the gate.
+        """Apply a field (3,), T, measured `age` s ago with coils off, and return whether it passed the gate.
 
         The measured field is rotated into the present body axes with the body rate.
         """
@@ -277,9 +278,9 @@ class FieldRate:
     def _update_unexplained(self) -> None:
         """Set the relative standard deviation of the gyroscopic torque from the uncertainty of the inertia.
 
-        Without noise of this size, the covariance of the linearised filter would become too small while the
-        inertia is poorly known. The least certain combination of the tensor's elements is omitted, because it
-        is the common scale, on which the gyroscopic acceleration does not depend.
+        Without this noise, the covariance of the linearised filter would become too small while the inertia
+        is poorly known. The least certain combination of the tensor's elements is omitted, because it is the
+        common scale of the elements, which does not affect the gyroscopic acceleration.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[INERTIA, INERTIA])[-2])
         self._unexplained = math.sqrt(max(unknown, 0.0)) * self._trace / np.diag(self._inertia)

@@ -2,29 +2,31 @@
 
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
 gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
-module `attitude_filter` replays each late sample at its own time. Here, a late attitude is propagated to the
-present with the present rate, and its innovation includes the error of that rate. The propagation with a
-constant rate is accurate for some seconds if the body rotates slowly enough for star images.
+module `attitude_filter` replays each late sample at its own time. This filter instead propagates a late
+attitude to the present with the present rate, and the innovation includes the error of that rate. The
+propagation with a constant rate is accurate for some seconds if the body rotates slowly enough for star
+images.
 
-Besides attitude and rate, the error state (`error_state`) holds the errors of the satellite's description in
-the following blocks.
+Besides attitude and rate, the error state (see `error_state`) contains blocks for the errors of the
+satellite's description.
 
 The block `inertia` holds the errors of the inertia tensor, relative to the trace. Euler's equation is linear
 in the errors of the inertia tensor. A tumble about more than one axis shows the ratios of the moments and the
-principal axes (Psiaki 2005, JGCD 28(4)). The common scale of the inertia is observable only against the
-dipole of the coils.
+principal axes (Psiaki 2005, JGCD 28(4)). The common scale of the inertia is observable only relative to the
+dipole moment of the coils.
 
 The block `coils` is the matrix of gains and misalignments of the coils. The estimated dipole is the commanded
-dipole plus this matrix times the commanded dipole. The blocks `gyro_matrix` and `field_matrix` hold scale
-factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
+dipole plus the product of the matrix in block `coils` and the commanded dipole. The blocks `gyro_matrix` and
+`field_matrix` hold scale factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
 
 The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
-accurately than the attitude of the body, to whose uncertainty the misalignment of the star camera adds. The
-block `horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates,
-other horizon cameras are used, so this misalignment is modelled as a Gauss-Markov process with a long memory.
+accurately than the attitude of the body, because the misalignment of the star camera adds to the uncertainty
+of the attitude of the body. The block `horizon` is the misalignment of the horizon cameras that measure Sun
+and nadir. When the body rotates, other horizon cameras are used, so the misalignment is modelled as a
+Gauss-Markov process with a long correlation time.
 
 Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
-sunlight, and the sizes of the disturbance torques of `knightcube.astro.earth.disturbance`.
+sunlight, and the components of the disturbance torques of `knightcube.astro.earth.disturbance`.
 
 The block `field_error` is the error of the field model. The error of the field model keeps its sign for
 minutes, and is modelled as a Gauss-Markov process of first order in body axes. While the attitude is known
@@ -92,7 +94,7 @@ BLOCKS = {
     "horizon": 3,
     "field_error": 3,
 }
-"""Sizes of the blocks of the error state, in order. Matrices (3, 3) are stored row by row."""
+"""Number of elements of each block of the error state, in order. Matrices (3, 3) are stored row by row."""
 (
     ATTITUDE,
     RATE,
@@ -111,14 +113,14 @@ BLOCKS = {
 ) = slices(BLOCKS)
 """Indices of the blocks of the error state."""
 SLOW = slice(GYRO.start, CAMERA.stop)
-"""Indices of the slowly varying states, which are kept for the next boot."""
+"""Indices of the slowly varying states, which are stored for the next boot."""
 STATES = FIELD.stop
-"""Size of the error state."""
+"""Number of elements of the error state."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterEnvironment:
-    """The environment of the satellite at one time, ICRS.
+    """The environment of the satellite at one time, in ICRS axes.
 
     The environment consists of the magnetic field `field` (3,) T, the `position` (3,) m, the `pressures` of
     air and sunlight, and the visible fraction `sunlit` of the Sun. The error of the field has a standard
@@ -180,7 +182,7 @@ class FreeMotion:
         """Return the external torque (3,) N m, and the error dynamics without the gyroscopic torque.
 
         The commanded dipole of the coils is `driven` (3,), A m^2. The sum of the estimated dipole of the
-        coils and the residual dipole is `dipole` (3,), A m^2. The sizes of the disturbance torques are
+        coils and the residual dipole is `dipole` (3,), A m^2. The components of the disturbance torques are
         `sizes` (9,), N m. The error dynamics (6, STATES) are the rows for attitude and rate.
         """
         to_body = attitude_matrix(quaternion)
@@ -216,31 +218,32 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s), in a body at rest, of the errors of coils and field, represented by white noise."""
+"""Correlation time (s) of the errors of coils and field for a body at rest; these errors are modelled as
+white noise."""
 CURVATURE = 6.0
-"""Correlation time (s) of the acceleration that is of second order in the error of the inertia."""
+"""Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected sizes of the constant torque and of the torques by air and sunlight, relative to that by air. The
-constant torque is small, because the error of the inertia has its own states. At one attitude the torques
-cannot be distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
-attitude."""
+"""Expected magnitudes of the constant torque, the aerodynamic torque and the solar radiation torque, relative
+to the aerodynamic torque. The expected constant torque is small, because the error of the inertia has its own
+states. At a single attitude the torques cannot be distinguished, and an aerodynamic torque that is attributed
+to the constant torque is wrong at every other attitude."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeFilterSettings:
     """Noise and limits of the filter.
 
-    Each pair of values holds the standard deviation at the start and the random walk per sqrt(s).
+    Each pair of values contains the initial standard deviation and the random walk per sqrt(s).
 
     Attributes:
         gyro: standard deviation and random walk of the gyro bias, rad/s.
         dipole, sunlit: standard deviation and random walk of the residual dipole in shadow, and of its
             increase in sunlight, A m^2.
         magnet: standard deviation and random walk of the magnetometer bias, T.
-        field: standard deviation of the field model's error before it is learned, T per axis.
+        field: initial standard deviation of the field model's error, T per axis.
         field_memory: correlation time of the field model's error, s.
-        torque: expected size and random walk of the torque by air, N m. The expected sizes of the torque by
-            sunlight and of the constant torque are fixed fractions of `torque`.
+        torque: expected magnitude and random walk of the aerodynamic torque, N m. The expected magnitudes of
+            the solar radiation torque and of the constant torque are fixed fractions of `torque`.
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
         coil_error: relative error of the coils' dipole, which varies over tens of seconds and adds to the
             error of the constant coil matrix.
@@ -249,18 +252,19 @@ class FreeFilterSettings:
         coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
             temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
-            rate in rad/s. Flexible parts, which are not contained in Euler's equation of a rigid body, are
-            loaded only while the body rotates. The random walk of the inertia keeps its uncertainty from
-            becoming too small.
+            rate in rad/s. The random walk represents flexible parts, which Euler's equation of a rigid body
+            omits and which are loaded only while the body rotates. The random walk of the inertia keeps its
+            uncertainty from becoming too small.
         errors: largest errors of the description of body and sensors.
-        coils: covariance (9, 9) of the coils' matrix, row by row, at the start; None for coils along the body
-            axes, whose covariance follows from `errors`.
+        coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; None for
+            coils along the body axes, because their covariance follows from `errors`.
         roles: roles of the blocks of the error state whose role differs from the default, by name of the
             block.
-        rate_start: standard deviation of the first rate, rad/s.
-        fine, coarse: largest standard deviation about the worst axis of a fine and of a coarse attitude, rad.
-        gate_sigma: a measurement less likely than a deviation of this many sigma in one component is
-            rejected.
+        rate_start: initial standard deviation of the rate, rad/s.
+        fine, coarse: largest standard deviation about the least certain axis for the accuracy classes FINE
+            and COARSE, rad.
+        gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
+            component by this many standard deviations.
     """
 
     gyro: tuple[float, float] = (1e-3, 2e-6)
@@ -284,7 +288,7 @@ class FreeFilterSettings:
     gate_sigma: float = 5.0
 
     def error_state(self, inertia: FloatArray) -> ErrorState:
-        """Return the declared error state of a body of `inertia` (3, 3) kg m^2."""
+        """Return the error state of the filter for a body with the inertia tensor `inertia` (3, 3) kg m^2."""
         start, walk = self.torque
         torques = np.repeat([CONSTANT_SHARE * start, AIR_SHARE * start, LIGHT_SHARE * start], 3)
         errors, ones = self.errors, np.ones(3)
@@ -315,14 +319,14 @@ _UNIFORM = 1.0 / math.sqrt(3.0)
 
 
 def _matrix_errors(scale: float, alignment: float) -> FloatArray:
-    """Return standard deviations (9,) from the largest errors on and off the diagonal of a matrix."""
+    """Return standard deviations (9,) of a matrix from its largest errors on and off the diagonal."""
     return _UNIFORM * np.where(np.eye(3, dtype=bool), scale, alignment).ravel()
 
 
 LARGEST_ROTATION = 0.1
-"""Largest rotation (rad) in a step of integration."""
+"""Largest rotation (rad) of the body in one integration step."""
 FIELD_LEARNED = 2_000.0
-"""Time (s) over which the size of the field model's error is averaged."""
+"""Averaging time (s) of the estimated variance of the field model's error."""
 HORIZON_MEMORY = 3_000.0
 """Correlation time (s) of the misalignment of the horizon cameras."""
 MINIMUM_FIELD_ERROR = 1e-8
@@ -341,7 +345,7 @@ _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowStates:
-    """The `values` (n,) and the covariance (n, n) of the slow states, in the order of the slice `SLOW`."""
+    """The `values` (n,) of the slowly varying states and their covariance (n, n), in the order of `SLOW`."""
 
     values: FloatArray
     covariance: FloatArray
@@ -349,7 +353,7 @@ class SlowStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
-    """A copy of the filter's attributes that form the estimate."""
+    """A copy of those attributes of the filter that form the estimate."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -361,12 +365,13 @@ class FreeMemory:
 
 
 class FreeFilter:
-    """The filter, with the present estimate.
+    """The navigation filter of a free satellite, with its present estimate.
 
-    Over 350 lines, because every propagation and measurement changes the same estimate and covariance.
+    The class is over 350 lines long, because every propagation and every measurement changes the same
+    estimate and covariance.
 
     Attributes:
-        layout: the declared error state.
+        layout: blocks of the error state.
         quaternion: attitude (4,), from ICRS into body axes.
         rate: body rate (3,) in body axes, rad/s.
         acceleration: angular acceleration (3,) in body axes during the last step, rad/s^2.
@@ -397,7 +402,7 @@ class FreeFilter:
         self._lag: FloatArray = np.zeros(3)
         # `_given` (A m^2 s^2) is the integral of the commanded dipole times the time since `begin_mean`.
         self._given: FloatArray = np.zeros(3)
-        self._since = 0.0  # time (s) over which `_lag` and `_given` are integrated
+        self._since = 0.0  # duration (s) of the integrals `_lag` and `_given`
         self.started = False
         self.refused = 0
         self.changes, self.newest_square = 0, 0.0
@@ -421,10 +426,10 @@ class FreeFilter:
     ) -> None:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
-        If the rate was not measured by the gyro, its covariance is `spread` (3, 3), rad^2/s^2.
-        With `by_stars` the attitude was measured by the star camera, otherwise by the horizon cameras. The
-        slow states are kept. If the previous estimate was contradicted (`doubted`), the covariance of the
-        slow states is reset to that of the settings, and implausible values of slow states are set to zero.
+        If the rate was not measured by the gyro, its covariance is `spread` (3, 3), rad^2/s^2. If `by_stars`
+        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slow
+        states are kept. If the previous estimate was contradicted (`doubted`), the covariance of the slow
+        states is reset to that of the settings, and implausible values of slow states are set to zero.
         """
         self.changes += 1
         if doubted:
@@ -458,7 +463,7 @@ class FreeFilter:
 
     @property
     def worst_sigma(self) -> float:
-        """Standard deviation of the attitude of the body about its worst axis, rad."""
+        """Standard deviation of the attitude of the body about its least certain axis, rad."""
         covariance = self.covariance
         return math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
 
@@ -493,13 +498,13 @@ class FreeFilter:
         deviation: float,
         memories: Sequence[FreeMemory] = (),
     ) -> None:
-        """Reset the learned matrix of the coils for one coil.
+        """Reset the estimated matrix of the coils for one coil.
 
         The estimate and its copies `memories` are changed. The reset is necessary after the sign or the gain
-        of the coil was corrected, because the learned matrix refers to the dipole before the correction. The
-        error of the corrected dipole becomes zero, and its correlations with other states are deleted. The
-        standard deviation of the corrected dipole becomes that of the settings, and along the coil at least
-        `deviation`.
+        of the coil was corrected, because the estimated matrix refers to the dipole before the correction.
+        The error of the corrected dipole becomes zero, and its correlations with other states are deleted.
+        The standard deviation of the corrected dipole becomes that of the settings, and along the coil at
+        least `deviation`.
 
         Args:
             direction: unit vector (3,) of the coil, body axes.
@@ -525,8 +530,9 @@ class FreeFilter:
     def renew(self, at: slice, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
         """Reset the block `at` of slow states (n,) to zero with a covariance (n, n).
 
-        The estimate and its copies `memories` are changed. The reset is necessary when the block describes
-        another device: another magnetometer, or coils among which the currents are allocated differently.
+        The estimate and its copies `memories` are changed. The reset is necessary when the block describes a
+        different device, such as another magnetometer, or a different allocation of the currents to the
+        coils.
         """
         self.changes += 1
         estimated = self.layout.prior[at, at].any()
@@ -538,7 +544,8 @@ class FreeFilter:
         """Reset the covariance of the slow states with the indices `at` (k,) to that of the settings.
 
         The estimate and its copies `memories` are changed. The reset is necessary if measurements contradict
-        learned values. Implausible values are set to zero, and with `drop` also errors of inertia and coils.
+        the estimated values. Implausible values are set to zero. If `drop` is true, the estimated errors of
+        inertia and coils are set to zero as well.
         """
         self.changes += 1
         prior = self.layout.prior[np.ix_(at, at)]
@@ -550,7 +557,7 @@ class FreeFilter:
             covariance[np.ix_(at, at)] = prior
 
     def _with(self, memories: Sequence[FreeMemory]) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Yield the constants and the covariance of the estimate, and of each of its copies."""
+        """Yield constants and covariance, first of the present estimate and then of each of its copies."""
         yield self._constants, self.covariance
         for memory in memories:
             yield memory.constants, memory.covariance
@@ -567,7 +574,7 @@ class FreeFilter:
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """Sizes (9,) N m of the disturbance torques."""
+        """Estimated components (9,), N m, of the disturbance torques."""
         return self._constants[TORQUES].copy()
 
     @property
@@ -578,7 +585,7 @@ class FreeFilter:
 
     @property
     def coil_matrix(self) -> FloatArray:
-        """Matrix (3, 3) from the commanded to the estimated dipole of the coils."""
+        """Matrix (3, 3) that converts the commanded dipole of the coils to the estimated dipole."""
         return _EYE + self._matrix(COILS)
 
     def description(self) -> dict[str, FloatArray]:
@@ -586,11 +593,12 @@ class FreeFilter:
 
         The inertia `inertia` (6,), kg m^2, holds the elements xx, yy, zz, yz, zx and xy of the tensor. The
         entries `coils`, `gyro` and `field` (9,) are the matrices of coils, gyro and magnetometer, row by row.
-        `camera` (3,) rad is the rotation vector of the star camera, and `dipole` and `sunlit_dipole` (3,) A
-        m^2 are the parts of the residual dipole. The name of each standard deviation ends with `_sigma`. The
-        standard deviation of the attitude of the star camera is `camera_attitude_sigma` (3,), rad; it is
-        smaller than that of the attitude of the body. The standard deviations of inertia and coils relative
-        to the trace (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
+        The entry `camera` (3,), rad, is the rotation vector of the star camera's misalignment. The entries
+        `dipole` and `sunlit_dipole` (3,), A m^2, are the residual dipole in shadow and its increase in
+        sunlight. The name of each standard deviation ends with `_sigma`. The standard deviation of the
+        attitude of the star camera is `camera_attitude_sigma` (3,), rad; it is smaller than that of the
+        attitude of the body. The standard deviations of inertia and coils relative to the trace (`per_trace`)
+        are `inertia_ratio_sigma` and `coils_ratio_sigma`.
         """
         self.motion.correct(self._constants[INERTIA])
         sigma = np.sqrt(self.covariance.diagonal())
@@ -633,7 +641,7 @@ class FreeFilter:
         """Propagate by one or two `seconds` under the mean commanded dipole (3,) A m^2, body axes.
 
         The value `doubt` (A m^2) is the standard deviation per axis of a dipole that may differ from the
-        command. If the dipole changes during `seconds`, `uneven` (3,) A m^2 s^2 is the double time integral
+        command. If the dipole changes during `seconds`, `uneven` (3,), A m^2 s^2, is the double time integral
         of the dipole minus that of the mean dipole.
         """
         before = self.rate
@@ -655,7 +663,7 @@ class FreeFilter:
         self._lag, self._given, self._since = np.zeros(3), np.zeros(3), 0.0
 
     def impulse(self, since: float) -> FloatArray:
-        """Return the time integral (3,), A m^2 s, of the dipole until now, as the mean over start times.
+        """Return the time integral (3,), A m^2 s, of the dipole until now, averaged over the start times.
 
         The start times cover the averaging interval of the gyro samples, whose middle is `since` s ago.
         """
@@ -666,10 +674,10 @@ class FreeFilter:
     def gyro(
         self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None, since: float = 0.0
     ) -> bool:
-        """Apply a gyro rate (3,) rad/s with covariance (3, 3), and return whether the rate passed the gate.
+        """Apply a gyro rate (3,), rad/s, with covariance (3, 3), and return whether the rate passed the gate.
 
-        If the gyro rate is an average over an interval, `change` (3,) rad/s is the change of the rate since
-        the middle of the interval, `since` s ago, due to the acceleration of the last step. The average is
+        If the gyro rate is an average over an interval, `change` (3,), rad/s, is the change of the rate since
+        the middle of the interval, `since` s ago, at the acceleration of the last step. The averaged rate is
         corrected for the change of the acceleration since `begin_mean`.
         """
         matrix = _EYE + self._matrix(GYRO_MATRIX)
@@ -702,12 +710,13 @@ class FreeFilter:
     ) -> bool:
         """Apply an attitude (4,) measured `age` s ago.
 
-        With `by_stars` the attitude was measured by the star camera, otherwise by the horizon cameras. The
-        covariance (3, 3), rad^2, is given in the present body axes.
+        If `by_stars` is true, the attitude was measured by the star camera, otherwise by the horizon cameras.
+        The covariance (3, 3), rad^2, is given in the present body axes.
         """
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
-        # The rotation since the measurement has the error of the rate.
+        # The rotation since the measurement is computed from the estimated rate, and its error follows from
+        # the error of the rate.
         rows[:, ATTITUDE], rows[:, RATE] = _EYE, -age * _EYE
         misaligned = CAMERA if by_stars else HORIZON
         rows[:, misaligned] = _EYE
@@ -751,9 +760,9 @@ class FreeFilter:
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
 
     def _propagate_field_error(self, dt: float, least: float) -> None:
-        """Let the field model's error decay, and learn its standard deviation while the attitude is fine.
+        """Let the field model's error decay, and estimate its standard deviation while the attitude is FINE.
 
-        The standard deviation is at least `least` (T per axis).
+        The estimated standard deviation is at least `least` (T per axis).
         """
         covariance, error = self.covariance, self._constants[FIELD]
         if self.worst_sigma <= self._settings.fine:
@@ -777,7 +786,7 @@ class FreeFilter:
     def _step(self, dt: float, driven: FloatArray, around: FilterEnvironment, doubt: float) -> None:
         """Propagate state and covariance by one step of the classical Runge-Kutta method.
 
-        The midpoint rule would err by as much as an error of the inertia of 4e-4.
+        The error of the midpoint rule would be equivalent to a relative inertia error of 4e-4.
         """
         self.changes += 1
         motion, rate = self.motion, self.rate
@@ -834,9 +843,10 @@ class FreeFilter:
         """Return the noise density (3, 3) of the angular acceleration, rad^2/s^3.
 
         The noise density depends on the coils' dipole (3,) A m^2, on the error of the field model, and on the
-        standard deviation `doubt` (A m^2) of an uncertain dipole. Errors of a dipole cause no torque along
-        the field, but the error of the field model does. The estimate is `then`, and the equation of motion
-        is `motion`; by default both are the present ones.
+        standard deviation `doubt` (A m^2) of an uncertain dipole. Errors of the dipole cause no torque along
+        the field, but the error of the field model causes a torque along the field. The noise density is
+        computed for the estimate `then` and the equation of motion `motion`, by default for the present
+        estimate and equation.
         """
         settings, motion, square = self._settings, motion or self.motion, float(dipole @ dipole)
         at = then or self
@@ -849,7 +859,7 @@ class FreeFilter:
             density = density + coils * (across @ across.T)
         if square:
             across = motion.inverse @ cross_matrix(dipole)
-            # In a rotating body, the two components of the field's error across the rate average out.
+            # While the body rotates, the two components of the field error across the rate average out.
             rotated = 1.0 + 0.25 * LASTING**2 * float(at.rate @ at.rate)
             error = max(at.field_error, around.field_sigma)
             density = density + LASTING * (1.0 + 2.0 / rotated) / 3.0 * error**2 * (across @ across.T)
@@ -879,8 +889,10 @@ class FreeFilter:
 
 BODY: IntArray = np.r_[DIPOLE, SUNLIT, TORQUES, INERTIA]
 LEARNED = {"body": BODY, "coils and body": np.r_[BODY, COILS]}
-"""Indices of the learned states that the motion without and with currents in the coils can contradict."""
-# Twice these states give the same motion, because inertia, dipoles and torques have a common scale.
+"""Indices of the estimated states that the motion can contradict: `body` without coil currents, and `coils
+and body` with coil currents."""
+# If all these states are doubled, the motion is the same, because inertia, dipoles and torques have a common
+# scale.
 _SCALED: FloatArray = np.zeros(STATES)
 _SCALED[LEARNED["coils and body"]] = 1.0
 _CAMERA_ROWS: FloatArray = np.zeros((3, STATES))
@@ -888,9 +900,9 @@ _CAMERA_ROWS[:, ATTITUDE] = _CAMERA_ROWS[:, CAMERA] = _EYE
 
 
 def density_walk(sizes: FloatArray) -> FloatArray:
-    """Return the increase (9, 9) per second of the covariance of the torque sizes (9,).
+    """Return the increase (9, 9) per second of the covariance of the disturbance components `sizes` (9,).
 
-    The random walk of the air density is relative, so its effect is proportional to the torque by air.
+    The random walk of the air density is relative, so its effect is proportional to the aerodynamic torque.
     """
     walk = np.zeros((SIZES, SIZES))
     walk[AIR, AIR] = AIR_WALK**2 * np.outer(sizes[AIR], sizes[AIR])

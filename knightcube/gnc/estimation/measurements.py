@@ -2,7 +2,7 @@
 
 A measurement has a `latency` if it comes from an inertial unit whose samples are older than their time stamps
 and if the filter estimates the age of the samples. The latency is the assumed age (s) that was subtracted
-from the time stamp to give `time_ns`. A latency of None marks a known time.
+from the time stamp to give `time_ns`. The latency is None if the time of the sample is known.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from knightcube.astro.arrays import FloatArray
 
 
 class _AtOneTime:
-    """A measurement of the state at the single time `time_ns`."""
+    """A measurement that depends on the state at one time only, `time_ns`."""
 
     __slots__ = ()
     time_ns: int
@@ -28,7 +28,8 @@ class _AtOneTime:
 class AttitudeMeasurement(_AtOneTime):
     """A measured attitude (4,) from reference into body axes, with covariance (3, 3) rad^2 in body axes.
 
-    `by_stars` marks an attitude of the star camera, whose misalignment is not part of the covariance.
+    The flag `by_stars` is true for an attitude of the star camera, whose misalignment is not included in the
+    covariance.
     """
 
     time_ns: int
@@ -40,7 +41,7 @@ class AttitudeMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateMeasurement(_AtOneTime):
-    """A body rate (3,) rad/s measured by a gyro, with the gyro's bias, and its covariance (3, 3)."""
+    """A body rate (3,), rad/s, measured by a gyro and including the gyro bias, with covariance (3, 3)."""
 
     time_ns: int
     rate: FloatArray
@@ -68,10 +69,11 @@ class MeanRateMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionMeasurement(_AtOneTime):
-    """A direction observed from the body, such as of the Sun or nadir.
+    """A direction observed from the body, such as the direction of the Sun or nadir.
 
-    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. `covariance` (3, 3)
-    rad^2 is the covariance of `observed` in body axes; its component along the direction has no effect.
+    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. The matrix
+    `covariance` (3, 3), rad^2, is the covariance of `observed` in body axes; its component along the
+    direction has no effect.
     """
 
     time_ns: int

@@ -7,13 +7,14 @@ equation, because the plant model predicts it more accurately than the gyro meas
 later measurements need are appended to the state (stochastic cloning, Roumeliotis and Burdick 2002).
 
 The filter estimates the age that the inertial unit's samples have at their time stamps. A sample is older
-than its time stamp because of the serial line, a driver's buffer or the filters inside the unit. During its
-age, a sampled attitude changes by rate times age, and a sampled rate by acceleration times age. The
-innovations therefore depend on the age. Only attitude samples correct the estimated age. Rate samples do not
-correct the age, because the acceleration is mostly caused by the coils, which respond to the noise of earlier
-samples. An estimate of the age from rate samples would be an identification in closed loop and would drift
-with the noise while the attitude is held. A rate sample therefore treats the age as a considered parameter
-(Schmidt 1966): its variance and correlations enter the gains of all other states.
+than its time stamp because of the delays of the serial line, the driver's buffer and the filters inside the
+inertial unit. Between sample and time stamp, the attitude changes by rate times age, and the rate changes by
+acceleration times age. The innovations therefore depend on the age. Only attitude samples correct the
+estimated age. Rate samples do not correct the age, because the acceleration is mostly caused by the coils,
+which respond to the noise of earlier samples. An estimate of the age from rate samples would be a closed-loop
+identification and would drift with the noise while the attitude is held. A rate sample therefore treats the
+age as a considered parameter (Schmidt 1966): its variance and correlations enter the gains of all other
+states.
 """
 
 from __future__ import annotations
@@ -80,11 +81,12 @@ class RateChange(NamedTuple):
 def rate_change(
     before: Accelerated, after: Accelerated, disturbance: Vector, covariance: FloatArray
 ) -> RateChange:
-    """Return the change of the rate at a sample from the model accelerations before and after the sample.
+    """Return the angular acceleration at a sample from the modelled accelerations before and after it.
 
-    The two accelerations apply one standard deviation of the age before and after the sample. The
-    accelerations differ if a coil command begins or ends in between. Half the difference of the accelerations
-    and the product of the errors of age and acceleration are treated as noise.
+    The arguments `before` and `after` are the accelerations one standard deviation of the age before and
+    after the sample. The two accelerations differ if a coil command begins or ends between their times. Half
+    the difference of the accelerations and the product of the errors of age and acceleration are treated as
+    noise.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
@@ -103,7 +105,8 @@ def rate_change(
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:
     """Return innovation and Jacobian, corrected for age, of a quantity that changes by `change` per second.
 
-    `more` (s) is the estimated age minus the assumed age that was subtracted from the time stamp.
+    The argument `more`, s, is the estimated age minus the assumed age that was subtracted from the time
+    stamp.
     """
     x, y, z = change
     rows = rows.copy()
@@ -125,11 +128,12 @@ def innovation(
     """Return the innovation of `measurement`; for a suspended body, only its component about the thread.
 
     The innovation of a direction lies in the plane normal to the direction. The innovation of a magnetic
-    field is a whole vector, because the field strength also depends on the magnetometer's bias. `change` is
-    needed for rate samples whose age is estimated.
+    field has three components, because the field strength also depends on the magnetometer's bias. The
+    argument `change` is needed for rate samples whose age is estimated.
     """
     size, noise = SIZE + 3 * len(state.kept), measurement.covariance
-    # Measured directions and fields need no projection on y: a suspended body has no variance about x and z.
+    # Measured directions and fields need no projection onto the y axis, because the attitude of a suspended
+    # body has no variance about x and z.
     if isinstance(measurement, DirectionMeasurement):
         return _direction(state, measurement, size)
     if isinstance(measurement, FieldMeasurement):
@@ -170,7 +174,8 @@ def _mean_rate(state: FilterState, measurement: MeanRateMeasurement, size: int) 
     x, y, z = measurement.rate.tolist()
     square = px * px + py * py + pz * pz
     angle = math.sqrt(square)
-    # 1/p^2 - (1 + cos p) / (2 p sin p) tends to 1/12, and differs by less than 1e-6 below 0.03 rad.
+    # The factor 1/p^2 - (1 + cos p) / (2 p sin p) tends to 1/12, and differs from it by less than 1e-6 below
+    # 0.03 rad.
     second = 1.0 / 12.0 if angle < 0.03 else 1.0 / square - 0.5 / (angle * math.tan(0.5 * angle))
     by_error = np.array(skew((px, py, pz)))
     by_error = (_EYE + 0.5 * by_error + second * (by_error @ by_error)) / span

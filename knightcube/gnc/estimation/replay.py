@@ -64,7 +64,7 @@ class CommandHistory:
             del self._times[:oldest], self._torquings[:oldest]
 
     def mark_unknown(self, since_ns: int) -> None:
-        """Treat the coil currents from `since_ns` on as unknown."""
+        """Treat the coil currents since `since_ns` as unknown."""
         first = bisect.bisect_left(self._times, since_ns)
         if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
             self._torquings.insert(first, self.at(since_ns))
@@ -91,16 +91,16 @@ class CommandHistory:
 
 
 _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
-"""Normalised squared innovation above which a gyro sample corrects only the rate, by the number of axes.
-Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with the rate.
-Before a broken coil is detected, the correlations with the rate give wrong corrections. The angle error
-reached 40 sigma while the rate was right. In a consistent filter, one gyro sample in forty exceeds this limit
-of the squared innovation."""
+"""Limit of the normalised squared innovation, by the number of axes; above it, a gyro sample corrects only
+the rate. Normally a gyro sample also corrects angle, disturbance and coil gain, by their correlations with
+the rate. Before a broken coil is detected, the correlations with the rate cause wrong corrections of these
+states. Without this limit, the angle error reached 40 standard deviations although the rate was correct. In a
+consistent filter, one gyro sample in forty exceeds this limit of the squared innovation."""
 
 
 @dataclass(slots=True, eq=False)
 class Checkpoint:
-    """A measurement, whether it passed the gate, and the filter state just after it.
+    """A measurement, whether it passed the gate, and the state of the filter after its application.
 
     Attributes:
         innovation: components of the innovation, in the unit of the measurement; empty for the first
@@ -134,9 +134,10 @@ class _Step(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PropagationModel:
-    """Body, process noise, coil commands, and the gate by the degrees of freedom of a measurement.
+    """Body, process noise, coil commands, and gate thresholds by the degrees of freedom of a measurement.
 
-    The last steps are stored, because the next measurement repeats a step of the estimate before it.
+    The last steps are stored, because the propagation to the next measurement often repeats a step of the
+    previous estimate.
     """
 
     body: RigidBody
@@ -207,7 +208,7 @@ class Replay:
         self._model = model
         self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
         self._pending = deque(measurements)
-        # The list holds the exposures that have not begun yet, the next exposure last.
+        # The list contains the exposures that have not begun yet; the next exposure is the last element.
         self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
         self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
         self.checkpoints: list[Checkpoint] = []
@@ -298,7 +299,7 @@ class CheckpointHistory:
 
     @property
     def newest_used(self) -> Checkpoint:
-        """The newest checkpoint whose measurement passed the gate, or the newest checkpoint of all."""
+        """The newest checkpoint whose measurement passed the gate, or the newest one if none passed."""
         return next((c for c in reversed(self._checkpoints) if c.used), self._checkpoints[-1])
 
     def at(self, time_ns: int) -> Checkpoint | None:
@@ -345,11 +346,11 @@ class CheckpointHistory:
         return next(k for k in range(len(self) - 1, -1, -1) if self._checkpoints[k] is checkpoint)
 
     def restart(self, first: Checkpoint | None) -> None:
-        """Drop all checkpoints, and start with `first` unless it is None."""
+        """Drop all checkpoints, and begin a new history with `first` unless it is None."""
         self._checkpoints = [] if first is None else [first]
 
     def forget(self, now_ns: int) -> None:
-        """Drop checkpoints that are too old, in batches; keep the newest one."""
+        """Drop checkpoints that are too old, in batches, but always keep the newest checkpoint."""
         checkpoints = self._checkpoints
         horizon_ns = now_ns - self._history_ns
         if len(checkpoints) > 2 and checkpoints[0].time_ns < horizon_ns - _SPARE_NS:

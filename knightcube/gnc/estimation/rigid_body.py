@@ -5,13 +5,13 @@ is the dipole moment of the coils. A body on the testbed's thread rotates only a
 then causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta - c w (Sease, eq.
 (5.4)).
 
-`propagate` integrates state and covariance. The attitude error is a small rotation about the body axes.
-Accelerations that the model does not contain are random walks.
+The function `propagate` integrates state and covariance. The attitude error is a small rotation about the
+body axes. Accelerations that the model does not contain are random walks.
 
 Without torque the angular acceleration is a quadratic form of the rate, w' = Q p(w), where p are the six
 products of the rate's components. Errors of the inertia tensor, and of the gyro's scale and alignment, only
-change the coefficients Q. A fit with the changes of Q as nuisance parameters is therefore insensitive to
-errors of inertia and gyro (Psiaki 2005, JGCD 28(4), and Pittelkau 2001, JGCD 24(6)).
+change the coefficients Q. A fit that estimates the errors of Q as nuisance parameters is therefore
+insensitive to errors of inertia and gyro (Psiaki 2005, JGCD 28(4), and Pittelkau 2001, JGCD 24(6)).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Torquing:
 class Accelerated(NamedTuple):
     """Angular acceleration w' (rad/s^2) and its derivatives (3, 3).
 
-    The derivatives are by torsion, damping and coil gain.
+    The derivatives are with respect to torsion, damping and coil gain.
     """
 
     acceleration: Vector
@@ -139,7 +139,7 @@ class RigidBody:
     def torquing(
         self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
     ) -> Torquing:
-        """Return the effect of coil currents (3,) A in a field (3,) T, reference axes.
+        """Return dipole and field for coil currents (3,), A, in a field (3,), T, reference axes.
 
         The default field is the constant field of the body description.
         """
@@ -160,8 +160,8 @@ class RigidBody:
     ) -> Linearised:
         """Return the angular acceleration under `torquing` at attitude q, with its derivatives.
 
-        The gyroscopic torque is computed for the rate `ahead` seconds later. The error of the midpoint rule
-        for a tumbling body is then of third order per step.
+        The gyroscopic torque is computed for the predicted rate `ahead` seconds later. With this prediction,
+        the error of the midpoint rule for a tumbling body is of third order per step.
         """
         x, y, z = times(self._response, self._gyroscopic(rate))
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
@@ -215,17 +215,17 @@ class RigidBody:
 LONGEST_STEP = 0.025
 """Default of the longest propagation step (s), equal to the control period of the testbed."""
 _UNKNOWN_FOR = 0.3
-"""Correlation time (s) of an unknown coil current, for the white noise that models it. The time exceeds the
-delay after which the guardian switches off the coils of a hung control loop."""
+"""Correlation time (s) of an unknown coil current, for the white noise that models it. The correlation time
+exceeds the delay after which the guardian switches off the coils of a hung control loop."""
 
 
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise, and the largest current of a coil.
 
     `current` is the spectral density of the current noise of one driven coil, A^2 s. `rate` (3, 3),
-    rad^2/s^3, is the spectral density of the unmodelled angular acceleration. `walks` (19,) are the variances
-    per second that the components of the error state gain by random walks. `unknown_current` (A) is the
-    current assumed for each coil while its current is unknown.
+    rad^2/s^3, is the spectral density of the unmodelled angular acceleration. The array `walks` (19,)
+    contains the variances that the components of the error state gain per second by random walks.
+    `unknown_current` (A) is the current assumed for each coil while its current is unknown.
     """
 
     current: float
@@ -290,12 +290,12 @@ _FLOW[RATE, DISTURBANCE] = np.eye(3)
 
 
 _FIRST, _SECOND = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
-"""Axes of the two rates in each of the six products xx, yy, zz, yz, zx and xy."""
+"""Axes of the first and of the second factor of the six rate products xx, yy, zz, yz, zx and xy."""
 _DRAWS = 2000
-"""Number of random bodies from which the covariance of Q is computed. The six largest modes of Q agree within
-5 % between 1000 and 4000 random bodies."""
+"""Number of random inertia tensors from which the covariance of the coefficients Q is computed. The six
+largest principal components of Q for 1000 and for 4000 random tensors agree within 5 %."""
 _NEGLIGIBLE = 1e-6
-"""Variance of a mode of Q, relative to the largest variance, below which the mode is omitted."""
+"""Variance of a principal component of Q, relative to the largest variance, below which it is omitted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,7 +392,7 @@ def _random_tensors(inertia: FloatArray, errors: BodyErrors, generator: np.rando
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return T (..., 3, 3, 3) of inertia tensors, with the torque-free acceleration w'_i = T_ijk w_j w_k."""
+    """Return the arrays T (..., 3, 3, 3) of inertia tensors for which w'_i = T_ijk w_j w_k without torque."""
     crosses = cross_matrices(np.eye(3))
     return np.asarray(-np.einsum("...il,jlm,...mk->...ijk", np.linalg.inv(inertia), crosses, inertia))
 
@@ -405,12 +405,12 @@ def _folded(quadratic: FloatArray) -> FloatArray:
 
 
 def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
-    """Return the Jacobian (15, 15) of inertia and coils, each divided by the trace of the inertia.
+    """Return the Jacobian (15, 15) of inertia and coil matrix, both divided by the trace of the inertia.
 
     The array `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
-    assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. The motion of a
-    satellite shows only the ratios of inertia and dipole, because a body with twice the inertia and twice the
-    dipole moves in the same way.
+    assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. Only the ratios of
+    inertia and dipole are observable from the motion of a satellite, because a body with twice the inertia
+    and twice the dipole moves in the same way.
     """
     trace = inertia[:3].sum()
     rows: FloatArray = np.eye(15) / trace
@@ -420,7 +420,7 @@ def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
 
 
 def by_matrix(vector: FloatArray) -> FloatArray:
-    """Return the derivative (3, 9) of M v, for a vector v (3,), with respect to the rows of M (3, 3)."""
+    """Return the derivative (3, 9) of M v, for a vector v (3,), with respect to the elements of M (3, 3)."""
     rows = np.zeros((3, 3, 3))
     rows[_INDICES, _INDICES] = vector
     return rows.reshape(3, 9)
