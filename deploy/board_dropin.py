@@ -4,7 +4,8 @@ The script install.sh runs board_dropin.py CONFIG FOLDER with the installed Pyth
 knightcube.service is written to the file `flight` of the folder, that of knightcube-safe.service to `safe`,
 and that of knightcube-link.service to `link`. The file `link` is empty if the configuration has no link. The
 file `tracker` is made if the star tracker needs the default sky index. Without FOLDER, the script prints the
-drop-in of knightcube.service. For an invalid configuration, it prints one line and exits with status 2.
+drop-in of knightcube.service. For an invalid configuration, the script prints one line and exits with status
+2.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 
 
 def dropin(config: Config) -> str:
-    """Return the drop-in of knightcube.service, which runs the flight."""
+    """Return the drop-in of knightcube.service, which runs the flight software."""
     lines = []
     if config.simulation is None:
         awaited = [device_unit(path) for path, _ in _nodes(config)]
@@ -92,8 +93,8 @@ def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list
 
     systemd resolves a file to one device number when the service starts. A USB device may reconnect under a
     different number, such as ttyUSB1 instead of ttyUSB0, so the class of its driver is permitted. For a
-    device that does not exist yet, the driver classes `plugged` are allowed. The folder `root` contains proc
-    and sys.
+    device that does not exist yet, the driver classes `plugged` are allowed. The folder `root` contains the
+    file systems proc and sys.
     """
     try:
         mode, number = (found := os.stat(path)).st_mode, found.st_rdev
@@ -142,7 +143,7 @@ def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def _devices(config: Config) -> list[str]:
-    """Return the settings that allow access to the real devices, empty for a simulation."""
+    """Return the settings that allow access to the real devices; the list is empty for a simulation."""
     if config.simulation is not None:
         return []
     lines, (coils, _) = _bus(config), _nodes(config)[0]
@@ -160,7 +161,8 @@ def _bus(config: Config) -> list[str]:
     """Return the settings that allow access to the I2C bus of the coils."""
     i2c, writes = device_file(config.coils.bus), tuple(driver_of("coils", config.coils).off(config.coils))
     words = " ".join(CoilReach("", i2c, writes).words)
-    pwm = f"KNIGHTCUBE_PWM={words.removesuffix(' 0xfd 0x10')}"  # `coils-off` completes a PCA9685's address
+    # The script `coils-off` itself appends the last two words for a PCA9685.
+    pwm = f"KNIGHTCUBE_PWM={words.removesuffix(' 0xfd 0x10')}"
     return [
         f"Environment=KNIGHTCUBE_I2C={i2c} {pwm if ' ' not in pwm else chr(34) + pwm + chr(34)}",
         *allowed(i2c, I2C),

@@ -1,4 +1,4 @@
-"""Builds a software release beside the release that flies, tests it, and switches to it by one rename.
+"""Builds a software release beside the release in use, tests it, and switches to it by one rename.
 
 The script install.sh calls `build_release.py PREFIX build|switch|rollback`. The manifest of a release is
 written last, so a release with a manifest is complete, and only complete releases are linked. Each build
@@ -59,7 +59,7 @@ class Build:
         if not self._options.dry_run:
             (release / SOURCE).write_text(wanted, encoding="ascii")
             shutil.copyfile(self._source / _BOARD_LOCK, release / LOCK)
-            os.sync()  # the files listed in the manifest reach the disk first
+            os.sync()  # the manifest is written after the files that it lists are on disk
             _write(release / MANIFEST, manifest_text(release))
         sys.stdout.write(f"{release.name}\n")
         return 0
@@ -100,7 +100,8 @@ class Build:
         if problem := _damaged_package(old):
             sys.stderr.write(f"install: failed: add the folder wheels, because {problem}\n")
             raise SystemExit(1)
-        # Bytecode is not copied: it has the times of the old files, and would be written again.
+        # Bytecode is not copied: it records the times of the old source files, so Python would compile it
+        # again.
         caches = shutil.ignore_patterns("__pycache__")
         ours = shutil.ignore_patterns(*_OURS, "__pycache__")
         for packages in old.glob("venv/lib/python3*/site-packages"):
@@ -114,7 +115,7 @@ class Build:
                     shutil.copyfile(path, place / path.name)
 
     def _test(self, python: Path) -> None:
-        """Test a release: import its modules, print its version, run its link, and fly ten seconds."""
+        """Test a release: import its modules, print its version, test its link, and fly for ten seconds."""
         self._run([python, "-c", "import flight.app.flight, flight.loop.worker"])
         self._run([python, "-c", "from flight.app.cli.link import self_test; self_test()"])
         self._run([python, "-m", "flight", "--version"])
@@ -186,7 +187,7 @@ def _damaged_package(release: Path) -> str:
 
 
 def switch(prefix: Path, name: str) -> None:
-    """Link a release as current and the present release as previous, and remove all other releases."""
+    """Make a release the current one and the former current one the previous one, and remove all others."""
     release, current = prefix / "releases" / name, linked(prefix, "current")
     if current == release:
         return
@@ -202,7 +203,7 @@ def switch(prefix: Path, name: str) -> None:
 
 
 def rollback(prefix: Path) -> str:
-    """Exchange the current and the previous release, and return the name of the new current release."""
+    """Swap the current and the previous release, and return the name of the new current release."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     if previous is None or previous == current:
         raise SystemExit("install: --rollback: there is no previous release")

@@ -1,18 +1,19 @@
 """Checks a signed bundle of a renewal, and prepares its content for installation.
 
 The program renewal.py runs `open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER PRESENT KEPT UTC` as root with
-the Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact, whose kind
-is its TUF target path. Python-tuf checks the metadata against the metadata in the folder TRUSTED, whose
-versions never decrease, and against the first root metadata in the file ROOT. Python-tuf reads the unpacked
-bundle instead of downloading files.
+the Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact. The TUF
+target path of the artefact states its kind. Python-tuf checks the metadata against the metadata in the folder
+TRUSTED, whose versions never decrease, and against the first root metadata in the file ROOT. Python-tuf reads
+the unpacked bundle instead of downloading files.
 
 The program writes the artefact to FOLDER/artefact. For a configuration, the program also writes FOLDER/set
-with the configuration and the drop-ins of its units. For orbital elements or a star catalogue, this
-configuration is a copy of the configuration PRESENT with one value replaced. KEPT is the folder that will
-contain the catalogue. UTC is the mission time (s since 1970) at which expiry dates are judged. With an empty
-UTC the mission time is unknown, and no expiry date is judged, because the system clock of a board may be
-wrong. The program prints the version, the permission to replace a newer version, and the
-SHA-256 as one JSON object. For a refused bundle, the program prints one line and exits with status 1.
+with the configuration and the drop-ins of its units. For orbital elements or a star catalogue, the
+configuration in FOLDER/set is a copy of the configuration PRESENT with one value replaced. KEPT is the folder
+in which the star catalogue is installed later. UTC is the mission time (s since 1970) with which expiry dates
+are compared. With an empty UTC the mission time is unknown, and expiry dates are not checked, because the
+system clock of a board may be wrong. The program prints the version, the permission to replace a newer
+version, and the SHA-256 as one JSON object. For a refused bundle, the program prints one line and exits with
+status 1.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ LARGEST_METADATA, LARGEST_TARGET, MOST_MEMBERS = 1 << 19, 1 << 28, 300
 """Maximum sizes (bytes) of a metadata file and of an artefact, and maximum number of files in a bundle."""
 _METADATA = re.compile(r"metadata/(\d{1,6}\.root|timestamp|snapshot|targets)\.json")
 _VALUES = {"elements": ("elements",), "catalogue": ("camera", "star_tracker", "index")}
-"""Key path of the configuration value that an artefact replaces, for each such kind."""
+"""Key path of the configuration value that an artefact replaces, by the kind of the artefact."""
 
 
 class Refused(Exception):
@@ -66,7 +67,7 @@ class FolderFetcher(FetcherInterface):  # type: ignore[misc]  # the package may 
 
 
 def unpack(bundle: Path, kind: str, folder: Path) -> None:
-    """Unpack the metadata and the artefact of a bundle into a folder. Raises Refused for other content."""
+    """Unpack the metadata and the artefact of a bundle into a folder. Raises Refused for unexpected files."""
     (folder / "metadata").mkdir(parents=True)
     (folder / "targets").mkdir()
     try:

@@ -2,8 +2,9 @@
 
 The releases are folders in /opt/knightcube/releases, and the links `current` and `previous` select two of
 them. The current release flies unless it is damaged, or was started `UNCLEAN` times without being proven. In
-these two cases an intact previous release flies, and reports the reason. A release is proven when it has
-flown for a minute. The script `fly` runs this program, and chooses a release itself if this program fails.
+these two cases an intact previous release flies instead, and reports the reason. A release is proven after it
+has flown for a minute. The script `fly` runs this program, and chooses a release itself if this program
+fails.
 
 The command `releases.py verify` checks every file of both releases. Any Python interpreter can run this
 program, which needs only the standard library.
@@ -113,13 +114,13 @@ def linked(prefix: Path, link: str) -> Path | None:
 
 
 class Trials:
-    """Number of starts of each unproven release, stored in a file that the flight also writes."""
+    """Number of starts of each unproven release, stored in a file that the flight software also writes."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / TRIALS
         self.starts: dict[str, int] = {}
         self.proven: list[str] = []
-        # A damaged file is ignored, so that the flight can start.
+        # A damaged file is ignored, so that the flight software can start.
         with suppress(OSError, *DAMAGED):
             kept = json.loads(_line_of(_text(self._path, LARGEST_RECORD)))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
@@ -146,7 +147,7 @@ class Trials:
 
 
 def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
-    """Return the release to fly, and the reason for a change from the current release or its damage."""
+    """Return the release to fly, and a text if the current release is damaged, missing or not chosen."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     found = [release for release in (current, previous) if release is not None]
     if not found:
@@ -178,7 +179,7 @@ def answer(prefix: Path, environment: Mapping[str, str]) -> int:
 
 
 def main(words: list[str]) -> int:
-    """Choose a release or verify both releases, and return the exit status, which is 2 for wrong use."""
+    """Choose a release or verify both releases, and return the exit status, which is 2 for bad arguments."""
     prefix = Path(__file__).resolve().parent.parent
     if words == ["choose"]:
         return answer(prefix, os.environ)

@@ -2,9 +2,10 @@
 """Renews configuration and release of a board, and supervises each renewal until the ground confirms it.
 
 The timer knightcube-renewal.timer runs `renewal.py` as root every ten seconds. Each run reads the state,
-executes at most one request of the link, judges the open trial, advances the command-loss timer, stores the
-state and ends. The state is stored before a step is executed, and each step may be executed again, so that a
-kill at any moment leaves the old or the new version, and the next run continues (docs/fly/renewal.md).
+executes at most one request of the link, checks the trial in progress, advances the command-loss timer,
+stores the state and ends. The state is stored before a step is executed, and each step may be executed again,
+so that a kill at any moment leaves the old or the new version, and the next run continues
+(docs/fly/renewal.md).
 
 The link is not trusted. Its requests must be regular files of limited size, and no symbolic link is followed.
 The program `open_bundle.py` checks signatures and content of an artefact before anything is installed. Time
@@ -80,10 +81,11 @@ class Trial:
         old: name of the previous kept configuration or release.
         new: name of the new configuration or release; empty until a release is built.
         stage: stage of the trial: `install`, `fly` or `revert`.
-        left_s: time (s) with power within which the ground must confirm.
+        left_s: remaining time (s) with power in which the ground must confirm the renewal.
         despite_faults: whether the trial continues after the flight has reported a fault.
         before: release to which the link `previous` pointed before the trial.
-        session: identifier of the link process at the installation; faults that it noted are ignored.
+        session: identifier of the link process at the installation; faults recorded by this process are
+            ignored.
         down_s: time (s) since the flight and the link process were last both active.
         tries: number of attempts to install.
         problem: reason for the return to the previous version.
@@ -161,7 +163,7 @@ def decoded(data: bytes) -> Any:
 
 
 def state_of(values: dict[str, Any]) -> State:
-    """Return the state from the values of a record. Raises one of `_DAMAGED` for other values."""
+    """Return the state from the values of a record. Raises one of `_DAMAGED` for invalid values."""
     state = State(**{**values, "trial": None})
     if values["trial"] is not None:
         state.trial = Trial(**values["trial"])
@@ -201,7 +203,7 @@ def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the file names in a folder to disk. Raises OSError."""
+    """Sync the directory entries of a folder to disk. Raises OSError."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -234,7 +236,7 @@ class Board:
         return self._settings / CONFIGURATION
 
     def roots(self) -> list[Path]:
-        """Return the copies of the first root metadata that exist."""
+        """Return the paths of the existing copies of the first root metadata."""
         copies = (self._settings / "root.json", self.prefix / "share/root.json")
         return [path for path in copies if path.is_file()]
 
@@ -336,8 +338,8 @@ class Board:
     def restart_parts(self) -> None:
         """Restart the requested parts (flight, link, board); a damaged request restarts flight and link.
 
-        The request is deleted last, so that a kill does not lose it. Only a restart of the board is deleted
-        first, because it would otherwise be repeated after each boot. Raises OSError.
+        The request is deleted last, so that a kill does not lose it. Only a request to restart the board is
+        deleted first, because it would otherwise be repeated after each boot. Raises OSError.
         """
         path = self.own / RESTART
         if not path.exists():
@@ -415,7 +417,7 @@ class Renewal:
         shown = {"reports": state.reports, "trial": text, "note": state.note}
         try:
             replace_file(self._board.own / "status", encoded(shown))
-        except OSError as error:  # the step continues, and the next one writes the reports again
+        except OSError as error:  # the present step continues, and the next step writes the reports again
             sys.stderr.write(f"renewal: cannot write the status: {error}\n")
 
     def _report(self, request: str, result: str, name: str, text: str) -> None:
@@ -442,8 +444,9 @@ class Renewal:
         return {}
 
     def step(self) -> None:
-        """Continue an interrupted step, execute one request and judge the trial. Raises OSError."""
-        # A trial whose installation ends in this step is not judged, because the units still have to restart.
+        """Continue an interrupted step, execute one request and check the trial. Raises OSError."""
+        # A trial whose installation ends in this step is not checked, because the units still have to
+        # restart.
         trial = self._state.trial
         judged = trial if trial is not None and trial.stage == "fly" else None
         if trial is not None:
@@ -511,7 +514,7 @@ class Renewal:
         self._board.restart(part)
 
     def _activate(self, name: str, kind: str, request: dict[str, Any]) -> None:
-        """Check a bundle and begin its trial. Raises Refused and OSError."""
+        """Check a bundle and begin its trial. Raises Refused for an invalid bundle, and OSError."""
         state, board = self._state, self._board
         if state.trial is not None:
             raise Refused(
@@ -551,7 +554,10 @@ class Renewal:
         self._continue()
 
     def _copy_bundle(self, kind: str, name: str, expected: str, path: Path) -> None:
-        """Copy the selected bundle from the link's files. Raises Refused if its SHA-256 is not `expected`."""
+        """Copy the selected bundle from the link's files.
+
+        Raises Refused if the SHA-256 of the bundle is not `expected`.
+        """
         if not _NAME.fullmatch(name):
             raise Refused(f"{name[:64]!r} is not the name of a bundle")
         digest = hashlib.sha256()
@@ -567,7 +573,7 @@ class Renewal:
     def _opened(self, kind: str, staging: Path, utc: str) -> dict[str, Any]:
         """Return the result of `open_bundle.py` for the bundle at the mission time `utc` (s), if it is known.
 
-        Raises Refused if no attempt succeeds.
+        Raises Refused if `open_bundle.py` refuses the bundle in every attempt.
         """
         board, problems = self._board, list[str]()
         program = Path(__file__).resolve().with_name("open_bundle.py")
@@ -637,7 +643,7 @@ class Renewal:
                 sys.stderr.write(f"renewal: cannot revert yet: {error}\n")
 
     def _install(self, trial: Trial) -> None:
-        """Install the new version and request a restart. Raises Refused and OSError."""
+        """Install the new version and request a restart. Raises Refused or OSError if this fails."""
         board = self._board
         if trial.what == "configuration":
             board.install(trial.new)
@@ -660,7 +666,10 @@ class Renewal:
         self._save()
 
     def _built(self) -> str:
-        """Build the release of the bundle, and return its name. Raises Refused and OSError."""
+        """Build the release of the bundle, and return its name.
+
+        Raises Refused if the build fails, and OSError.
+        """
         board, staging = self._board, self._board.own / "staging"
         source = staging / "source"
         shutil.rmtree(source, ignore_errors=True)
@@ -689,7 +698,7 @@ class Renewal:
     def _revert(self, trial: Trial) -> None:
         """Install the version before the trial, request a restart and end the trial.
 
-        Raises Refused and OSError.
+        Raises Refused or OSError if the installation fails.
         """
         state, board = self._state, self._board
         if trial.what == "configuration":
@@ -708,7 +717,7 @@ class Renewal:
         self._note(text)
         state.trial = None
         self._report(trial.request, "failed", "activate", text)
-        if trial.what == "configuration" or trial.new:  # a release that was not built has changed nothing
+        if trial.what == "configuration" or trial.new:  # no restart is necessary if the release was not built
             board.restart()  # if killed before the state is stored, this step is repeated
         self._save()
 
@@ -802,7 +811,8 @@ class Renewal:
             text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
             if self._go_back(step, "", "command-loss", text):
                 return
-            # If this earlier version does not exist, the next step follows at once.
+            # If the version of this step does not exist, the next step of the command-loss timer follows at
+            # once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _note(self, text: str) -> None:
@@ -837,7 +847,7 @@ class Renewal:
 
 
 def extract(archive: Path, folder: Path) -> None:
-    """Unpack the regular files and folders of a release. Raises Refused and OSError."""
+    """Unpack the regular files and folders of a release. Raises Refused for other members, and OSError."""
     folder.mkdir()
     try:
         with tarfile.open(archive, "r:*") as files:

@@ -4,9 +4,9 @@
 The service knightcube-safe.service runs this program, which needs only Python's standard library and the
 script `coils-off` in the same folder. The program ends with status 0 when the flight is to be started again.
 The first start follows after 30 s, and the waiting time doubles with each further failure, up to an hour. The
-command `mode` ends the waiting time at once, and the command `safe` extends the waiting time to an hour from
-then. The command `ping` is answered. Other commands are refused, and datagrams that are not commands get no
-answer.
+command `mode` ends the waiting time at once, and the command `safe` sets the waiting time to one hour from
+the command. The command `ping` is answered. Other commands are refused, and datagrams that are not commands
+get no answer.
 
 The environment variable KNIGHTCUBE_COMMANDS holds the path of the command socket; without it, no commands are
 received. The folder RUNTIME_DIRECTORY keeps the number of tries until the next boot of the board.
@@ -30,7 +30,7 @@ FLEW_S = 600.0
 """Flight time (s) after which a later failure starts again with the shortest waiting time."""
 
 COILS_S, RETRY_S = 30.0, 1.0
-"""Intervals (s) of setting the coils to zero, with and without an acknowledgement by the PWM chip."""
+"""Intervals (s) of setting the coils to zero: after an acknowledgement by the PWM chip, and without one."""
 
 # Tests compare these packet layouts with those of flight/link, which this program does not import.
 COMMANDS = {

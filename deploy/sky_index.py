@@ -1,7 +1,7 @@
 """Builds the star tracker's sky index at installation, so that flights start some seconds earlier.
 
 The script install.sh runs `sky_index.py [--wanted] CONFIG` with the installed Python. With the option
---wanted the program builds no index, but prints a word if an index must be built.
+--wanted the program builds no index, but prints the word `wanted` if an index must be built.
 """
 
 from __future__ import annotations

@@ -8,14 +8,14 @@ if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
 _WEIGHTS = {"reference/": 1e-3, "decisions/": 0.1, "sources/": 0.1, "architecture": 0.1, "results/": 0.25}
-"""Weights in the search by the beginning of a page's path, relative to a guide with the same words.
+"""Search weights of pages by the beginning of their path; a guide with the same words has the weight 1.
 
 A word in a title weighs 1,000 times as much as a word in the text.
 """
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
-    """Set the weight of a page in the search, unless the page sets it; return its text unchanged."""
+    """Set the search weight of a page unless the page itself sets it, and return its text unchanged."""
     for start, weight in _WEIGHTS.items():
         if page.file.src_uri.startswith(start):
             page.meta.setdefault("search", {"boost": weight})

@@ -1,4 +1,4 @@
-"""Send the new command `note` to a flight; needs the tree with `command.diff` applied."""
+"""Send the new command `note` to a flight, in a source tree to which `command.diff` has been applied."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CONFIG = Path("config/step_demo.yaml")
 
 
 def main() -> None:
-    """Fly the demonstration without a camera, listening on a socket; send a remark; look into the log."""
+    """Run the demonstration flight with a command socket, send a remark to it, and read the flight log."""
     with tempfile.TemporaryDirectory() as name:
         folder, socket = Path(name), Path(name) / "commands"
         text = CONFIG.read_text(encoding="utf-8")

@@ -16,13 +16,13 @@ row, column = np.indices((512, 512))
 rays = camera.unit_vectors(np.stack([column.ravel(), row.ravel()], axis=-1).astype(float))
 noise = np.random.default_rng(1).normal(0.0, 1.0, (512, 512))
 
-# The limb, at the height AIR of sunlit air, is 22 deg below the local horizontal; the camera looks 28 deg
-# below the local horizontal, and is rolled by 10 deg.
+# The limb, which is the top of the sunlit air (height AIR), is 22 deg below the local horizontal. The
+# boresight is 28 deg below the local horizontal, and the camera is rolled by 10 deg.
 tilt, roll = np.radians([62.0, 10.0])
 nadir = np.array([np.sin(tilt) * np.sin(roll), np.sin(tilt) * np.cos(roll), np.cos(tilt)])
 limb = np.arcsin((EARTH_RADIUS + AIR) / (EARTH_RADIUS + ALTITUDE))
 above = (np.arccos(rays @ nadir) - limb) * camera.focal_length  # px above the limb
-# The optical depth of the air is 1 at the limb, and grows by the factor e over 8 km, which are 1.2 px.
+# The optical depth of the air is 1 at the limb, and grows downwards by the factor e per 8 km (1.2 px).
 earth = 150.0 * (1.0 - np.exp(-np.exp(-above / 1.2))).reshape(512, 512)
 
 horizon = find_nadir(earth + 5.0 + noise, camera, HorizonKnowledge(altitude=ALTITUDE))

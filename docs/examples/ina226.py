@@ -1,6 +1,7 @@
 """A device driver outside this repository: the current monitor INA226 of the coils' supply (TI SBOS547B).
 
-A configuration names it by `power_monitor: {driver: "ina226:INA226"}`, see docs/extending/device.md.
+A configuration selects the driver by `power_monitor: {driver: "ina226:INA226"}`, see
+docs/extending/device.md.
 """
 
 # --8<-- [start:section]
@@ -13,12 +14,12 @@ from hal.interfaces.devices import PowerReading
 from hal.interfaces.errors import DeviceError, OutOfRange, Refused, answering
 from hal.interfaces.wires import Clock, I2cBus, Rig
 
-if TYPE_CHECKING:  # a board does not load the simulator
+if TYPE_CHECKING:  # the simulator is not imported on a board
     from sim_hal.emulation import Emulation
 
 
 class Ina226Section(PowerMonitorSection, frozen=True, kw_only=True):
-    """The keys of the device: those of every monitor (`address`, `bus`, `shunt`), and one of its own."""
+    """Configuration keys of the device: `address`, `bus` and `shunt` as for every monitor, and `averages`."""
 
     averages: int = 16
 
@@ -33,7 +34,7 @@ AVERAGES = (1, 4, 16, 64, 128, 256, 512, 1024)
 
 
 class Ina226:
-    """The driver. The driver knows registers, and reads them in its own job, never in the control loop."""
+    """Driver of the INA226, which reads its registers in a job of its own, never in the control loop."""
 
     def __init__(self, bus: I2cBus, clock: Clock, section: Ina226Section) -> None:
         self.name = f"ina226 at 0x{section.address:02x}"
@@ -43,14 +44,14 @@ class Ina226:
         self._ticker = clock.ticker("power", PERIOD_NS, self._serve)
 
     def identify(self) -> str:
-        """Return the die's identifier as text. Raises NotResponding without an answer, and Refused."""
+        """Return the die's identifier as text. Raises NotResponding, or Refused for a different chip."""
         word = self._word(DIE_ID)
         if word >> 4 != 0x226:
             raise Refused(self.name, f"its identifier is 0x{word:04x}: is another chip at this address?")
         return f"answers: die 0x{word:04x}"
 
     def latest(self) -> PowerReading | None:
-        """Return the newest reading, None before the first reading."""
+        """Return the newest reading, or None before the first reading."""
         return self._reading
 
     def error(self) -> str:
@@ -88,12 +89,12 @@ class Ina226:
 
 
 def open_monitor(rig: Rig, section: Ina226Section) -> Ina226:
-    """Return the driver on the wires of a rig: the board's, or emulated ones."""
+    """Return the driver on the bus of a rig, which is the bus of a board or an emulated bus."""
     return Ina226(rig.wires.i2c(section.bus), rig.clock, section)
 
 
 def probe(rig: Rig, section: Ina226Section) -> str:
-    """Ask the device for a sign of life, for `knightcube check`. Raises DeviceError."""
+    """Check for `knightcube check` that the device responds. Raises DeviceError if not."""
     monitor = open_monitor(rig, section)
     try:
         return monitor.identify()
@@ -114,7 +115,7 @@ def check(section: Ina226Section) -> None:
 
 # --8<-- [start:emulator]
 class EmulatedIna226:
-    """Emulator of the chip, which stores registers and answers with bytes."""
+    """Emulator of the INA226, which answers reads of its registers with bytes."""
 
     def __init__(self, emulation: Emulation, section: Ina226Section) -> None:
         self._emulation, self._section = emulation, section
@@ -125,11 +126,11 @@ class EmulatedIna226:
         return address == self._section.address
 
     def write(self, address: int, data: bytes) -> None:
-        """Set the register pointer. This model ignores the configuration."""
+        """Set the register pointer. This model ignores values written to the configuration register."""
         self._pointer = data[0]
 
     def read(self, count: int) -> bytes:
-        """Return the register at the pointer."""
+        """Return the content of the register that the pointer selects."""
         now_ns = self._emulation.now_ns()
         volts, current = self._emulation.supply(now_ns - 35_000_000, now_ns)
         word = {

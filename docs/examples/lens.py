@@ -1,4 +1,4 @@
-"""Calibrate a lens from images of the night sky, solve another image with it, and learn it image by image.
+"""Calibrate a lens from images of the night sky, solve another image with it, and estimate it image by image.
 
 The script draws the images as a camera with 2 % of barrel distortion at its corners takes them.
 """

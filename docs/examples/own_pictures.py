@@ -14,7 +14,7 @@ tracker = StarTracker(options.fov)
 for path in options.pictures:
     try:
         solution = tracker.solve(read_image(path))
-    except (UsageError, ValueError) as error:  # not a picture, damaged, or too small
+    except (UsageError, ValueError) as error:  # the file is not a picture, or it is damaged or too small
         print(error)
         continue
     if not solution:

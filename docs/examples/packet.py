@@ -1,4 +1,7 @@
-"""Record the new packet `thermal` and read it back; needs the tree with `packet.diff` applied."""
+"""Record the new packet `thermal` and read it back.
+
+Needs a source tree to which `packet.diff` has been applied.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,11 @@ from sim_hal.clock import SimClock
 
 
 def main() -> None:
-    """Write one packet into a flight log; read it, export it, print its documentation."""
+    """Write one packet into a flight log, read it, export it, and print its documentation."""
     with tempfile.TemporaryDirectory() as name:
         folder, clock = Path(name), SimClock()
         log = FlightLog(folder, clock=clock, sync_period_ns=None)
-        # A task calls this line where the values arise.
+        # In the flight software, the task that measures the values executes this line.
         Recorder(log, log).record(THERMAL, clock.now_ns(), celsius=[21.5, 19.0, 20.25, 20.5, 22.0, 18.75])
         log.close()
         run = read_run(folder)

@@ -1,8 +1,9 @@
-"""A body of our own: points in three axes by quaternion feedback, without a planner.
+"""A user-defined body, which points in three axes by quaternion feedback, without a planner.
 
 The configuration names this body as `body: pointing_body:POINTING`. The law is the cross product law of
-magnetic control: from the wanted torque T, the dipole is m = (B x T) / |B|^2, so that m x B is the part of T
-across the field B. Estimation and brake are those of the testbed, whose plant this body has.
+magnetic control: for the wanted torque T, the dipole is m = (B x T) / |B|^2, so that m x B is the part of T
+perpendicular to the field B. The body has the plant of the testbed, and uses the testbed's estimation and
+detumbling.
 
 Run with `python docs/examples/pointing_body.py`: it flies the demonstration's first step.
 """
@@ -53,7 +54,7 @@ from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 DUE_NS = 60_000_000_000
-"""After this time a target should have been reached."""
+"""Time (ns) after which a target should have been reached."""
 
 
 # --8<-- [start:law]
@@ -65,7 +66,7 @@ class FixedAttitude:
 
     @property
     def text(self) -> str:
-        """The law in words, for events."""
+        """Text of the target law for events."""
         return "attitude " + " ".join(f"{part:+.3f}" for part in self.wanted)
 
     def quaternion(self, now_ns: int) -> FloatArray:
@@ -75,7 +76,7 @@ class FixedAttitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtRest:
-    """A `Reference`: an attitude (4,) at rest."""
+    """A `Reference` with a constant attitude (4,) and zero body rate."""
 
     quaternion: FloatArray
 
@@ -95,7 +96,7 @@ def error_of(estimate: Estimate, wanted: FloatArray) -> FloatArray:
 
 # --8<-- [start:tracker]
 class CrossProductTracker:
-    """Implements `Tracker`: quaternion feedback, limited so that the dipole keeps its direction."""
+    """Implements `Tracker`: quaternion feedback with a current limit that keeps the dipole's direction."""
 
     def __init__(self, config: TestbedConfig, reference_field: FloatArray) -> None:
         plant, bandwidth = plant_of(config), config.control.bandwidth
@@ -106,11 +107,11 @@ class CrossProductTracker:
         self._field = reference_field
 
     def field(self, estimate: Estimate) -> FloatArray:
-        """Return the field (3,) T in body axes."""
+        """Return the magnetic field (3,), T, in body axes."""
         return attitude_matrix(estimate.quaternion) @ self._field
 
     def command(self, estimate: Estimate, reference: AtRest) -> CoilCommand:
-        """Return the command that turns the body towards the reference."""
+        """Return the coil command that rotates the body towards the reference."""
         error = error_of(estimate, reference.quaternion)
         torque = -self._stiffness * error - self._damping * estimate.rate
         field = self.field(estimate)
@@ -136,19 +137,19 @@ class Direct:
         self.since_ns = 0
 
     def hold(self, quaternion: FloatArray, now_ns: int) -> None:
-        """Make an attitude (4,) the reference from now on."""
+        """Make an attitude (4,) the reference from `now_ns` on."""
         self._reference, self.since_ns = AtRest(quaternion), now_ns
 
     def sample(self, now_ns: int) -> AtRest | None:
-        """Return the reference now; None before the first target."""
+        """Return the reference at `now_ns`, or None before the first target."""
         return self._reference
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether the target is still to be reached."""
+        """Return whether the time to reach the target has not yet elapsed."""
         return now_ns - self.since_ns < DUE_NS
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return False: no plan can be missing."""
+        """Return False, because this body needs no plan."""
         return False
 
     def release(self) -> None:
@@ -156,7 +157,7 @@ class Direct:
         self._reference = None
 
     def busy_since_ns(self) -> int | None:
-        """Return None: the worker has no jobs."""
+        """Return None, because the worker never has a job."""
         return None
 
     def aim(self, target: Target, now_ns: int) -> None:
@@ -173,7 +174,7 @@ class Direct:
         """Plan nothing."""
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
-        """Take up the target again after the path was released."""
+        """Make the target the reference again if the reference was released."""
         if self._reference is None:
             self.aim(target, now_ns)
 
@@ -181,7 +182,7 @@ class Direct:
         """Accept nothing."""
 
     def counts(self) -> tuple[int, int]:
-        """Return that no plan was accepted or refused."""
+        """Return the numbers of accepted and refused plans, which are always zero."""
         return 0, 0
 
 
@@ -190,7 +191,7 @@ class Direct:
 
 # --8<-- [start:targets]
 class Attitudes:
-    """Implements `Targets`: the configured steps as attitudes about the thread."""
+    """Implements `Targets`: the configured steps as rotations about the thread."""
 
     def __init__(self, config: TestbedConfig, direct: Direct) -> None:
         self._times = [round(step.at * 1e9) for step in config.steps]
@@ -198,7 +199,7 @@ class Attitudes:
         self._direct = direct
 
     def configured(self, mission_time_ns: int) -> Target:
-        """Return the configured target in force."""
+        """Return the configured target at a mission time."""
         return self._steps[max(sum(time <= mission_time_ns for time in self._times) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
@@ -212,7 +213,7 @@ class Attitudes:
         return Target(KEPT, FixedAttitude(tuple(estimate.quaternion.tolist())))
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return True: the coils turn the body about the thread wherever it points."""
+        """Return True, because the coils can rotate the body about the thread in every attitude."""
         return True
 
     def speed(self, estimate: Estimate) -> float:
@@ -224,7 +225,7 @@ class Attitudes:
         return float(np.linalg.norm(error_of(estimate, target.law.quaternion(estimate.time_ns))))
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the error once the target is due; None while under way."""
+        """Return the error, or None before the time at which the target is due."""
         return None if self._direct.is_following(now_ns) else self.error(estimate, target)
 
 
@@ -237,7 +238,7 @@ def _about_thread(q2: float) -> FixedAttitude:
 
 # --8<-- [start:view]
 class View:
-    """Implements `BodyView`: the packet `attitude`, which the loop records for every body, is enough."""
+    """Implements `BodyView`: records no packets besides `attitude`, which the loop records for every body."""
 
     def __init__(self, services: Services) -> None:
         self._events = services.events
@@ -251,15 +252,15 @@ class View:
             self._events.report(events.TARGET, now_ns, target.law.text)
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
-        """Return the body's field of the mode packet."""
+        """Return the field of the mode packet that depends on the body."""
         return {"target_q2": math.nan}
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return a rate from streaks in words."""
+        """Return a body rate from streaks as text."""
         return f"rate {rate.rate.round(5).tolist()} rad/s"
 
     def progress(self, output: ControlOutput | None) -> str:
-        """Return the target in words."""
+        """Return the target as text, or an empty text without a target."""
         return output.target.law.text if output is not None and output.target is not None else ""
 
 
@@ -268,7 +269,7 @@ class View:
 
 # --8<-- [start:make]
 class PointingControl(BodyControl):
-    """Implements `BodyControl`: the parts above, and the testbed's detumbling."""
+    """Implements `BodyControl`: the classes above and the testbed's detumbling law."""
 
     def __init__(self, config: TestbedConfig) -> None:
         direct = Direct()
@@ -282,13 +283,13 @@ class PointingControl(BodyControl):
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
-    """Return the body of a configuration, with what an earlier boot learned."""
+    """Return the body of a configuration with the values that were learned before the last boot."""
     config = as_testbed(config)
     return FlightBody(TestbedEstimation(config, learned), PointingControl(config), View(services))
 
 
 def plan(job: Any) -> Any:
-    """Plan nothing: this body submits no jobs."""
+    """Raise NotImplementedError, because this body submits no planning jobs."""
     raise NotImplementedError
 
 
@@ -297,7 +298,7 @@ POINTING = BodyKind(plan, make)
 
 
 def main() -> None:
-    """Fly the demonstration's first step with this body, and print where it points in the end."""
+    """Fly the demonstration's first step with this body, and print the final pointing error and body rate."""
     text = Path("config/step_demo.yaml").read_text(encoding="utf-8")
     before, _, after = text.partition("camera: ")
     text = f"{before}camera: none\n\nestimation:" + after.partition("\nestimation:")[2]

@@ -1,6 +1,6 @@
 """A magnetometer outside this repository, QMC5883L, with its driver and its emulator.
 
-A configuration names both in the driver `sensors`, see docs/extending/device.md.
+A configuration names driver and emulator in a section of the driver `sensors`, see docs/extending/device.md.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ CONTROL, OUT = 0x09, 0x00
 
 
 class Qmc5883:
-    """The driver, with the interface of CircuitPython drivers. It may sleep."""
+    """Driver of the QMC5883L with the interface of CircuitPython drivers. It may sleep."""
 
     def __init__(self, i2c: Any, address: int = 0x0D) -> None:
         self._i2c, self._address = i2c, address
@@ -28,7 +28,7 @@ class Qmc5883:
 
 
 class EmulatedQmc5883:
-    """Emulator of the chip, which answers with bytes."""
+    """Emulator of the QMC5883L, which answers reads with the bytes of a measurement."""
 
     def __init__(self, measured: Any, sensor: Any) -> None:
         self._measured, self._address = measured, sensor.address
@@ -38,7 +38,7 @@ class EmulatedQmc5883:
         return bool(address == self._address)
 
     def write(self, address: int, data: bytes) -> None:
-        """Take a register pointer or a setting; this model ignores both."""
+        """Accept a register pointer or a setting, both of which this model ignores."""
 
     def read(self, count: int) -> bytes:
         """Return a measurement with noise of 0.2 uT."""

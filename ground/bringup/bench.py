@@ -1,7 +1,7 @@
 """The open devices of a bench session, and the outcome of a step.
 
-The driver sets a coil to zero if its command is not repeated within 0.25 s, the guardian if this process
-stops, and `Session.close` in any case.
+The driver sets a coil to zero if its command is not repeated within 0.25 s. The guardian sets all coils to
+zero if this process stops, and `Session.close` does so at the end of every session.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from knightcube.astro.arrays import FloatArray, Image
 _POLL_NS = 25_000_000
 _FRAME_PATIENCE_NS = 12 * SECOND_NS
 _ATTEMPTS = 3
-"""Number of attempts to open a device, so that loose contact is found in the measurement."""
+"""Number of attempts to open a device, so that the measurement can begin despite a loose contact."""
 _LOST_FRAMES = 2
 """Number of additional triggers if a trigger gives no frame."""
 _LATE_FRAME_S = 2.0
@@ -36,7 +36,10 @@ STILL_S = 0.5
 
 
 class StepSkipped(Exception):
-    """Raised by a step that cannot be done; the text is the reason, `finding` the fault that caused it."""
+    """Raised by a step that cannot be done.
+
+    The text states the reason; `finding` is the fault that caused it.
+    """
 
     def __init__(self, reason: str, finding: Finding | None = None) -> None:
         super().__init__(reason)
@@ -50,9 +53,9 @@ class Outcome:
     Attributes:
         findings: faults of the parts.
         values: measured values for the report and for JSON.
-        changes: values of the configuration that the measurements give, by section.
-        arrays: measured arrays for the pictures.
-        frames: frames for the report.
+        changes: configuration values derived from the measurements, by section.
+        arrays: measured arrays for the plots.
+        frames: camera frames for the report.
     """
 
     findings: list[Finding] = field(default_factory=list)
@@ -73,9 +76,11 @@ class Session:
         ask: function that requests an action of the person at the bench and waits for its completion.
         hand: the emulated hand (`sim_hal.rig.EmulatedBench`), or None at a real bench.
         guardian: guardian of the coils, or None with emulated devices.
-        coil_field: expected field of each coil (n, 3) at the magnetometer, T/A, body axes, or None.
+        coil_field: expected field of each coil (n, 3) at the magnetometer, T/A, body axes, or None if the
+            configuration does not describe it.
         known: outcomes of earlier steps, by name.
-        live: whether somebody watches the focus until he or she ends the step.
+        live: function that shows a text while the user turns the focus ring, and returns whether to go on, or
+            None.
     """
 
     config: Config
@@ -113,7 +118,7 @@ class Session:
         return self._open[key]
 
     def section(self, key: str) -> tuple[str, Any]:
-        """Return the kind of a device and its section, which is None if it is not configured."""
+        """Return the kind of a device and its section, which is None if the device is not configured."""
         if key.startswith("wide_cameras"):
             return "camera", self.config.wide_cameras[int(key[13:-1])]
         if key.startswith("power."):

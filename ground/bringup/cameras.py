@@ -19,11 +19,11 @@ from knightcube.vision.startracker.detection.detect import detect
 _FRAMES = 3
 _LENS_FRAMES = 6
 _FEW_SOURCES = 5
-"""Number of point sources from which a frame shows stars or lamps, not hot pixels."""
+"""Smallest number of point sources for which a frame is assumed to show stars or lamps."""
 _SHARP = (0.6, 2.5)
-"""Range (px) of a star's PSF width, standard deviation, in which stars are measured well."""
+"""Range (px) of the PSF width (standard deviation) in which star positions are measured accurately."""
 _HOT = 1e-3
-"""Largest fraction of hot pixels of a sound sensor."""
+"""Largest fraction of hot pixels of a healthy sensor."""
 
 
 def step_dark(session: Session) -> Outcome:
@@ -80,7 +80,8 @@ def step_dark(session: Session) -> Outcome:
 def _noise(difference: FloatArray) -> float:
     """Return the standard deviation (counts) of a frame's noise from the difference of two dark frames.
 
-    Hot pixels have no influence. If the noise is below a count, most differences are zero.
+    The median makes the result independent of hot pixels. If the noise is below one count, most differences
+    are zero and the root mean square is returned instead.
     """
     deviations = np.abs(difference - np.median(difference))
     robust = 1.4826 * float(np.median(deviations))
@@ -124,7 +125,7 @@ def _format_faults(part: str, camera: Camera | WideCamera, frames: Sequence[Fram
 
 
 def _dead_lines(first: FloatArray, second: FloatArray) -> str:
-    """Return the numbers of rows and columns that are equal in two frames as text, or an empty text."""
+    """Return a text about the number of rows and columns that are equal in two frames, or an empty text."""
     same = first == second
     rows, columns = int(same.all(axis=1).sum()), int(same.all(axis=0).sum())
     return f"{rows} rows and {columns} columns do not change" if rows or columns else ""
@@ -161,7 +162,7 @@ def _wrong_size(part: str, camera: Camera | WideCamera, pixels: Image) -> list[F
 
 
 def _no_light(dark: Outcome | None, pixels: Image, level: float, sources: int) -> Finding:
-    """Return the finding about a frame without point sources: the cap, or an unknown cause."""
+    """Return the finding about a frame without point sources: the cap is on, or the cause is unknown."""
     before = {} if dark is None else dark.values
     same = abs(level - before.get("level", math.inf)) <= 3.0 * max(before.get("noise_counts", 0.0), 1.0)
     if pixels.max() == pixels.min() > 0:
@@ -177,7 +178,7 @@ def _no_light(dark: Outcome | None, pixels: Image, level: float, sources: int) -
 def psf_width(pixels: Image) -> tuple[float, int]:
     """Return the PSF width (standard deviation, px) and the number of stars; NaN for fewer than 5 stars.
 
-    Stars that are many pixels wide are measured in sums of squares of pixels.
+    Stars that are many pixels wide are measured in binned frames.
     """
     for factor in (16, 8, 4, 2, 1):
         rows, columns = (size // factor * factor for size in pixels.shape)
@@ -254,11 +255,11 @@ def step_lens(session: Session) -> Outcome:
     return Outcome(findings, values, changes)
 
 
-# Cameras for Sun and horizon.
+# Cameras for the directions to Sun and horizon.
 
 
 def step_wide(session: Session) -> Outcome:
-    """Cover one horizon camera after the other, whose frame must change, and no other camera's frame."""
+    """Cover one horizon camera after the other, and check that only the covered camera's frame changes."""
     cameras = session.config.wide_cameras
     if not cameras:
         raise StepSkipped("the configuration has no wide_cameras")
@@ -306,7 +307,7 @@ def step_wide(session: Session) -> Outcome:
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
-    """Return the covers with which a camera's frame is dark, given its frame without covers."""
+    """Return the keys of the cameras whose cover darkens a frame, given the frame without covers."""
     level = float(np.mean(pixels))
     levels = {key: float(np.mean(frame)) for key, frame in covered.items()}
     darkest = min(levels.values())

@@ -1,7 +1,7 @@
-"""Search for the devices of a configuration on their buses and lines, and for the reasons why one is missing.
+"""Search for the devices of a configuration, and for the reason why a device is missing.
 
-A missing chip is searched on all addresses of its bus, and a missing serial device at all baud rates on all
-serial lines of the configuration. Chips are identified by registers that no driver changes.
+A missing chip is searched for at all addresses of its bus, and a missing serial device on all serial lines of
+the configuration at all baud rates. Chips are identified by registers that no driver changes.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from hal.interfaces.wires import I2cBus, Rig
 _PCA9685 = [0xE2, 0xE4, 0xE8, 0xE0]
 """Registers 2 to 5 (SUBADR1 to ALLCALLADR) of a PCA9685, which our drivers leave at their power-on values."""
 _INA219 = {0x399F, *(config_for(bits) for bits in range(4))}
-"""Config words of an INA219: after power-on, and as our driver sets it."""
+"""Values of an INA219's configuration register: after power-on, and as set by our driver."""
 _ADDRESSES = [address for address in range(0x08, 0x78) if address != 0x70]
 """7-bit addresses without the reserved ones and without 0x70, to which every PCA9685 answers."""
 _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}
 _LISTEN_NS = 1_200_000_000
 _LOOK_NS = 20_000_000
 _REGULAR, _PAUSE = 8, 5.0
-"""Smallest number of pauses that are judged, and ratio of the longest to the median one for loose contact."""
+"""Smallest number of pauses for a diagnosis, and ratio of longest to median pause for loose contact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
 
 
 def _place(config: Config, kind: str, section: Any, driver: Any) -> str:
-    """Return the device file, and the address of a chip, of a section."""
+    """Return the device file of a section and, for a chip, its I2C address."""
     files = () if driver is None else driver.files(section)
     bus = driver_of("coils", config.coils).files(config.coils)
     address = getattr(section, "address", None)
@@ -139,7 +139,7 @@ def _missing(
 ) -> Finding:
     """Return the finding about a device that does not answer."""
     finding = None
-    with suppress(DeviceError):  # the bus or the line itself is missing, which `error` says
+    with suppress(DeviceError):  # if the bus or the line itself is missing, `error` already states this
         if kind in serial:
             finding = _serial_finding(kind, section, rig, serial)
         elif getattr(section, "driver", "") in {"pca9685", "ina219"}:
@@ -149,7 +149,7 @@ def _missing(
 
 
 def _wrong_address(kind: str, section: Any, rig: Rig, taken: set[Any]) -> Finding | None:
-    """Search a missing chip on all addresses of its bus that no section names."""
+    """Search for a missing chip at all addresses of its bus that no section names."""
     bus, named = rig.wires.i2c(section.bus), section.driver
     chips = {address: chip for address in _ADDRESSES if (chip := chip_at(bus, address)) is not None}
     where = [address for address, chip in chips.items() if chip == named and address not in taken]

@@ -2,11 +2,11 @@
 
 The coils are compared by the field that each coil makes at the magnetometer per ampere, in both directions of
 the current, and by the current that the supply delivers. The measured response of each coil is compared with
-the expected response of every coil, so that exchanged, reversed and weak coils are distinguished. The axes of
-gyro, accelerometer and magnetometer follow from right-handed turns of 90 deg about each body axis, which
-begin with the z axis up. A hand keeps the angle and the axis to about 15 deg, so that only exchanged and
-reversed axes and large rotations are found. A turn leaves the common sign of the magnetometer open; the coils
-determine this sign.
+the expected response of every coil, so that swapped, reversed and weak coils are distinguished. The axes of
+gyro, accelerometer and magnetometer are determined from right-handed rotations of 90 deg by hand about each
+body axis. Before each rotation the z axis points up. Angle and axis of a rotation by hand are accurate to
+about 15 deg, so that only swapped and reversed axes and large misalignments are found. Rotations do not
+determine the common sign of the magnetometer's axes; the coils determine this sign.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from knightcube.astro.quaternion import (
 )
 
 QUARTER = 0.5 * math.pi
-"""Angle (rad) of the turn about each body axis."""
+"""Angle (rad) of the rotation by hand about each body axis."""
 GRAVITY = 9.80665
 RECOGNISED = math.radians(25.0)
-"""Largest angle between a measured and an expected direction that belong together."""
+"""Largest angle (rad) at which a measured direction is assigned to an expected direction."""
 ASKEW = math.radians(15.0)
-"""Largest angle of a coil's field to its expected direction, if turns by hand do not limit the accuracy."""
+"""Largest angle (rad) of a coil's field to its expected direction, if the magnetometer's axes are exact."""
 FEWEST = 20
-"""Smallest number of samples from which noise is determined."""
+"""Smallest number of samples from which the noise is determined."""
 ALIKE = math.radians(15.0)
-"""Largest angle between the axes of two sensors that have the same axes."""
+"""Largest angle (rad) between the axes of two sensors that count as equally mounted."""
 SCALE = 0.1
-"""Largest relative difference of the scales of two axes or sensors that agree."""
+"""Largest relative difference between the scales of two axes or sensors that count as equal."""
 STRONGEST_BIAS = 1.5e-5
-"""Largest constant field (T) of a body, without regard to the strength of the measured field."""
+"""Constant field (T) of a body that is always permitted, even if the field of the site is weak."""
 _AXES = "xyz"
 _NEAR = 0.15
 """Relative difference up to which a measured value agrees with its expected value."""
@@ -57,7 +57,7 @@ class Finding:
         kind: kind of the fault in one or two words, for example `reversed`.
         text: measured value and its meaning.
         cure: remedy.
-        factor: factor by which the resistance differs, or None.
+        factor: factor by which a coil's resistance differs from the configured one, or None.
     """
 
     part: str
@@ -72,7 +72,7 @@ class Finding:
 
 
 def signed_permutations() -> list[FloatArray]:
-    """Return the 48 matrices (3, 3) that exchange and reverse axes; the identity is the first."""
+    """Return the 48 matrices (3, 3) that permute and reverse axes, beginning with the identity."""
     found = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
@@ -83,7 +83,7 @@ def signed_permutations() -> list[FloatArray]:
 
 
 def axis_names(matrix: FloatArray) -> str:
-    """Return which body axis each measured axis shows, such as `x shows -y, y shows x`."""
+    """Return a text about the body axis that each wrong axis measures, such as `x shows -y, y shows x`."""
     shown = []
     for name, row in zip(_AXES, matrix, strict=True):
         index = int(np.argmax(np.abs(row)))
@@ -93,7 +93,7 @@ def axis_names(matrix: FloatArray) -> str:
     return ", ".join(shown)
 
 
-# Inertial unit at rest and in turns.
+# Inertial unit at rest and during rotations by hand.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,12 +133,12 @@ def missing_share(change: FloatArray, noise: float) -> float:
 
 
 def repeated_share(values: FloatArray) -> float:
-    """Return the fraction of samples (k, 3) that equal the sample before in all axes."""
+    """Return the fraction of samples (k, 3) that equal the preceding sample in all axes."""
     return float(np.mean((np.diff(values, axis=0) == 0.0).all(axis=1)))
 
 
 def allan_deviation(values: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """Return averaging times (m,), s, and the Allan deviations (m, 3) of values (k, 3)."""
+    """Return averaging times (m,), s, and the Allan deviations (m, 3) of values (k, 3) every `period` s."""
     sizes = [1 << n for n in range(int(math.log2(max(len(values) // 4, 1))) + 1)]
     found = []
     for size in sizes:
@@ -152,7 +152,7 @@ def diagnose_rest(
 ) -> list[Finding]:
     """Return the faults of an inertial unit that rested for `span` s.
 
-    `bad` is the share of packets with a wrong checksum, `strongest` the largest field (T) that the site has.
+    `bad` is the fraction of packets with a wrong checksum, `strongest` the strongest field (T) of the site.
     """
     found, part = [], "inertial_unit"
     if bad > 0.01:
@@ -243,11 +243,11 @@ def _rest_values(samples: Samples, strongest: float) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turns:
-    """Measurements of the turns about x, y and z, whose first index is the axis of the turn.
+    """Measurements of the rotations by hand about x, y and z; the first index is the axis of rotation.
 
     Attributes:
-        gyro: rotation vectors (3, 3) by the gyro, rad.
-        before, after: mean acceleration and field (3, 2, 3) before and after each turn.
+        gyro: rotation vectors (3, 3) measured by the gyro, rad.
+        before, after: mean acceleration and mean field (3, 2, 3) before and after each rotation.
     """
 
     gyro: FloatArray
@@ -258,7 +258,7 @@ class Turns:
 def turned(samples: Samples, bias: FloatArray) -> FloatArray:
     """Return the integral (3,), rad, of the gyro's rate less its `bias` (3,), rad/s.
 
-    For a turn about one axis, the integral is the rotation vector, also beyond half a turn.
+    For a rotation about a fixed axis, the integral is the rotation vector, also beyond 180 deg.
     """
     steps = np.diff(samples.times)[:, None]
     return np.asarray(np.sum((samples.rate[1:] - bias) * steps, axis=0))
@@ -266,7 +266,7 @@ def turned(samples: Samples, bias: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxesFound:
-    """The axes of each sensor: the orthogonal matrix (3, 3) from body axes to measured axes, or None."""
+    """Axes of each sensor: orthogonal matrix (3, 3) from body axes to measured axes, or None if unknown."""
 
     gyro: FloatArray | None
     accelerometer: FloatArray | None
@@ -275,13 +275,13 @@ class AxesFound:
 
 
 def diagnose_axes(turns: Turns) -> AxesFound:
-    """Return the axes of gyro, accelerometer and magnetometer from the turns about x, y and z."""
+    """Return the axes of gyro, accelerometer and magnetometer from the rotations about x, y and z."""
     findings: list[Finding] = []
     gyro = _gyro_axes(turns.gyro, findings)
     if gyro is not None and not findings:
         findings += _gyro_scale(turns)
     axes: dict[str, FloatArray | None] = {"gyro": gyro}
-    # The gyro measures the turns better than a hand makes them, if its scale is right.
+    # If the gyro's scale is right, its angles are more accurate than the nominal angles of the rotations.
     vectors = QUARTER * np.eye(3) if gyro is None or findings else turns.gyro @ gyro
     rotations = [attitude_matrix(from_rotation_vector(vector)) for vector in vectors]
     up = np.array([0.0, 0.0, 1.0])
@@ -320,7 +320,10 @@ def diagnose_axes(turns: Turns) -> AxesFound:
 
 
 def _common(found: dict[str, FloatArray]) -> FloatArray | None:
-    """Return the axes of all sensors if they agree, or None. The sign of the magnetometer's axes is open."""
+    """Return the axes of all sensors if they agree, or None.
+
+    The sign of the magnetometer's axes is not compared.
+    """
     if "gyro" not in found:
         return None
     first = found["gyro"]
@@ -332,7 +335,7 @@ def _common(found: dict[str, FloatArray]) -> FloatArray | None:
 
 
 def _wrong_axes(part: str, axes: FloatArray) -> Finding:
-    """Return the finding about a sensor, or the whole IMU, whose axes differ from the configured axes."""
+    """Return the finding about wrong axes of a sensor or of the whole inertial unit."""
     whole, proper = part == "inertial_unit", np.linalg.det(axes) > 0
     sensors = "the axes of all sensors are wrong" if whole else "its axes differ from the body's"
     if not np.allclose(np.abs(axes).max(axis=1), 1.0):
@@ -369,14 +372,14 @@ def _nearest(axes: FloatArray) -> FloatArray:
 
 
 def _orthogonal(measured: FloatArray, true: FloatArray) -> FloatArray | None:
-    """Return the orthogonal matrix that maps true unit vectors (k, 3) to measured ones, or None."""
+    """Return the orthogonal matrix from true to measured unit vectors (k, 3), or None if the fit is poor."""
     left, _, right = np.linalg.svd(measured.T @ true)
     found = left @ right
     return found if np.linalg.norm(measured - true @ found.T, axis=1).max() <= RECOGNISED else None
 
 
 def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | None:
-    """Return the gyro's axes from the integrals (3, 3) of its rate in the turns, or None with a finding."""
+    """Return the gyro's axes from its rotation vectors (3, 3), or add a finding and return None."""
     part, sizes = "inertial_unit.gyro", np.linalg.norm(measured, axis=1)
     if not np.isfinite(sizes).all():
         text = "its rates are not numbers, or outside its range"
@@ -402,9 +405,9 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
 
 
 def _gyro_scale(turns: Turns) -> list[Finding]:
-    """Return the finding about a gyro whose turns about x and y differ from those of gravity, if any.
+    """Return the finding about a gyro whose angles about x and y differ from those of gravity, if any.
 
-    Both angles are measured in the same turn, so that the hand does not limit the comparison.
+    Both angles belong to the same rotation, so the accuracy of the hand does not limit the comparison.
     """
     first, second = turns.before[:2, 0], turns.after[:2, 0]
     sizes = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
@@ -427,9 +430,9 @@ def _wrong_scales(part: str, scales: FloatArray, what: str) -> Finding:
 
 
 def _force_scales(force: FloatArray) -> list[Finding]:
-    """Return the finding about the scales of an accelerometer from specific forces (k, 3), g, if wrong.
+    """Return the finding about the scales of an accelerometer from specific forces (k, 3), g, if any.
 
-    Each axis of a sound sensor is vertical before or after one of the turns.
+    Each axis of a healthy sensor is vertical before or after one of the rotations.
     """
     sizes = np.abs(force).max(axis=0)
     if sizes.min() < 0.1 or np.abs(sizes - 1.0).max() <= 2.0 * SCALE:
@@ -438,7 +441,7 @@ def _force_scales(force: FloatArray) -> list[Finding]:
 
 
 def _field_faults(field: FieldFound) -> list[Finding]:
-    """Return the fault that a fit of the magnetometer's values shows, if any: scales, or a constant field."""
+    """Return the fault in the fit of the magnetometer, if any: wrong scales, or a large constant field."""
     part = "inertial_unit.magnetometer"
     if field.scales is not None:
         return [_wrong_scales(part, field.scales, "relative scales")]
@@ -451,11 +454,12 @@ def _field_faults(field: FieldFound) -> list[Finding]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFound:
-    """The result of a fit of the magnetometer's values in the turns.
+    """Result of a fit of the magnetometer's values before and after the rotations.
 
     Attributes:
-        axes: orthogonal matrix (3, 3) from body axes to measured axes, or None if none explains the values.
-        size, bias: field of the site and constant field of the body, T.
+        axes: orthogonal matrix (3, 3) from body axes to measured axes, or None if no matrix explains the
+            values.
+        size, bias: magnitudes of the site's field and of the body's constant field, T.
         scales: relative scales (3,) of the measured axes if they differ, or None.
     """
 
@@ -468,17 +472,17 @@ class FieldFound:
 def _fitted_field(
     before: FloatArray, after: FloatArray, turns: Sequence[FloatArray], gyro: FloatArray | None
 ) -> FieldFound:
-    """Return the magnetometer's axes from fields (3, 3) before and after turns, with an unknown bias.
+    """Return the magnetometer's axes from fields (3, 3) before and after the rotations, with an unknown bias.
 
-    The fit starts from the best exchange of axes and from the axes of the gyro.
+    The fit starts from the best signed permutation of the axes and from the axes of the gyro.
 
-    The common sign is open: of two matrices with opposite signs, the matrix closer to the identity is
-    returned. No matrix is returned if none explains the fields.
+    The common sign is undetermined: of two matrices with opposite signs, the matrix closer to the identity is
+        returned. The axes are None if no matrix explains the fields.
     """
     values = np.concatenate([*before, *after])
 
     def unknowns(axes: FloatArray, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals, and field and bias (6,), for given axes and scales."""
+        """Return the residuals (k, 3), and the field and the bias (6,), for given axes and scales."""
         rows = [np.hstack([np.eye(3), np.eye(3)])] * 3
         rows += [np.hstack([axes @ turn @ axes.T, np.eye(3)]) for turn in turns]
         matrix, scaled = np.vstack(rows), values / np.tile(scales, 6)
@@ -486,7 +490,7 @@ def _fitted_field(
         return matrix @ found - scaled, found
 
     def solved(axes: FloatArray) -> tuple[FloatArray, float]:
-        """Return the residuals and the size of the field for given axes."""
+        """Return the residuals and the magnitude of the field for given axes."""
         residuals, found = unknowns(axes, np.ones(3))
         return residuals, float(np.linalg.norm(found[:3]))
 
@@ -537,8 +541,9 @@ class CoilTest:
         absent: fraction of the samples (n, 2) in which the field of the driven coil was missing.
         fault: text of a failed command to the coils, or an empty text.
         clipped: whether a current exceeded the range of the monitor.
-        volts: supply voltages (V) without a command and the lowest one with a command; NaN without a monitor.
-        sensed: whether the magnetometer works; if not, only the currents of the coils are judged.
+        volts: supply voltage (V) without a command, and the lowest supply voltage with a command; NaN without
+            a monitor.
+        sensed: whether the magnetometer works; if not, only the currents of the coils are evaluated.
     """
 
     commanded: FloatArray
@@ -556,19 +561,19 @@ class CoilTest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilsFound:
-    """The result of the coils' test.
+    """Result of the coil test.
 
     Attributes:
-        response, expected: field of each command (n, 3), T/A, in body axes.
-        serves: index (n,) of the configured coil that each command drives, or -1.
+        response, expected: measured and expected field of each command (n, 3), T/A, in body axes.
+        serves: index (n,) of the configured coil that each command drives, or -1 without a field.
         strength: field of each command (n,) relative to that of the coil that it drives; negative if
             reversed.
-        misfit: angle (n,), rad, between measured and expected field, without regard to the sign.
-        live: mask of the commands (n,) that make a field.
+        misfit: angle (n,), rad, between the axes of measured and expected field, from 0 to pi / 2.
+        live: mask (n,) of the commands that produce a field.
         drawn: supply current (n,) relative to the command, corrected for a wrong shunt; NaN if unknown.
         shunt: factor by which the shunt differs from the configured one, or 1.
         joined: commands (j, k) whose coils are connected, so that command j also drives coil k.
-        askew: largest angle (rad) between the measured and the expected field of a sound coil.
+        askew: largest angle (rad) between the measured and the expected field of a healthy coil.
         findings: the faults.
     """
 
@@ -595,8 +600,8 @@ def diagnose_coils(
 ) -> CoilsFound:
     """Return the faults of the coils, given the expected field (n, 3), T/A, of each coil in body axes.
 
-    The matrix `magnetometer` (3, 3) maps body axes to measured axes; its sign may be wrong. If the expected
-    size is not known (`size_known`), the median of the coils is the expected size.
+    The matrix `magnetometer` (3, 3) maps body axes to measured axes; its sign may be wrong. If the field
+    strength per ampere is not known (`size_known`), the median of the coils is expected.
     """
     axes = np.eye(3) if magnetometer is None else magnetometer
     plus, minus = test.plus @ axes, test.minus @ axes  # rows in body axes
@@ -633,14 +638,14 @@ def _usual_size(response: FloatArray, expected: FloatArray) -> float:
 
 
 def _exact(axes: FloatArray) -> bool:
-    """Return whether each axis of the magnetometer is a body axis, so that no turn by hand limits it."""
+    """Return whether each axis of the magnetometer is exactly a body axis."""
     return bool(np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6))
 
 
 def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict[int, int]:
-    """Return the pairs (j, k) of which command j makes the fields of the coils j and k together.
+    """Return the pairs (j, k) of coils for which command j produces the fields of both coils.
 
-    Command k then makes no field, or the same field as command j.
+    Command k then produces no field, or the same field as command j.
     """
     found, size = {}, np.linalg.norm(response, axis=1)
     for j in np.flatnonzero(live).tolist():
@@ -657,11 +662,11 @@ def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict
 
 
 _ALL = frozenset({"no field", "no supply", "no response", "wrong supply voltage", "sagging supply"})
-"""Kinds of faults that concern all coils, after which single coils are not judged."""
+"""Kinds of faults that concern all coils; single coils are not evaluated after such a fault."""
 
 
 def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> tuple[float, list[Finding]]:
-    """Return -1 and a finding if the fields of all coils are opposite, which is one fault of one sensor."""
+    """Return -1 and a finding if all fields are reversed, which indicates a reversed magnetometer, else 1."""
     count = int(live.sum())
     if count < 2 or (strength[live] > 0).any() or (misfit[live] > RECOGNISED).any():
         return 1.0, []
@@ -673,12 +678,12 @@ def _common_sign(strength: FloatArray, misfit: FloatArray, live: BoolArray) -> t
 def _match(
     response: FloatArray, expected: FloatArray, live: BoolArray
 ) -> tuple[list[int], FloatArray, FloatArray]:
-    """Return the configured coil of each command (n,), its relative strength (n,) and the angle (n,), rad."""
+    """Return coil (n,), relative field strength (n,) and angle error (n,), rad, of each command."""
     count = len(response)
     unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     length = np.linalg.norm(response, axis=1, keepdims=True)
     cosine = response / np.where(length > 0.0, length, 1.0) @ unit.T
-    own = 0.05 * np.eye(count)  # parallel coils are not considered exchanged
+    own = 0.05 * np.eye(count)  # parallel coils do not count as swapped
     rows = np.flatnonzero(live)
     serves, strength, misfit = [-1] * count, np.zeros(count), np.full(count, math.pi)
     if len(rows):
@@ -691,7 +696,7 @@ def _match(
 
 
 def _shared_fault(test: CoilTest, state: CoilsFound, size_known: bool) -> tuple[list[Finding], float]:
-    """Return the faults that all coils share, and the factor of the shunt."""
+    """Return the faults that all coils share, and the ratio of measured to commanded current."""
     live, drawn, count = state.live, state.drawn, len(state.live)
     flowing = drawn > 0.12
     found = []
@@ -726,7 +731,7 @@ def _shared_fault(test: CoilTest, state: CoilsFound, size_known: bool) -> tuple[
 
 
 def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known: bool) -> list[Finding]:
-    """Return the finding about a supply current that differs by the factor `common` in all coils."""
+    """Return the finding about a supply current that is `common` times the command for all coils."""
     fields = float(np.median(np.abs(state.strength[state.live])))
     bound = "at least " if test.clipped else ""
     text = f"the measured current is {bound}{common:.3g} times the commanded one"
@@ -746,9 +751,9 @@ def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known:
 def _coil_findings(
     state: CoilsFound, j: int, names: Sequence[str], legs: FloatArray, absent: float
 ) -> list[Finding]:
-    """Return the faults of the command to coil `j`, given its field (2,), T/A, in both directions.
+    """Return the faults of the command to coil `j`, given its field (2,), T/A, for both current directions.
 
-    The field is missing in the fraction `absent` of the samples.
+    The argument `absent` is the fraction of the samples without the field.
     """
     part, name, k = f"coils.windings[{j}]", names[j], state.serves[j]
     if not state.live[j]:
@@ -805,7 +810,7 @@ def _without_field(part: str, name: str, drawn: float) -> Finding:
 
 
 def _wrong_size(part: str, name: str, size: float, drawn: float) -> list[Finding]:
-    """Return the finding about a coil whose field or current differs in size from the expected value."""
+    """Return the finding about a coil whose field or current differs in magnitude from the expected value."""
     allowed, known = _NEAR + 0.05, not math.isnan(drawn)
     right_current = not known or abs(drawn - 1.0) <= allowed
     if abs(size - 1.0) <= allowed and right_current:

@@ -14,10 +14,10 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 
 _SETTLE_S = 1.6
-"""Time (s) after which the mean of a current monitor has the present value."""
+"""Time (s) after a change of the current until a monitor's mean contains only the new current."""
 _MONITOR_S = 1.0
 _NEAR = 0.15
-"""Relative difference up to which two monitors agree about a change of the current."""
+"""Largest relative difference between the changes of the current that two monitors measure."""
 
 
 # Power system.
@@ -121,19 +121,19 @@ def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -
 # GPS receiver.
 
 _FIX_PATIENCE_S = 120.0
-"""Longest time (s) to the first fix of a receiver under an open sky."""
+"""Longest time (s) that a receiver under an open sky needs for its first fix."""
 _SILENCE_S = 6.0
 _FIXES = 12
 _PERIOD_S = 1.0
 """Interval (s) of the fixes that the drivers request."""
 _LATE_S = 0.7
-"""Largest age (s) of a fix at its arrival: receivers need up to 0.2 s, slow serial lines more."""
+"""Largest age (s) of a fix at its arrival: receivers need up to 0.2 s, and slow serial lines add to this."""
 _CLOCK_S = 5.0
-"""Difference (s) of GPS time and computer above which the time is wrong, and a fix is not merely late."""
+"""Difference (s) between GPS time and computer time that is not explained by a late fix."""
 
 
 def step_gps(session: Session) -> Outcome:
-    """Receive fixes, and judge satellites, rate, time, position and velocity."""
+    """Receive fixes, and check number of satellites, rate, time, position and velocity."""
     receiver: GpsReceiver = session.device("gps")
     session.ask("Place the GPS antenna under an open sky, and leave it there.")
     clock, before, readings = session.rig.clock, receiver.link(), list[GpsReading]()
@@ -176,7 +176,7 @@ def _offset(reading: GpsReading, now_ns: int, utc_ns: int) -> float:
 
 
 def _gps_stream(readings: Sequence[GpsReading], bad: float) -> list[Finding]:
-    """Return the faults that the arrival of the readings shows, with the share `bad` of wrong checksums."""
+    """Return the faults in the stream of readings, given the fraction `bad` of wrong checksums."""
     findings = []
     if bad > 0.02:
         text = f"{100.0 * bad:.0f} % of the messages have a wrong checksum"
@@ -230,7 +230,7 @@ _STRINGS_S = 2.5
 
 
 def step_strings(session: Session) -> Outcome:
-    """Shine a lamp onto one panel after the other, whose string must give a current, and no other string."""
+    """Illuminate one panel after the other, and check that only the string of this panel gives a current."""
     strings: SolarStrings = session.device("solar_strings")
     section = session.config.solar_strings
     assert section is not None, "the device is open"

@@ -1,6 +1,6 @@
 """The steps of a bench session with real or emulated devices.
 
-Each step returns its findings, its measured values and the changes of the configuration that follow. The
+Each step returns its findings, its measured values and the resulting changes of the configuration. The
 coils are driven only in the steps `coils` and `power`, one at a time.
 """
 
@@ -57,7 +57,7 @@ def step_find(session: Session) -> Outcome:
 
 
 def expectation(config: Config) -> UnitExpectation:
-    """Return the rate and the noise that the inertial unit should have, by data sheet and configuration."""
+    """Return the expected sample rate and noise of the inertial unit, from data sheet and configuration."""
     unit = config.inertial_unit
     if getattr(unit, "driver", "vn100") != "vn100":
         return UnitExpectation(unit.rate_hz, max(unit.rate_noise, 1e-3), 1e-6, 0.05)
@@ -66,7 +66,7 @@ def expectation(config: Config) -> UnitExpectation:
 
 
 def step_rest(session: Session) -> Outcome:
-    """Measure rate, noise and mean values of the inertial unit at rest."""
+    """Measure sample rate, noise and mean values of the inertial unit at rest."""
     unit: InertialUnit = session.device("inertial_unit")
     session.ask("Let the body stand still, with its z axis up, away from iron.")
     expected, before, begun_ns = expectation(session.config), unit.link(), session.rig.clock.now_ns()
@@ -104,7 +104,7 @@ def step_rest(session: Session) -> Outcome:
 
 
 def step_axes(session: Session) -> Outcome:
-    """Measure the axes of gyro, accelerometer and magnetometer by a turn about each body axis."""
+    """Measure the axes of gyro, accelerometer and magnetometer by rotations by hand about each body axis."""
     gyro, before, after = np.zeros((3, 3)), np.zeros((3, 2, 3)), np.zeros((3, 2, 3))
     seconds = 8.0
     for index, name in enumerate("xyz"):
@@ -133,7 +133,7 @@ def step_axes(session: Session) -> Outcome:
 
 
 def _mounting(config: Config, axes: FloatArray | None, findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return the mounting that explains the measured axes, if all sensors of the unit are rotated alike."""
+    """Return the mounting that explains the measured axes, if all sensors of the unit are rotated equally."""
     rotated = any(one.part == "inertial_unit" and one.kind == "rotated" for one in findings)
     if axes is None or not rotated:
         return {}
@@ -147,7 +147,7 @@ def step_coils(session: Session) -> Outcome:
     session.device("inertial_unit")
     section, axes = session.config.coils, session.known.get("axes", Outcome()).values.get("axes", {})
     monitor: PowerMonitor | None = None
-    with suppress(StepSkipped):  # without a monitor the coils are compared by their fields alone
+    with suppress(StepSkipped):  # without a current monitor, only the fields of the coils are compared
         monitor = session.device("power_monitor")
     session.ask("Let the body stand still, and keep iron and magnets away. The coils are driven now.")
     reach = section.supply_voltage / np.array(section.resistance)
@@ -174,7 +174,8 @@ def step_coils(session: Session) -> Outcome:
     if monitor is not None and math.isnan(test.idle):
         problem = monitor.error() or "no conversion arrives"
         found.findings.append(Finding("power_monitor", "no reading", problem, "check its supply and wiring"))
-    if any(one.kind == "current while off" for one in found.findings):  # a braked bridge drives no current
+    # Braking a bridge stops the current that flows while the coils are off.
+    if any(one.kind == "current while off" for one in found.findings):
         coils.brake(frozenset(range(len(section.windings))))
     values = {
         "commanded": commanded.tolist(),
@@ -206,7 +207,7 @@ def _drive(
     fault = ""
 
     def measured(command: FloatArray) -> tuple[FloatArray, float]:
-        """Return the fields (k, 3) and the mean supply current while `command` is repeated."""
+        """Return the fields (k, 3), T, and the mean supply current, A, while `command` is repeated."""
         drawn: dict[int, float] = {}
 
         def repeat() -> None:
@@ -269,7 +270,8 @@ def _voltage(monitor: PowerMonitor | None) -> float:
 def _coil_changes(config: Config, found: CoilsFound, clipped: bool, *, axes_known: bool) -> dict[str, Any]:
     """Return the changes of windings and shunt that the findings about single coils imply.
 
-    A measured field is the direction of a coil's axis only if it is expected along this axis (`axes_known`).
+    If `axes_known` is false, the field at the magnetometer is not along the coil's axis and does not change
+    it.
     """
     kinds = {(one.part, one.kind): one for one in found.findings}
     windings = [

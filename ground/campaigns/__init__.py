@@ -1,4 +1,4 @@
-"""Resumable Monte Carlo campaigns: many flights with drawn values, on all cores or on a cluster."""
+"""Resumable Monte Carlo campaigns: many flights with random values, on all cores or on a cluster."""
 
 from knightcube.errors import FlightError
 

@@ -1,9 +1,9 @@
 """Campaigns on a Dask cluster whose machines have the dependencies, but not the packages of this project.
 
 A plugin sends the project's packages to every worker, also to workers that join later. A case is sent as the
-name of its function and as data. This module itself is pickled by value, so that scheduler and workers can
-read it without the packages. The top level of this module must therefore import neither the packages nor
-Dask.
+name of the function that runs it, with the case's data. This module itself is pickled by value, so that
+scheduler and workers can read it without the packages. The top level of this module must therefore import
+neither the packages nor Dask.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class ShippedCode:
         os.environ["KNIGHTCUBE_CODE"] = self.version
 
     def teardown(self, worker: Any) -> None:
-        """Do nothing: the worker itself deletes its folder with the unpacked packages."""
+        """Do nothing, because the worker itself deletes its folder with the unpacked packages."""
 
 
 def carry_out(version: str, module: str, function: str, case: dict[str, Any]) -> Any:
@@ -83,7 +83,7 @@ def archive_of(root: Path) -> bytes:
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
         for top in FOLDERS:
-            # The folder flight/schema contains config/ as a link.
+            # The folder flight/schema contains a symbolic link to config/.
             for folder, below, files in os.walk(root / top, followlinks=True):
                 below[:] = sorted(name for name in below if name != "__pycache__")
                 for name in sorted(files):
@@ -106,7 +106,7 @@ def finished(
         address: address of the scheduler.
         run: function that runs a case.
         cases: cases to run.
-        report: function that shows a line about the cluster to the user.
+        report: function that shows the user a line of text about the cluster.
     """
     distributed, cloudpickle = map(importlib.import_module, ("distributed", "cloudpickle"))
 
@@ -140,7 +140,7 @@ def finished(
 
 
 def _client(address: str) -> Any:
-    """Return a client of a scheduler that has a worker. Raises UsageError."""
+    """Return a client of a scheduler that has at least one worker. Raises UsageError."""
     from knightcube.errors import UsageError  # noqa: PLC0415 - see the docstring of the module
 
     try:

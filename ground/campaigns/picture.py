@@ -1,4 +1,4 @@
-"""Plot of a campaign: each performance figure of the flights against each drawn value."""
+"""Plot of a campaign: each performance measure of the flights against each randomly drawn value."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _MOST = 6
 
 
 def draw_campaign(results: Sequence[Result], file: Path) -> bool:
-    """Plot the performance figures of all flights against the drawn numbers, as a PNG.
+    """Plot the performance measures of all flights against the randomly drawn numbers, as a PNG.
 
-    Returns False, without a file, if there are no figures or no drawn numbers. At most six figures are
-    plotted against six drawn numbers. Crosses mark flights beyond the limit; infinite figures are at the
-    upper edge. Raises UsageError if matplotlib is not installed or the file cannot be written.
+    Returns False and writes no file without performance measures or drawn numbers. At most six measures are
+    plotted against six drawn numbers. Crosses mark flights beyond the limit of a measure; infinite measures
+    are at the upper edge. Raises UsageError if matplotlib is not installed or the file cannot be written.
     """
     drawn = list(numbers_drawn(results).items())[:_MOST]
     figures = [one for one in figures_of(results).items() if np.any(np.isfinite(one[1][2]))][:_MOST]

@@ -1,9 +1,9 @@
 """Runner of campaigns: runs cases on all cores or on a Dask cluster, shows progress, and resumes.
 
-A campaign makes cases, each with a key and a seed of its own. The function `run` of the campaign turns a case
+A campaign consists of cases, each with its own key and seed. The function `run` of the campaign turns a case
 into a result that JSON can represent. Each result is appended to the file `results.jsonl` at once, so that
 an interrupted campaign continues with the missing cases. Results do not depend on the order of the cases or
-on the process that runs them. A lock on this file keeps a second process out of the folder.
+on the process that runs them. A lock on `results.jsonl` prevents a second process from using the folder.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _PLAIN_S = 10.0
 _WIDTH = 30
 """Width of the progress bar in characters."""
 _ATTEMPTS = 3
-"""Number of worker processes that one case may end before the campaign ends."""
+"""Number of worker processes whose death during the same case ends the campaign."""
 _STOP_S = 5.0
 """Time (s) in which interrupted worker processes must end before they are killed."""
 _SCRATCH = "knightcube-campaign-"
-"""First characters of the name of the folder that contains the temporary files of the workers."""
+"""Prefix of the name of the folder that contains the temporary files of the workers."""
 _TEMPORARY = "temporary"
-"""Name of the link to this folder in the campaign's folder."""
+"""Name of the link in the campaign's folder to the folder of temporary files."""
 
 
 class Progress:
@@ -212,7 +212,7 @@ def fly(
     label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
     with _opened(out) as sink:
         done = _resume(label, out, sink)
-        _clear(out / _TEMPORARY)  # a kill after the last result also leaves it
+        _clear(out / _TEMPORARY)  # a campaign that was killed after its last result leaves this link as well
         missing = [case for case in cases if case.key not in done]
         if missing:
             bar = Progress(len(cases), len(cases) - len(missing)) if progress else None
@@ -248,7 +248,7 @@ def fly_here(campaign: Campaign, runs: int, seed: int) -> list[Result]:
 
 
 def _selected(campaign: Campaign, runs: int, seed: int, only: str) -> list[Case]:
-    """Return the cases whose key contains the text `only`. Raises UsageError without such a case."""
+    """Return the cases whose key contains the text `only`. Raises UsageError if no key contains the text."""
     cases = [case for case in campaign.cases(runs, seed) if only in case.key]
     if only and not cases:
         raise UsageError(f"--only {only!r}: no case of {campaign.name} contains this text")
@@ -316,9 +316,9 @@ class _Worker:
 def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: Path) -> Results:
     """Run cases on the cores of this machine, and yield each result when its case ends.
 
-    If a worker process dies, another process runs its case. Raises CampaignError if a case ends three
-    processes in a row, and the exception of a case that fails. After an interruption or an error no process
-    is left.
+    If a worker process dies, another process runs its case. Raises CampaignError if three processes die while
+    they run the same case, and passes on the exception of a case that fails. All processes have ended when
+    the function returns or raises.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -332,7 +332,8 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
                 for worker in crew:
                     if worker.case is None and waiting:
                         worker.case = waiting.popleft()
-                        with suppress(OSError):  # the process has died, which its end of the pipe shows
+                        # If the process has died, reading from its pipe shows this below.
+                        with suppress(OSError):
                             worker.pipe.send(worker.case)
                 busy = {worker.pipe: (worker, worker.case) for worker in crew if worker.case is not None}
                 for pipe in connection.wait(list(busy)):
@@ -364,7 +365,7 @@ def _worker(campaign: Campaign, scratch: str) -> _Worker:
     pipe, end = context.Pipe()
     process = context.Process(target=_serve, args=(end, campaign.run, os.getpid(), scratch))
     process.start()
-    end.close()  # so that the pipe ends with the process
+    end.close()  # if this end stayed open, the pipe would outlive the worker process
     return _Worker(process, pipe)
 
 
@@ -401,8 +402,9 @@ def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) 
 def _scratch(out: Path) -> Iterator[str]:
     """Yield a folder for temporary files of the workers, and delete the folder at the end.
 
-    A symbolic link in the campaign's folder points to it. After a kill, the next start deletes the folder by
-    this link. The folder itself has a short path, because paths of sockets are limited to 107 characters.
+    A symbolic link in the campaign's folder points to the temporary folder. If the campaign is killed, its
+    next start deletes the temporary folder through this link. The temporary folder has a short path, because
+    paths of sockets are limited to 107 characters.
     """
     link = out / _TEMPORARY
     folder = tempfile.mkdtemp(prefix=_SCRATCH)

@@ -1,4 +1,4 @@
-"""Campaign of flights of one configuration whose values are drawn from stated distributions."""
+"""Campaign of flights whose configuration values are drawn at random from given distributions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ from knightcube.errors import FlightError, UsageError
 from sim_hal.settings import Simulation
 
 _DRAWS = 100
-"""Maximum number of draws per case, because drawn configurations may be invalid (impossible inertia)."""
+"""Maximum number of draws per case.
+
+A draw is repeated if its configuration is invalid (impossible inertia).
+"""
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _FORMS = (
     "KEY=10% (uniform, relative), KEY=+-0.5 (uniform), KEY=normal 10% or KEY=normal 0.5 (standard "
@@ -103,10 +106,10 @@ def configuration_value(text: str) -> Any:
 def varied_campaign(path: Path, variations: Sequence[Variation], duration: float | None) -> Campaign:
     """Return the campaign that flies a simulated configuration with drawn values.
 
-    The result of a flight contains the drawn values, and the figures for which the report states a limit:
-    from the section `requirements` for a satellite, or from the thesis for a testbed. Case k does not depend
-    on the number of runs. Raises UsageError for a key or a distribution that the configuration does not
-    allow.
+    The result of a flight contains the drawn values, and the performance measures with a limit. The limits
+    are those of the section `requirements` for a satellite, and those of the thesis for a testbed. Case k
+    does not depend on the number of runs. Raises UsageError for a key or a distribution that the
+    configuration does not allow.
 
     Args:
         path: file of the configuration.
@@ -169,7 +172,8 @@ def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, 
         holder = _below(holder, step, one, steps[: depth + 1])
     last = steps[-1]
     if isinstance(holder, dict) and last not in holder and not one.relative:
-        return [(holder, last, one.key)]  # the drawn number replaces a default
+        # The drawn number replaces a default value that the configuration does not state.
+        return [(holder, last, one.key)]
     found = _below(holder, last, one, steps)
     if not one.relative and not isinstance(found, list):
         return [(holder, last, one.key)]
@@ -215,7 +219,7 @@ def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) 
 
 
 def fly_case(case: Case) -> Result:
-    """Fly a case in lock-step, and return its drawn values and the judged figures of its report."""
+    """Fly a case in lock-step, and return its drawn values and the performance measures with a limit."""
     given = case.parameters
     found: Result = {
         "key": case.key,
@@ -247,12 +251,12 @@ def fly_case(case: Case) -> Result:
 
 
 def _within(result: Result) -> bool:
-    """Return whether a flight ended without an error and met every judged limit."""
+    """Return whether a flight ended without an error and satisfied every limit."""
     return not result["error"] and all(row["verdict"] != "miss" for row in result["judged"])
 
 
 def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[float]]]:
-    """Return limit, unit and the worst value of each flight (NaN if unknown), for each judged quantity."""
+    """Return limit, unit and worst value per flight (NaN if unknown) of each quantity with a limit."""
     found: dict[str, tuple[float, str, list[float]]] = {}
     for number, result in enumerate(results):
         for row in result["judged"]:
@@ -307,7 +311,7 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
-    """Return median, 95 % quantile and maximum of the finite values, each None without finite values."""
+    """Return median, 95 % quantile and maximum of the finite values, or None for all three without any."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return dict.fromkeys(("median", "95 %", "maximum"))
@@ -319,7 +323,7 @@ def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
 
 
 def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
-    """Return the key of the drawn number that correlates most with a figure, and the rank correlation."""
+    """Return the key of the drawn number that correlates most with a measure, and the rank correlation."""
     known = np.isfinite(values)
     ranks = np.argsort(np.argsort(np.array(values)[known]))
     best = ("", 0.0)

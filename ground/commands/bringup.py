@@ -74,7 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Do the steps, print and keep their results. The exit status is 1 if a fault is found."""
+    """Execute the steps, print their results, and store them. The exit status is 1 if a fault is found."""
     text, config = requested_config(RunRequest(options.config, Path()))
     check_values(config)
     emulated = options.wired is not None or config.simulation is not None
@@ -85,7 +85,8 @@ def run(options: argparse.Namespace) -> int:
     kept = {} if options.again else _kept(options.out / REPORT, key)
     say = _silent if options.json else sys.stdout.write
     wanted = options.only or [name for name in steps_of(config) if name not in kept]
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends with the coils at zero
+    # Ctrl-C raises KeyboardInterrupt, so that the coils are set to zero before the end.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with _opened(options, text, config, emulated, say) as session:
             session.known |= kept
@@ -128,7 +129,7 @@ def _silent(_: str) -> int:
 def _opened(
     options: argparse.Namespace, text: str, config: Config, emulated: bool, say: Callable[[str], Any]
 ) -> Iterator[Session]:
-    """Open the rig, real or emulated, and close it with the coils at zero. Raises DeviceError."""
+    """Open the real or emulated devices, and close them with the coils at zero. Raises DeviceError."""
 
     def ask(request: str) -> None:
         if emulated or options.yes:
@@ -153,7 +154,8 @@ def _opened(
             bench = emulated_bench(wired, wired_text, wired_config)
             session = Session(config, bench.rig, stack, ask, bench)
         else:
-            rig = linux_rig(config, stack, patient=True)  # a missing chip is a finding, not the end
+            # A missing chip is reported as a finding and does not end the session.
+            rig = linux_rig(config, stack, patient=True)
             guardian = start_guardian(rig, stack)
             if guardian is not None:
                 guardian.wait_ready(patient=True)
@@ -168,7 +170,7 @@ def _opened(
 
 
 def _coil_field(path: Path, text: str, config: Config) -> Any:
-    """Return the field of each coil (n, 3), T/A, that the configuration describes, or None."""
+    """Return the field of each coil (n, 3), T/A, from the configuration, or None if it is not configured."""
     rows = None
     if config.simulation is not None:
         from sim_hal.rig import SimulationRequest  # noqa: PLC0415 - loads the simulator
@@ -224,7 +226,7 @@ def _keep(options: argparse.Namespace, key: str, known: Mapping[str, Outcome], n
         stored = {}
     stored = {step: one for step, one in stored.items() if step in known and one.get("config") == key}
     if "skipped" in outcome.values:
-        stored.pop(name, None)  # a later session tries the step again
+        stored.pop(name, None)  # the step is not stored, so a later session tries it again
     else:
         stored[name] = {"config": key, "done": now, **_facts(outcome)}
     _write(folder / REPORT, json.dumps({"config": str(options.config), "steps": stored}, indent=1) + "\n")

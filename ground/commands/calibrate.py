@@ -50,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Calibrate, print and write the camera. The exit status is 1 if the pictures do not suffice."""
+    """Calibrate, print and write the camera. The exit status is 1 if the pictures are insufficient."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)
@@ -179,7 +179,7 @@ def _omitted(name: str, term: OmittedTerm) -> str:
 
 
 def _field_of_view(lens: DeterminedLens) -> float:
-    """Return the field of view across the columns without the distortion, deg."""
+    """Return the horizontal field of view (deg) of the lens without its distortion."""
     found = lens.calibration.lens
     return 2.0 * math.degrees(math.atan(0.5 * found.columns / found.focal_length))
 

@@ -30,7 +30,7 @@ from knightcube.vision.camera.images import write_picture
 _POLL_NS = 5_000_000
 _PATIENCE_NS = 10_000_000_000
 _MAX_ROTATION = 0.5
-"""Largest rotation (rad) in one exposure, beyond which streaks leave any field of view."""
+"""Largest rotation (rad) in one exposure; longer streaks would leave any field of view."""
 _MAX_EXPOSURES = 8
 """Maximum time to wait for a frame, in exposure times (a free-running camera finishes other frames first)."""
 
@@ -161,7 +161,10 @@ def _truth(frame: Frame, lone: OpenCamera, rate: FloatArray) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class OpenCamera:
-    """An open camera with clock and configuration. A simulated camera has an attitude (4,) by time (ns)."""
+    """An open camera with clock and configuration.
+
+    For a simulated camera, `attitude` returns the attitude (4,) at a time (ns).
+    """
 
     clock: Clock
     frames: FrameSource
@@ -171,10 +174,10 @@ class OpenCamera:
 
 @contextmanager
 def opened_camera(config_path: Path, rate: FloatArray | None = None) -> Iterator[OpenCamera]:
-    """Open only the camera of a configuration, simulated if it has a section `simulation`.
+    """Open only the camera of a configuration, which is simulated if the section `simulation` exists.
 
     A simulated camera rotates at `rate` (3,), rad/s, in camera axes. Raises ConfigError if the configuration
-    has no camera, UsageError for a real camera with a rate, and DeviceError.
+    has no camera, UsageError if a rate is given for a real camera, and DeviceError.
     """
     text, config = requested_config(RunRequest(config_path, Path()))
     if config.camera is None:

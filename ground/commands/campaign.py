@@ -1,4 +1,4 @@
-"""Command `knightcube campaign`: many flights of a configuration with drawn values."""
+"""Command `knightcube campaign`: many flights of a configuration with randomly drawn values."""
 
 from __future__ import annotations
 

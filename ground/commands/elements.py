@@ -32,13 +32,13 @@ from sim_hal.settings import OrbitSection, Simulation
 from sim_hal.worlds.orbit import elements, julian_date, propagate
 
 _SPAN, _STEP = 86_400.0, 600.0
-"""Span and interval (s) of the positions to which the elements of an orbit are fitted."""
+"""Duration and sampling interval (s) of the positions to which the elements of an orbit are fitted."""
 _LISTED = 5
 """Maximum number of satellites that a message lists."""
 _ECCENTRICITY = OrbitSection().eccentricity
 """Default eccentricity of an orbit."""
 _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
-"""Required columns of a CSV file of fixes, and its optional columns of the velocity."""
+"""Required columns of a CSV file of fixes, and its optional velocity columns."""
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")
 
 

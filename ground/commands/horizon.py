@@ -120,7 +120,7 @@ def run(options: argparse.Namespace) -> int:
     if options.fov_error is None:
         solution = find_nadir(pixels, camera, knowledge, settings, hidden)
     else:
-        # The focal length changes by df / f = -d(fov) / sin(fov).
+        # The relative uncertainty of the focal length is df / f = d(fov) / sin(fov).
         sigma = math.radians(options.fov_error) / math.sin(math.radians(options.fov))
         solution = nadir_of_uncertain_field(pixels, camera, sigma, knowledge, settings, hidden)
     if options.json:
@@ -135,7 +135,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _mask(options: argparse.Namespace, pixels: Image) -> BoolArray | None:
-    """Return the mask of the structure in the picture, or None without one."""
+    """Return the mask of the spacecraft structure in the picture, or None if no mask is given."""
     if options.mask is None:
         return None
     hidden = read_image(options.mask) > 0
@@ -199,7 +199,8 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
     for nadir in solution.candidates if solution.nadir is None else (solution.nadir,):
         values = _nadir_facts(nadir, altitude_fitted)
         x, y, z = nadir.direction
-        # The uncertainty across the arc from the boresight to nadir differs from that along the arc.
+        # The uncertainty of nadir perpendicular to the arc from boresight to nadir differs from that along
+        # the arc.
         sigmas = np.degrees(np.sqrt(np.linalg.eigvalsh(nadir.tangent_covariance)))
         lines += [
             f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",
@@ -254,14 +255,14 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PaperNadir:
-    """Nadir (3,) in camera axes by a method of Meller et al., and the limb circle of the first picture."""
+    """Nadir (3,) in camera axes by a method of Meller et al., and the limb circle in the first picture."""
 
     nadir: FloatArray
     seen: ScannedHorizon
 
 
 def _check_method(options: argparse.Namespace) -> None:
-    """Raise UsageError for options that the chosen method does not have."""
+    """Raise UsageError for options that do not belong to the chosen method."""
     error = options.fov_error
     if error is not None and (options.fov is None or options.method != "default"):
         raise UsageError(f"--fov-error {error:g}: only with --fov and --method default")
@@ -341,7 +342,7 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
 def _graphic(
     turned: float, camera: CameraModel, first: ScannedHorizon, second: ScannedHorizon, altitude: float
 ) -> FloatArray:
-    """Return nadir (3,) in axes of the first camera, whose boresight is body x and whose y axis is body z."""
+    """Return nadir (3,) in the axes of the first camera by the graphic method."""
     angle, axis = math.radians(turned), camera.ideal.centre
     cameras = (
         LevelCamera(np.array([0.0, 1.0]), axis),

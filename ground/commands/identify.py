@@ -1,8 +1,8 @@
 """Command `knightcube identify`, which estimates the constants of a body from a flight.
 
-For the testbed, the command flies pulses of a coil and fits the constants of the plant. The filter of a
-satellite learns inertia, coils and sensors in every flight. For a satellite, the command therefore only reads
-the folder of a run.
+For the testbed, the command flies pulses of a coil and fits the constants of the plant. The attitude filter
+of a satellite estimates the constants of inertia, coils and sensors in every flight, so for a satellite the
+command only reads the folder of a run.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly unless the user gives a run, fit the constants, and print and write the results."""
+    """Fly unless the user gives the folder of a run, fit the constants, and print and write the results."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     folder = Path(options.source)
@@ -148,7 +148,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show_learned(options: argparse.Namespace, folder: Path, config: OrbitConfig) -> int:
-    """Print and write what a satellite has learned in a run."""
+    """Print and write the constants that a satellite has estimated in a run."""
     if options.picture is not None:
         raise UsageError("--picture: draws the fit of a testbed flight only")
     found = learned_description(read_run(folder), config)
@@ -184,7 +184,7 @@ def _quantity_facts(one: LearnedQuantity) -> dict[str, Any]:
 
 
 def _table(found: LearnedDescription, folder: Path) -> str:
-    """Return the learned values as a table."""
+    """Return the estimated values as a table."""
     lines = [
         f"flight: {folder}, learned up to {found.time:.0f} s",
         "",
@@ -201,7 +201,7 @@ def _table(found: LearnedDescription, folder: Path) -> str:
 
 
 def _fly(options: argparse.Namespace) -> Path:
-    """Fly the excitation and return the folder of the run."""
+    """Run a flight with the excitation, and return its folder."""
     if isinstance(configuration.load(options.source), OrbitConfig):
         raise UsageError(
             f"{options.source}: a satellite is identified from a run: fly it with `knightcube run`, "

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from ground.passes import OrbitPrediction, Station
 
 _ASK_S = 0.2
-"""Interval (s) between two questions whether Yamcs runs."""
+"""Interval (s) between two requests for the state of Yamcs."""
 _START_S = 60.0
 """Longest time (s) to wait for the link, and for the flight."""
 _RUNS, _FLIGHT = "runs", "the flight"
@@ -125,7 +125,8 @@ def run(options: argparse.Namespace) -> int:
 
         replay: Replay | None = None
         if _started(options.port, folder, forecast, ended):
-            if packets is not None:  # packets before Yamcs's archive runs would be lost
+            # The replay begins now, because packets before the start of Yamcs's archive would be lost.
+            if packets is not None:
                 replay = Replay(packets, folder, options.speed, time.monotonic())
             sys.stdout.write(
                 f"Yamcs on http://127.0.0.1:{options.port}/, user {USER}, password in {folder / USERS}, "
@@ -143,7 +144,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess.Popen[bytes]]:
-    """Start link and flight of a configuration in real time. Return their processes, which `stack` ends."""
+    """Start link and flight of a configuration in real time. Return their processes; `stack` ends them."""
     runs = folder / _RUNS
     runs.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "flight"]
@@ -160,7 +161,7 @@ def _flown(config: Path, folder: Path, stack: ExitStack) -> dict[str, subprocess
 def _first_packets(
     folder: Path, earlier: Sequence[Path], running: Mapping[str, subprocess.Popen[bytes]]
 ) -> list[bytes]:
-    """Wait for the first packets of the flight and return them. Raises FlightError if there are none."""
+    """Wait for the first packets of the flight and return them. Raises FlightError if no packets arrive."""
     until = time.monotonic() + _START_S
     while time.monotonic() < until and running[_FLIGHT].poll() is None:
         new = [run for run in find_runs(folder / _RUNS) if run not in earlier]
@@ -171,7 +172,7 @@ def _first_packets(
 
 
 def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Popen[bytes]:
-    """Start a process that writes to a new log, and return the process, which `stack` ends."""
+    """Start a process that writes to a new log file, and return it; `stack` ends the process."""
     file = stack.enter_context(log.open("w", encoding="utf-8"))
     process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     stack.callback(_end, process)
@@ -179,12 +180,15 @@ def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Pope
 
 
 def _failed(process: subprocess.Popen[bytes]) -> bool:
-    """Return whether a process has ended with an error; a flight ends without one after its duration."""
+    """Return whether a process has ended with an error.
+
+    The end of a flight after its duration is no error.
+    """
     return process.poll() not in (None, 0)
 
 
 def _packets(run: Path) -> list[bytes]:
-    """Return the packets of the flight log in a run's folder, in their order. Raises UsageError."""
+    """Return the packets of the flight log in a run's folder, in recorded order. Raises UsageError."""
     segments = find_segments(run, "flight")
     if not segments:
         raise UsageError(f"{run}: no flight log (flight-0001{SUFFIX}) in this folder")
@@ -193,7 +197,7 @@ def _packets(run: Path) -> list[bytes]:
 
 
 def _mission_zero(packets: Sequence[bytes]) -> datetime | None:
-    """Return the UTC of mission time zero that the packets state at last, or None if no packet states it."""
+    """Return the UTC of mission time zero from the last packet that states it, or None if none does."""
     rows = decode(b"".join(packets))[RUN.name]
     if not len(rows) or not rows[-1]["utc_ns"]:
         return None
@@ -201,31 +205,32 @@ def _mission_zero(packets: Sequence[bytes]) -> datetime | None:
 
 
 class Replay:
-    """Replay of recorded packets: the files of packets from which the data link `recorded` reads.
+    """Replay of recorded packets as files, which the Yamcs data link `recorded` reads.
 
-    Yamcs reads and deletes a file as soon as it appears. A file is therefore complete when it appears, and
-    the next file follows after its deletion, so that the order of the packets remains.
+    Yamcs reads and deletes a file as soon as it appears. A file is therefore written under another name and
+    then renamed, and the next file follows after its deletion, so that Yamcs reads the packets in order.
     """
 
     def __init__(self, packets: Sequence[bytes], folder: Path, speed: float | None, begun: float) -> None:
         """Begin a replay.
 
         Args:
-            packets: recorded packets in their order.
+            packets: recorded packets in the order of the log.
             folder: folder of Yamcs's configuration.
-            speed: mission time per time of the machine; None replays all packets at once.
-            begun: time of the machine, s.
+            speed: ratio of mission time to the time of this computer; None replays all packets at once.
+            begun: monotonic time (s) of this computer at the start of the replay.
         """
         self._folder, self._speed, self._begun = folder, speed, begun
         end = HEADER_BYTES + SECONDARY_BYTES
         times = [int.from_bytes(packet[end - 8 : end], "big", signed=True) for packet in packets]
-        self._times = list(accumulate(times, max))  # a late packet does not wait
+        # A packet with an earlier time than its predecessor is due with the predecessor.
+        self._times = list(accumulate(times, max))
         self._packets = packets
         self._sent = 0
         self._files = 0
 
     def turn(self, now: float) -> None:
-        """Write the packets that are due at `now`, the time of the machine (s), as a file."""
+        """Write the packets that are due at the monotonic time `now` (s) into a file."""
         due = len(self._packets)
         if self._speed is not None and self._times:
             due = bisect_right(self._times, self._times[0] + 1e9 * self._speed * (now - self._begun))
@@ -248,7 +253,10 @@ def _address(config: Path, section: Link | None) -> str:
 
 
 def _gateway(options: argparse.Namespace, stack: ExitStack) -> Gateway:
-    """Return a gateway to the satellite, which `stack` closes. Its token is in a file beside the keys."""
+    """Return a gateway to the satellite, which `stack` closes.
+
+    The token of the gateway is in a file beside the keys.
+    """
     token = new_token()
     terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
     gateway = Gateway(terminal, "127.0.0.1:0", token, _complain)
@@ -286,7 +294,7 @@ def _started(port: int, folder: Path, forecast: _Forecast | None, ended: Callabl
 def _runs(session: Session) -> bool:
     try:
         return bool(session.ask(f"/instances/{INSTANCE}")["state"] == "RUNNING")
-    except (OSError, ValueError):  # a ValueError is an answer that is not JSON
+    except (OSError, ValueError):  # ValueError: the answer is not JSON
         return False
 
 

@@ -131,7 +131,7 @@ class Answers:
     """The values of the satellite's description, and the texts that the user entered for them."""
 
     def __init__(self, out: Path | None, force: bool) -> None:
-        """Set the file to write, if given, and with `force` the permission to replace an existing file."""
+        """Set the file to write, if given, and allow replacing an existing file if `force` is true."""
         self._out, self._force = out, force
         self._texts: dict[str, list[str]] = {}
         self.values: dict[str, Any] = {}
@@ -150,7 +150,7 @@ class Answers:
         return [f"--{one.name}" for one in QUESTIONS if one.default is None and one.name not in self.values]
 
     def take_defaults(self) -> None:
-        """Take the default of each value that the user has not given.
+        """Set each value that the user has not given to its default.
 
         Raises UsageError if a default contradicts a given value.
         """
@@ -169,7 +169,7 @@ class Answers:
         return path
 
     def command(self) -> str:
-        """Return the command with the values that are known so far."""
+        """Return the command line with the values that are known so far."""
         words = [PROGRAM, "new-satellite"]
         for name, texts in self._texts.items():
             for text in texts:
@@ -281,7 +281,7 @@ def _check(text: str, path: Path) -> None:
         config = configuration.parse(text, str(path))
         check_settings(config)
         check_simulated_elements(RunRequest(path, Path()), text, config)
-    except ConfigError as error:  # the line number is left out, because the file does not exist yet
+    except ConfigError as error:  # the message omits the line number, because the file does not exist yet
         raise UsageError(f"nothing was written: {error.problem}") from error
 
 

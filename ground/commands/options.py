@@ -42,7 +42,7 @@ def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> Non
 
 
 def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:
-    """Add the arguments of the output, and the function that runs the command."""
+    """Add the arguments that describe the output, and set the function that runs the command."""
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw the result on the picture")
     parser.set_defaults(command=run)
@@ -93,7 +93,7 @@ def count(text: str) -> int:
 
 
 def finite(text: str) -> float:
-    """Return a finite number from an argument's text.
+    """Return the finite number in an argument.
 
     Raises ArgumentTypeError unless the number is finite.
     """

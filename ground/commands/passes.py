@@ -1,4 +1,4 @@
-"""Commands `knightcube passes` and `knightcube day`: when a ground station sees the satellite."""
+"""Commands `knightcube passes` and `knightcube day`: predicted passes over ground stations."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from ground.passes import OrbitPrediction, Pass, Station
 
 _LONGEST_DAYS = 30.0
-"""Longest span, days: elements of an older epoch do not predict times to a useful accuracy."""
+"""Longest span (days) of a prediction, because older elements do not give times of useful accuracy."""
 _UNCERTAIN_S = 10.0
 """Standard deviation of the predicted times (s) above which a warning is printed."""
 _LEAD_S = 120.0
-"""Default time (s) between the command to point to the station and the rise, for the slew."""
+"""Default time (s) for the slew, from the command to point to the station until the rise."""
 
 
 def configure_passes(parser: argparse.ArgumentParser) -> None:
@@ -120,7 +120,7 @@ def run_passes(options: argparse.Namespace) -> int:
 
 
 def run_day(options: argparse.Namespace) -> int:
-    """Draw the day and print the name of the picture."""
+    """Plot the passes of a day, and print the name of the picture."""
     from ground.report import draw_day  # noqa: PLC0415
 
     prediction, stations, config = predicted(options)

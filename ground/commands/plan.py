@@ -1,4 +1,4 @@
-"""Command `knightcube plan`, which plans one slew of the testbed, or with --orbit a slew in three axes."""
+"""Command `knightcube plan`, which plans a slew of the testbed or, with --orbit, of a satellite."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from knightcube.gnc.guidance.three_axes.slew_plan import STRETCH, OrderedSlew, S
 
 BODIES: tuple[Literal["sun", "earth", "moon"], ...] = ("sun", "earth", "moon")
 _OFF_UNIT = 0.1
-"""Largest deviation from 1 of the norm of a typed quaternion, which is then normalised."""
+"""Largest deviation from 1 of the norm of a given quaternion, which the command normalises."""
 _DEFAULT_CONFIG = "step_demo"
 _TESTBED_ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")
 """Options that only testbed slews have."""
@@ -337,7 +337,8 @@ def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, 
         "peak_of_limit": plan.peak,
         "dipole_limit_A_m2": made.task.craft.limit.tolist(),
         "turn_deg": math.degrees(float(angle_between(path.quaternion[0], path.quaternion[-1]))),
-        # The path's quaternion is continuous, so its scalar part changes sign after half a revolution.
+        # The quaternion of the path is continuous, so its scalar part changes sign after a rotation by 180
+        # deg.
         "way_round": "short" if around[3] >= 0.0 else "long",
         "way_deg": math.degrees(float(np.trapezoid(speed, path.times))),
         "peak_rate_deg_s": math.degrees(float(speed.max())),

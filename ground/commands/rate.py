@@ -112,7 +112,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 
 
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
-    """Return the fit settings from the options, or else from the configuration, or else the defaults."""
+    """Return the fit settings from the options, if not given from the configuration, or else the defaults."""
     settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
     if options.line_time is not None and not math.isfinite(options.line_time):
         raise UsageError(f"--line-time {options.line_time}: must be finite")
@@ -179,7 +179,7 @@ def _facts(found: FrameMotion, objects: tuple[SpaceObject, ...], method: str) ->
 
 
 def _reason(found: FrameMotion) -> str:
-    """Return a line about why the picture gives no rate, or an empty text."""
+    """Return a line that states why the picture gives no rate, or an empty text."""
     if found.rate is not None:
         return ""
     detailed = found.reason if isinstance(found, MotionResult) else ""

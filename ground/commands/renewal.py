@@ -211,7 +211,7 @@ def _command(options: argparse.Namespace) -> int:
         sys.stdout.flush()
 
     def has_begun(reports: list[Report]) -> bool:
-        """Return whether the link and then the privileged part have reported a start: the trial runs."""
+        """Return whether both the link and the privileged part have reported that the trial started."""
         return options.what == "activate" and [one.stage for one in reports].count(Stage.STARTED) == 2
 
     builds = options.what == "activate" and options.kind == "release"
@@ -262,7 +262,7 @@ def _two_lines(data: bytes, path: Path) -> bytes:
 
 
 def _release_version(kind: str, source: Path) -> int:
-    """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError for another kind."""
+    """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError without a version."""
     if kind != "release":
         raise UsageError(f"{kind}: give its version with --version N")
     text = read_text(source / "pyproject.toml")
