@@ -118,7 +118,7 @@ def _packet(layout: Layout) -> dict[str, Any]:
 
 
 def _details(field: Field) -> dict[str, Any]:
-    """Return the optional properties of a field: states, bits, limits, and the wrap of a counter."""
+    """Return the optional properties of a field: states, bits, limits, and the largest value of a counter."""
     limits = field.limits
     details: dict[str, Any] = {
         "states": [list(state) for state in field.states],
@@ -133,7 +133,7 @@ def _details(field: Field) -> dict[str, Any]:
 
 
 def meaning_of(field: Field) -> str:
-    """Return a text about a field: its meaning, states or bits, ranges and counter wrap."""
+    """Return a text about a field: its meaning, states or bits, ranges, and the limit of a counter."""
     parts = [field.meaning] if field.meaning else []
     levels = {number: f" ({level})" for number, level in field.alarms}
     for word, labels in (("", field.states), ("bits: ", field.bits)):

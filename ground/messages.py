@@ -2,7 +2,8 @@
 
 Tracking Data Messages (503.0-B-2), Orbit Parameter and Ephemeris Messages (502.0-B-3), and Attitude Ephemeris
 Messages (504.0-B-1) are in keyword = value notation, or in XML (505.0-B).
-Initial orbits are determined from the sightings and the satellite's positions in the `track` packets.
+The initial orbits of tracked objects are determined from the sightings and the satellite's positions in the
+`track` packets.
 """
 
 from __future__ import annotations
@@ -39,11 +40,11 @@ def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path
     """Write the measured tracks of a run to the file `path`, and return the written files.
 
     If the satellite's own orbit was known, the file with the suffix `.oem` beside `path` has the positions of
-    the camera at the sightings, as an Orbit Ephemeris Message. Each object has one segment, with right
-    ascension and declination measured in each frame, in ICRS at mid-exposure. The aberration of the camera is
-    corrected, and the light time is not corrected. Standard deviations are written as comments, because the
-    message format has no keyword for them. MAG is the mean magnitude of the last sightings. Raises UsageError
-    if no object was tracked or `path` cannot be written.
+    the camera at the sightings, as an Orbit Ephemeris Message. Each object has one segment, which contains
+    the measured right ascension and declination (ICRS) at mid-exposure of each frame. Stellar aberration due
+    to the camera's velocity is corrected, light time is not. Standard deviations are written as comments,
+    because the message format has no keyword for them. The keyword MAG gives the mean magnitude of the last
+    sightings. Raises UsageError if no object was tracked or `path` cannot be written.
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
@@ -57,7 +58,7 @@ def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path
     _, first = np.unique(measured["middle_ns"], return_index=True)
     placed = measured[first]
     placed = placed[np.isfinite(np.hstack([placed["place"], placed["velocity"]])).all(axis=1)]
-    if len(placed) < 2:  # one state is not an ephemeris
+    if len(placed) < 2:  # an ephemeris needs at least two states
         return [path]
     observer = path.with_suffix(".oem")
     _write(observer, _ephemeris(placed, start_ns), as_xml)
@@ -158,7 +159,7 @@ def xml_of(lines: list[str]) -> str:
     kind = name.split("_")[1].lower()  # tdm, oem, opm or aem
     root = ET.Element(kind, id=name, version=version)
     place, body = ET.SubElement(root, "header"), ET.SubElement(root, "body")
-    segment = data = root  # until the first segment begins
+    segment = data = root  # placeholder until the first segment begins
     for line in filter(None, lines[1:]):
         key, value = _keyword(line)
         if line == "META_START" or (kind == "opm" and key == "OBJECT_NAME"):
@@ -309,7 +310,7 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
     span = float(times[-1] - times[0]) if len(times) else 0.0
     found = ObjectOrbit(number, len(seen), span, None, None, "")
     if seen["relative"].any():
-        # All directions then share the error of the estimated attitude, which an orbit cannot be fitted to.
+        # Without identified stars, all directions share the error of the attitude, so no orbit is fitted.
         return replace(found, reason="the directions were measured without identified stars")
     placed = seen[np.isfinite(seen["place"]).all(axis=1)]
     if len(placed) < MINIMUM_SIGHTINGS:

@@ -28,13 +28,13 @@ from knightcube.errors import UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 _SEARCH_S = 3600.0
-"""Time (s) by which the search extends beyond the span, so that a pass at its edge is complete."""
+"""Time (s) by which the search extends beyond the span, so that passes at its ends are found completely."""
 _STEP_S = 10.0
 """Interval (s) between computed positions; begin and end of an eclipse are interpolated."""
 _SPEED = 7.6e3
 """Typical speed (m/s) in a low orbit, which converts an along-track error to a timing error."""
 LEAD_S = 120.0
-"""Default time (s) between the command to point to the station and the rise, for the slew."""
+"""Default time (s) for the slew, from the command to point to the station until the rise."""
 _RISE, _CULMINATION, _SET = range(3)
 """Codes of the events of `EarthSatellite.find_events`."""
 
@@ -175,7 +175,7 @@ class OrbitPrediction:
 
     @property
     def timing_error_s(self) -> float:
-        """Standard deviation (s) of predicted times at the end of the span, due to the elements' age."""
+        """Standard deviation (s) of predicted times at the end of the span due to the age of the elements."""
         return self._elements.at(julian_date(self.end)).sigma / _SPEED
 
     def passes(self, stations: Sequence[Station]) -> list[Pass]:

@@ -1,4 +1,4 @@
-"""Drawing of results on pictures: streaks and objects, a plate solution, and the Earth's limb.
+"""Functions that draw results on pictures: streaks and objects, a plate solution, and the Earth's limb.
 
 Constellation lines are not drawn, because no table with a clear licence was found.
 """
@@ -99,9 +99,9 @@ def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> P
     """Return `picture` (rows, columns, 3) with the plate solution drawn on it.
 
     Points matched to guide stars have orange rings, and other points have blue rings. Wider green rings mark
-    the expected positions of guide stars as bright as those of the solution. Star names, or the HIP numbers
-    of the brightest stars, are yellow. The vermillion compass has a long arrow to the north and a short arrow
-    to the east. Raises UsageError if Pillow is not installed.
+    the expected positions of all guide stars that are as bright as the matched stars. Star names, or the HIP
+    numbers of the brightest stars, are yellow. The vermillion compass has a long arrow to the north and a
+    short arrow to the east. Raises UsageError if Pillow is not installed.
     """
     drawn = picture.copy()
     scale = max(1.0, max(picture.shape) / 1024.0)
@@ -193,7 +193,8 @@ def draw_horizon(
 ) -> npt.NDArray[np.uint8]:
     """Return `picture` (rows, columns, 3) with the horizon drawn on it.
 
-    The fitted limb is a line. Edges on the limb have orange rings, and other edges have blue rings.
+    The fitted limb is a line. Edge points on the limb have orange rings, and other edge points have blue
+    rings.
     """
     drawn = picture.copy()
     if solution.view is not None:
@@ -209,7 +210,7 @@ def draw_horizon(
 def draw_circle(
     picture: npt.NDArray[np.uint8], seen: ScannedHorizon, camera: CameraModel
 ) -> npt.NDArray[np.uint8]:
-    """Return `picture` (rows, columns, 3) with the circle fit of Meller et al. and its edges in orange."""
+    """Return `picture` (rows, columns, 3) with the circle fit of Meller et al. and its edge points."""
     drawn = picture.copy()
     angle = np.arange(8 * (camera.columns + camera.rows)) * (0.25 * np.pi / (camera.columns + camera.rows))
     ring = seen.circle.centre + seen.circle.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)

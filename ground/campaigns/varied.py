@@ -210,7 +210,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) -> dict[str, Any]:
-    """Replace the configured numbers of a variation by drawn numbers, and return these by full key."""
+    """Replace the configured numbers of a variation by drawn numbers, and return the latter by full key."""
     drawn = {}
     for holder, at, key in _numbers_at(values, one):
         held = holder[at] if isinstance(holder, list) or at in holder else math.nan

@@ -182,7 +182,7 @@ def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Pope
 def _failed(process: subprocess.Popen[bytes]) -> bool:
     """Return whether a process has ended with an error.
 
-    The end of a flight after its duration is no error.
+    A flight ends without an error after its duration.
     """
     return process.poll() not in (None, 0)
 

@@ -58,7 +58,7 @@ def run_report(options: argparse.Namespace) -> int:
     try:
         paths = reporting.draw(run, options.figures or options.run / "figures")
     except UsageError as error:
-        # The numbers have been printed, so missing figures are not a failure of the report.
+        # The numbers have been printed, so without the option --figures missing figures are not an error.
         sys.stderr.write(f"knightcube: {error}\n")
         return 0 if options.figures is None else 2
     if not options.json:
@@ -67,7 +67,7 @@ def run_report(options: argparse.Namespace) -> int:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    """Print two runs side by side, and draw them if a folder is given."""
+    """Print the results of two runs side by side, and draw both runs if a folder is given."""
     runs = [read_run(folder) for folder in (options.run, options.other)]
     compared = compare(*(reporting.summarise(run) for run in runs))
     text = json.dumps(compared, allow_nan=False) + "\n" if options.json else format_comparison(compared)

@@ -1,4 +1,4 @@
-"""Commands to a flight: `knightcube command`, `knightcube parameters` and `knightcube files`."""
+"""Commands that control a flight: `knightcube command`, `knightcube parameters` and `knightcube files`."""
 
 from __future__ import annotations
 
@@ -106,11 +106,11 @@ _RATE = 20_000.0
 _SILENCE_S = 60.0
 """Default time (s) without a packet after which a file command fails."""
 _TURN_S = 0.01
-"""Time (s) to wait for packets before the due protocol data units of file transfers are sent."""
+"""Time (s) for which received packets are awaited before the due protocol data units are sent."""
 _SHOW_S = 1.0
 """Time (s) between two lines of progress."""
 _LINGER_S = 0.5
-"""Time (s) after a transfer in which the other end may request a repetition of the last answer."""
+"""Time (s) after a transfer in which the satellite may request a repetition of the last answer."""
 
 
 def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:
@@ -177,9 +177,9 @@ def _add_commands(words: _Words, packets: Sequence[Packet] = COMMANDS) -> None:
 
 
 def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
-    """Return the options, with the scheduled command as one line and the options after its words.
+    """Return the options, including those after the scheduled command, which becomes one line of text.
 
-    A table of parameters is longer than a scheduled command can be.
+    A table of parameters cannot be scheduled, because it is too long for a scheduled command.
 
     Raises UsageError for values that the command forbids; wrong words end the program with status 2.
     """
@@ -276,7 +276,10 @@ def _command_by_link(options: argparse.Namespace) -> int:
 
 
 def packet_of(options: argparse.Namespace) -> bytes:
-    """Return the packet of the typed command; the time in the packet makes it unique. Raises UsageError."""
+    """Return the packet of the command that the user typed; the time in the packet makes it unique.
+
+    Raises UsageError.
+    """
     try:
         match options.what:
             case "play":
@@ -530,7 +533,7 @@ _LOCAL = {
     "put": "`files put` sends a local file",
     "use": "`files use` needs the local copy of the file on board, whose SHA-256 it sends",
 }
-"""Reason by the file command for which the command needs a local file."""
+"""Reasons why file commands need a local file, by the name of the command."""
 
 
 def run_files(options: argparse.Namespace) -> int:
@@ -614,7 +617,7 @@ class _FileWork:
             for report in self._session.reports():
                 if problem := failed([report]):
                     raise FlightError(problem)
-                # The satellite completes a transfer when the ground has the file.
+                # The satellite reports a transfer as completed after the ground has received the file.
                 completed |= report.stage is Stage.COMPLETED
             for progress in self._new_endings(name):
                 self._check(progress)
@@ -656,7 +659,10 @@ class _FileWork:
         return found
 
     def _turn(self, name: str) -> None:
-        """Transfer for a moment. Raises FlightError after a signal or a long silence; data is kept."""
+        """Transfer for a moment.
+
+        Raises FlightError after a signal or a long silence; received data is kept.
+        """
         if select.select([self._terminal], [], [], _TURN_S)[0]:
             self._session.take(self._terminal.take(), time.monotonic_ns())
         now_ns = time.monotonic_ns()
@@ -669,7 +675,7 @@ class _FileWork:
         if name and now_ns * 1e-9 - self._shown_s >= _SHOW_S:
             self._shown_s = now_ns * 1e-9
             for one in self._session.entity.transfers():
-                if one.name not in {"", name}:  # an earlier transfer that continues
+                if one.name not in {"", name}:  # an earlier transfer that continues is not shown
                     continue
                 part = f"{one.done} of {one.size} bytes" if one.size else "started"
                 sys.stderr.write(f"knightcube: {shown(one.name or name)}: {part}\n")

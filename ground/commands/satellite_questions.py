@@ -31,8 +31,8 @@ _FORMS = {
 }
 """Sizes of CubeSats, m; all but the 1U have their longest side along x.
 
-The CubeSat Design Specification, Rev. 14.1, gives the sizes of 1U, 1.5U, 2U, 3U, 6U and 12U. A 4U, 8U or
-16U is a stack with 113.5 mm per unit along x. A 27U is as long as a 12U, with 126.3 mm more per unit across.
+The CubeSat Design Specification, Rev. 14.1, gives the sizes of 1U, 1.5U, 2U, 3U, 6U and 12U. A 4U, 8U or 16U
+is a stack of units of 113.5 mm along x. A 27U is as long as a 12U and 126.3 mm wider along y and z.
 """
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _DENSITIES = (20.0, 20_000.0)
@@ -56,13 +56,13 @@ _COIL_RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A value of the description, which is an option of the command and a question on a terminal.
+    """A value of the satellite's description, given as an option or as the answer to a question.
 
     Attributes:
         name: name of the option without dashes.
-        metavar: unit or form of the value, as the help shows it.
+        metavar: unit or form of the value in the help text.
         text: the question, with the unit.
-        read: function that returns the value of a text; it raises ValueError with the permitted values.
+        read: function that converts a text to the value; it raises ValueError with the permitted values.
         default: text of the default value, or None for a value that must be given.
     """
 
@@ -89,7 +89,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
 
 
 def _coil_number(key: str, text: str) -> float:
-    """Return the number of a text that describes a coil. Raises ValueError with the permitted range."""
+    """Return a number that describes a coil from its text. Raises ValueError with the permitted range."""
     try:
         return number(*_COIL_RANGES[key])(text)
     except ValueError as error:
@@ -159,7 +159,7 @@ def _read_size(text: str) -> Vector:
 
 @dataclass(frozen=True, slots=True)
 class Apsides:
-    """An elliptical orbit by its lowest and highest altitude.
+    """An elliptical orbit given by its lowest and highest altitude.
 
     Attributes:
         altitude: semi-major axis minus the Earth's radius, km.
@@ -268,7 +268,7 @@ def read_value(name: str, text: str) -> Any:
 
 
 def check_values(name: str, values: Values) -> None:
-    """Check the value of the question `name` against the values that are known so far.
+    """Check the value of the question `name` for consistency with the values that are known so far.
 
     Raises UsageError if the values contradict each other.
     """
@@ -297,7 +297,7 @@ def _density_problem(mass: float, size: Vector) -> str:
 
 
 def _perigee_problem(altitude: float, eccentricity: float) -> str:
-    """Return why an orbit of an altitude (km) and eccentricity is too low, with the cure."""
+    """Return a text that states why an orbit is too low, with the cure, or an empty text."""
     axis = 1e-3 * EARTH_RADIUS + altitude
     perigee = axis * (1.0 - eccentricity) - 1e-3 * EARTH_RADIUS
     if perigee >= _LOWEST_PERIGEE:

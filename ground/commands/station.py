@@ -144,10 +144,10 @@ def run_watch(options: argparse.Namespace) -> int:
 
 
 def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: str) -> int:
-    """Show the flight whose packets come from `tail`.
+    """Show the flight whose packets the source `tail` delivers.
 
-    `wait` is the longest time (s) to wait for a first complete state, and `where` ends the message that no
-    more packets arrive.
+    `wait` is the longest time (s) to wait for a first complete state, and `where` is the end of the message
+    that is shown if no packets arrive.
     """
     state = FlightState()
     if options.json or options.once:
@@ -155,7 +155,7 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
         until = time.monotonic() + wait
         while not {"attitude", "health"} <= state.newest.keys() and time.monotonic() < until:
             state.update(tail.new())
-        # A link sends packets of its own, which do not show that a flight is in progress.
+        # The link process also sends packets of its own, which do not show that a flight is in progress.
         if not state.newest or (options.link is not None and not state.mode):
             sys.stderr.write(f"knightcube: no state of the flight in {wait:g} s {where}\n")
             return 1
@@ -350,7 +350,10 @@ def _print(text: str) -> None:
 
 
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
-    """Return the console that the options describe. Its resources are closed by `stack`."""
+    """Return the console that the options describe.
+
+    The exit stack `stack` closes the resources of the console.
+    """
     from ground.console.commanding import CommandForms, LinkFeed, by_socket, flying  # noqa: PLC0415
     from ground.console.files import LinkFiles, RunFiles  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
@@ -392,7 +395,10 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
 
 
 def _stations(options: argparse.Namespace) -> tuple[str, ...]:
-    """Return the ground stations of the options as texts. Raises UsageError for an invalid station."""
+    """Return the ground stations that the options describe, as texts.
+
+    Raises UsageError for an invalid station.
+    """
     if not options.station and options.stations is None:
         return ()
     from ground.passes import read_stations, station_of  # noqa: PLC0415 - Skyfield is large
@@ -409,7 +415,7 @@ def _listening(port: int) -> socket.socket:
     line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         line.bind(("127.0.0.1", port))
-        line.listen()  # before the address is printed
+        line.listen()  # the socket listens before the address is printed
     except OSError as error:
         line.close()
         raise UsageError(f"--port {port}: {error.strerror or error}; give another, or 0 for any") from error

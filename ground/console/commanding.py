@@ -58,9 +58,9 @@ FlightError."""
 _TIMEOUT_S = 3.0
 """Longest time (s) to wait for an answer from a socket."""
 _LISTEN_S = 0.02
-"""Longest time (s) of one read of a link."""
+"""Longest time (s) for which one read of a link waits."""
 _PING_AFTER_S = 2.0
-"""Time without telemetry (s) before a ping, because the link forgets a UDP sender after a minute."""
+"""Time (s) without telemetry after which a ping is sent, because the link forgets silent UDP senders."""
 _ANSWER_S = 5.0
 """Longest time (s) to wait for the report on a command over the link."""
 _KEPT_REPORTS = 64
@@ -89,9 +89,10 @@ class CommandForms:
     """Sender of commands, which packs the values of the page's forms into command packets."""
 
     def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = LAYOUTS) -> None:
-        """Accept the commands of `layouts`; without `send` the console is read-only.
+        """Accept the commands of `layouts`; the console is read-only if `send` is None.
 
-        The attribute `body` is the kind of body, whose commands alone are accepted, or None if unknown.
+        The attribute `body` is the kind of body, or None if unknown. Only commands for this kind are
+        accepted.
         """
         self._send = send
         self._layouts = layouts
@@ -112,7 +113,10 @@ class CommandForms:
         return _text_of(self._pack(name, given))
 
     def obey(self, name: str, given: Object) -> Object:
-        """Send a command and return the answer. Raises FlightError, UsageError for invalid values."""
+        """Send a command and return the answer.
+
+        Raises UsageError for invalid values, and FlightError if no answer arrives.
+        """
         if self._send is None:
             raise UsageError("this console is read-only: start it with --to or --link to send commands")
         return self._send(self._pack(name, given))
@@ -126,7 +130,7 @@ class CommandForms:
         if unknown:
             raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
         if name == LOAD_PARAMETERS.name and not given.get("crc"):
-            # The operator does not have to compute the CRC of the parameters.
+            # The CRC of the parameters is computed here unless the operator has entered it.
             parameters = [float(_value(name, field, given.get(field.name))) for field in PARAMETERS]
             given = {**given, "crc": crc_of(parameters)}
         fields = {field.name: _value(name, field, given.get(field.name)) for field in packet.fields}
@@ -139,7 +143,7 @@ class CommandForms:
         return data
 
     def _check(self, name: str, fields: Object) -> None:
-        """Raise UsageError or CommandError for values that this body or the satellite's schedule refuses."""
+        """Raise UsageError or CommandError for values that the body or the command schedule refuses."""
         if name == MODE.name and (mode := Mode(fields["mode"])) in foreign_modes(self.body):
             raise UsageError(f"mode {mode.label}: this body has no such mode")
         if name == CLEAR.name and fields["event"] not in {kind.name for kind in EVENTS}:
@@ -162,7 +166,7 @@ def _text_of(data: bytes) -> str:
 
 
 def _value(name: str, field: Field, given: Any) -> Any:
-    """Return a field's value. An empty number is NaN in a field that can hold NaN. Raises UsageError."""
+    """Return a field's value. An empty input is NaN in a field that can hold NaN. Raises UsageError."""
     if field.count > 1 and isinstance(given, str):
         return _bytes(name, field, given)
     if field.count > 1:
@@ -198,8 +202,8 @@ def _number(name: str, field: Field, given: Any) -> float | int:
 class LinkFeed:
     """Live telemetry and commands over a link. One thread calls `new`, and other threads may call `send`.
 
-    Playback is not shown, because its packets are older than the live packets. The attribute `lock` protects
-    the terminal and an open file session.
+    Packets of playback are not shown, because they are older than the live packets. The attribute `lock`
+    protects the terminal and an open file session.
     """
 
     def __init__(self, terminal: Terminal) -> None:
@@ -249,7 +253,7 @@ class LinkFeed:
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
             if reports and reports[-1].stage is not Stage.ACCEPTED:
-                # The lines of a list arrive as reports after the report of acceptance.
+                # The lines of a list command arrive as reports after the report of acceptance.
                 listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
                 text = "; ".join(explained(report) for report in listed)
                 return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
@@ -258,7 +262,10 @@ class LinkFeed:
 
     @contextlib.contextmanager
     def transferring(self, store: Store, rate: float) -> Iterator[FileSession]:
-        """Yield a session of file transfers; `new` passes it the received packets. Raises FlightError."""
+        """Yield a session of file transfers, to which `new` passes the received packets.
+
+        Raises FlightError.
+        """
         with self.lock:
             session = FileSession(self._terminal, store, _SPI, rate, time.monotonic_ns())
             self._session = session
@@ -276,7 +283,7 @@ class LinkFeed:
 
 @contextlib.contextmanager
 def flying(config: Path, out: Path) -> Iterator[str]:
-    """Fly a simulated configuration into `out` in real time and yield the flight's command socket.
+    """Fly a simulated configuration in real time with logs in `out`, and yield the command socket.
 
     The flight ends when the context is left. Raises FlightError if the flight does not start.
     """

@@ -1,4 +1,4 @@
-"""Descriptions of commands, fields and events for the console's page, beyond the tables of packets."""
+"""Descriptions of commands, fields and events for the console's page that complete the packet tables."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from knightcube.gnc.guidance.three_axes.pointing_target import ARGUMENTS, NUMBER
 
 Object = dict[str, Any]
 Body = Literal["testbed", "orbit"]
-"""Kind of body that flies: a body on a thread, or a satellite in orbit."""
+"""Kind of the controlled body: a body on a thread (testbed), or a satellite in orbit."""
 _FOREIGN = {"testbed": (POINT.name, ORBITAL), "orbit": (SLEW.name, TESTBED)}
-"""Command and modes that a kind of body refuses."""
+"""Command and modes that each kind of body refuses."""
 _TENSOR = re.compile(r"(?:[xyz]{2} ){5}[xyz]{2}")
-"""Pattern of the components of a symmetric matrix in the meaning of a field."""
+"""Pattern of the component names of a symmetric matrix in the description of a field."""
 _COMPONENTS = {3: list("xyz"), 4: list("xyzw"), 9: [a + b for a in "xyz" for b in "xyz"]}
 """Names of the components of an array by its length."""
 _LIMITED_BY: Mapping[str, tuple[tuple[str, str, str], ...]] = {
@@ -32,7 +32,7 @@ _LIMITED_BY: Mapping[str, tuple[tuple[str, str, str], ...]] = {
     "health.disk_free": (("health_disk_free", "below", "warning"),),
     "health.temperature": (("health_temperature", "above", "warning"), ("health_hottest", "above", "fault")),
 }
-"""Parameters in use that limit a field of telemetry, each with the forbidden side and the level."""
+"""Limits of telemetry fields: parameter that holds the limit, side (above or below), and severity."""
 _OWN_FORM = frozenset({LOAD_PARAMETERS.name, DUMP_PARAMETERS.name})
 
 
@@ -43,7 +43,7 @@ def layouts_for(body: Body | None, layouts: Mapping[str, Layout]) -> dict[str, L
 
 
 def foreign_modes(body: Body | None) -> frozenset[Mode]:
-    """Return the modes that a kind of body does not have, none if the body is not known."""
+    """Return the modes that a kind of body does not have; the set is empty if the body is not known."""
     return _FOREIGN[body][1] if body is not None else frozenset()
 
 
@@ -145,7 +145,7 @@ def add_components(packets: list[Object]) -> list[Object]:
 
 
 def endings() -> dict[str, list[str]]:
-    """Return, for each event that ends a fact, the events with which such a fact begins."""
+    """Return, for each event that ends a condition, the events that begin this condition."""
     found: dict[str, list[str]] = {}
     for fact in FACTS:
         if fact.ends is not None and fact.begins.name not in found.setdefault(fact.ends.name, []):

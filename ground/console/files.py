@@ -1,4 +1,4 @@
-"""Files of the satellite for the console: of a run's folder, or over a link by CFDP."""
+"""Files of the satellite for the console, from the folder of a run or by CFDP over a link."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _SILENCE_S = 30.0
 """Time (s) without telemetry after which a transfer fails. The received data is kept."""
 _POLL_S = 0.05
 _LINGER_S = 0.5
-"""Time (s) after a transfer during which the satellite may request the last answer again."""
+"""Time (s) after a transfer during which the satellite may request a repetition of the last answer."""
 _MOST_FILES = 2000
 """Largest number of files in the list of a run's folder."""
 
 
 class Files(Protocol):
-    """Files of a satellite, which the page lists and gets."""
+    """Protocol for the files of a satellite, which the page lists and fetches."""
 
     puts: bool
 

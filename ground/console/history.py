@@ -1,7 +1,7 @@
 """History of a flight for the console: all packets by time, and the state at a chosen time.
 
-A flight of hours at 40 Hz does not fit into the memory of a ground computer. The packets are therefore stored
-in a temporary folder, and only their times (8 bytes each) are in memory.
+The packets of hours of flight at 40 Hz do not fit into the memory of a ground computer. The packets are
+therefore stored in a temporary folder, and only their times (8 bytes each) are in memory.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 LISTED = ("event", "command", "verification", "streak", "stars", "sightings")
-"""Packet types that the page lists one by one; of other types the page shows only the newest packet."""
+"""Packet types that the page lists one by one; of all other types the page shows only the newest packet."""
 MAX_SPEED = 1000.0
 """Highest speed of a replay, as multiple of real time."""
 MAX_TIME = 1e9
-"""Latest mission time (s) that a reader can ask for, 30 years."""
+"""Latest mission time (s) that a reader can request: 30 years."""
 _MAX_LISTED = 500
 _FIRST_CAPACITY = 1024
 
@@ -65,11 +65,11 @@ class History:
         return int(first), int(last)
 
     def count(self, name: str, until_ns: int) -> int:
-        """Return the number of packets of a name up to a time."""
+        """Return the number of packets with a given name up to a time."""
         return int(np.searchsorted(self._tracks[name].times, until_ns, side="right"))
 
     def rows(self, name: str, first: int, stop: int) -> PacketArray:
-        """Return the packets `first` to `stop` of a name, counted from 0 in order of arrival."""
+        """Return the packets of a name with indices from `first` to `stop` - 1, in order of arrival."""
         return self._tracks[name].rows(first, stop)
 
     def series(
@@ -100,7 +100,7 @@ class History:
 
 
 class _Track:
-    """Packets of one name, with their bytes in a file and their times in memory."""
+    """Packets with the same name, whose bytes are in a file and whose times are in memory."""
 
     def __init__(self, layout: Layout, folder: Path) -> None:
         self._layout = layout
@@ -110,7 +110,7 @@ class _Track:
 
     @property
     def times(self) -> npt.NDArray[np.int64]:
-        """Times (ns), which never decrease, because a search needs ordered times even for a damaged log."""
+        """Times (ns), sorted even for a damaged log, because the search needs increasing times."""
         return self._kept[: self._count]
 
     def append(self, rows: PacketArray) -> None:
@@ -137,11 +137,11 @@ class _Track:
 
 @dataclass(slots=True)
 class PageCursor:
-    """Time that one reader of the page has chosen, either the newest time or that of a replay.
+    """Time that a browser window shows: the newest time, or the time of a replay.
 
     Attributes:
         live: whether the newest packet is shown.
-        speed: mission time per real time, 0 while the replay is paused.
+        speed: ratio of mission time to real time in a replay, 0 while the replay is paused.
     """
 
     live: bool = True
@@ -150,9 +150,9 @@ class PageCursor:
     _since: float = 0.0
 
     def obey(self, text: str, now: float) -> bool:
-        """Process a message {"live": true} or {"at": s, "speed": x} and return whether the time jumped.
+        """Process a message {"live": true} or {"at": s, "speed": x} and return whether the shown time jumped.
 
-        `now` is the reader's clock, s. Other messages are ignored.
+        `now` is the monotonic time, s. Other messages are ignored.
         """
         try:
             message = json.loads(text)

@@ -1,10 +1,10 @@
 """Web server of the console, with telemetry of one flight and commands from forms, on loopback only.
 
-Only the browser that opened an address with a token may use the console. A token is valid for one browser.
-The first request with a token gets a cookie, and the token is replaced. An address that another user of the
-machine finds later, for example in the list of processes, is therefore useless. The headers Host and Origin
-are also checked, because DNS rebinding and pages of another origin could reach the console through the
-operator's own browser.
+Only a browser that opened an address with a token may use the console. Each token is valid for one browser:
+the first request with a token receives a cookie, and the token is replaced. An address with a used token,
+which another user of the machine may find in the list of processes, is therefore useless. The headers Host
+and Origin are also checked, because DNS rebinding and pages of another origin could reach the console through
+the operator's own browser.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ _MAX_PATH = 200
 _RANDOM_BYTES = 32
 _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
-"""Packet types of the link process, which are received even if the flight process is silent."""
+"""Packet types that the link process sends, even if the flight process is silent."""
 _BODY_OF: dict[str, Body] = {CONTROL.name: "testbed", NAVIGATION.name: "orbit", SPIN.name: "orbit"}
-"""Packet types that only one kind of body sends."""
+"""Kind of body by the packet types that only this kind sends."""
 _MOST_UPLOAD = 1 << 24
-"""Largest size (bytes) of a file that the page puts on the satellite."""
+"""Largest size (bytes) of a file that the page uploads to the satellite."""
 _MOST_STATIONS = 20
 _MOST_DAYS = 7.0
 _T = TypeVar("_T")
@@ -94,8 +94,8 @@ class Console:
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: camera frames that the flight has kept.
         trouble: reason why the last read failed, or an empty text.
-        files: files of the satellite, or None if they are not known.
-        stations: ground stations of the panel of passes, before the operator enters others.
+        files: files of the satellite, or None if the files are not accessible.
+        stations: ground stations in the panel of passes until the operator enters other stations.
         settled_ns: newest time (ns) of which all packets have been received, which the live page shows.
         sockets: open WebSockets.
     """
@@ -116,7 +116,7 @@ class Console:
 
     @property
     def body(self) -> Body | None:
-        """Kind of body, from the configuration or else from the packets; None while unknown."""
+        """Kind of body from the configuration, or else from the packets; None while unknown."""
         if self.surroundings.body is not None:
             return self.surroundings.body
         for name, body in _BODY_OF.items():
@@ -134,7 +134,8 @@ class Console:
         self.trouble = ""
         newest_ns = self.history.span_ns[1]
         self.history.append(packets)
-        # Packets of one time may arrive in two reads, so the page shows only times up to the previous read.
+        # Packets with equal times may arrive in two reads, so the page shows only times up to the previous
+        # read.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
@@ -145,7 +146,7 @@ class Console:
 
 
 class Access:
-    """Token of the next browser and cookies of the sessions."""
+    """Access control: token for the next browser, and cookies of the sessions."""
 
     def __init__(self, announce: Callable[[str], object]) -> None:
         """Make a token. The function `announce` receives each token that replaces a used token."""
@@ -275,7 +276,7 @@ class _Pages:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        # Pictures are made in one thread, because each thread keeps the memory of its largest picture.
+        # Pictures are drawn in one thread, because every thread would keep the memory of its largest picture.
         self._drawing = ThreadPoolExecutor(1)
 
     async def index(self, _: web.Request) -> web.StreamResponse:
@@ -305,9 +306,9 @@ class _Pages:
         )
 
     async def series(self, request: web.Request) -> web.StreamResponse:
-        """Answer the query ?packet=&field=&component=&from=&to= (s) &points= with a field over time.
+        """Answer the query ?packet=&field=&component=&from=&to= (s) &points= with a field's values over time.
 
-        With points=0 the answer has every value in the span, up to a million.
+        With points=0 the answer contains every value in the time span, up to a million values.
         """
         name, column = request.query.get("packet", ""), request.query.get("field", "")
         if name not in LAYOUTS or column not in (LAYOUTS[name].dtype.names or ()):
@@ -377,7 +378,7 @@ class _Pages:
         return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
     async def put(self, request: web.Request) -> web.StreamResponse:
-        """Put the body of the request on the satellite, as the file ?kind=&name=."""
+        """Upload the body of the request to the satellite, as the file ?kind=&name=."""
         kind, name = request.query.get("kind", ""), request.query.get("name", "")
         data = await request.read()
         return web.json_response(await asyncio.to_thread(self._files.put, kind, name, data))
@@ -393,7 +394,7 @@ class _Pages:
         name, given = await _command_of(request)
         try:
             return web.json_response({"words": self._console.forms.text(name, given)})
-        except UsageError as error:  # a usual answer while a form is being filled
+        except UsageError as error:  # usual while the operator fills in a form
             return web.json_response({"error": str(error)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:
@@ -402,7 +403,7 @@ class _Pages:
         return web.json_response(await asyncio.to_thread(self._console.forms.obey, name, given))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
-        """Push the flight's state at the time that the reader has chosen."""
+        """Send the flight's state at the chosen time over a WebSocket, repeatedly."""
         line = web.WebSocketResponse(heartbeat=10.0, max_msg_size=4096)
         await line.prepare(request)
         self._console.sockets.add(line)
@@ -448,7 +449,7 @@ class _Pages:
 
 
 def _predicted(lines: tuple[str, str], begin: datetime, days: float, stations: list[str]) -> dict[str, Any]:
-    """Return the passes over stations, each with its scheduled commands: UTC, words to send, text to read."""
+    """Return the passes over stations, each with its scheduled commands: UTC, command words, description."""
     from ground.passes import OrbitPrediction, facts_of, scheduled_targets, station_of  # noqa: PLC0415 - large
 
     prediction = OrbitPrediction(lines, begin, days)

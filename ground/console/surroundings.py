@@ -24,11 +24,11 @@ from knightcube.vision.camera.images import facts_of
 
 Object = dict[str, Any]
 _TRACK_STEP, _TRACK_HALF = 60.0, 5700.0
-"""Step (s) of the ground track, and the time (s) before and after the present that the track covers."""
+"""Step (s) of the ground track, and the duration (s) that the track covers before and after the present."""
 _MAX_SIDE = 640
-"""Largest side of a picture on the page (px)."""
+"""Maximum width and height (px) of a picture on the page."""
 _DARK, _BRIGHT = 50.0, 99.9
-"""Percentiles of the pixels that are shown as black and white."""
+"""Percentiles of the pixel values that are shown as black (first) and as white (second)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,8 @@ class FlightSurroundings:
         coil_dipole: largest dipole moment along a body axis, A m^2.
         body: kind of body, or None if the configuration cannot be read.
         resistance: resistance of each coil, ohm.
-        currents: currents (n, 3), A, per dipole moment along each body axis, A m^2, of a satellite with three
-            coils.
+        currents: coil currents per dipole moment along each body axis (n, 3), A/(A m^2), of a satellite with
+            three coils.
     """
 
     elements: TwoLineElements | None
@@ -75,7 +75,7 @@ class FlightSurroundings:
         return cls(elements, view, dipole, body, config.coils.resistance, currents, lines)
 
     def at(self, utc_ns: int) -> Object | None:
-        """Return position, ICRS directions (3,), and the ground points (deg) below satellite and Sun."""
+        """Return satellite position, ICRS directions (3,), and the points (deg) below satellite and Sun."""
         state = self._state(_julian_date(utc_ns))
         if state is None:
             return None

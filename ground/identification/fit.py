@@ -1,18 +1,18 @@
 """Maximum-likelihood fit of the motion's constants and the noise levels to a record, by Gauss-Newton steps.
 
 The equation of motion, divided by the inertia, is theta'' = g I cos(theta) - kappa theta - delta theta' + d
-(Sease 2013, eq. 5.4, with the thread). Each change of the current I is delayed by tau. The angle theta and
-the biased rate theta' + b are measured. The actual current differs from the commanded current, so an active
-coil adds process noise. The predictor is therefore the extended Kalman filter of angle and rate
-(prediction-error method: Ljung 1999, System Identification, sections 7.2 and 10.2). An output-error fit would
-treat the accumulated process noise as signal. Between events the state is propagated by a Taylor series whose
-error is a ten-thousandth of the noise. The derivatives by the constants treat the filter gains as constant,
-which keeps the expected gradient at zero.
+(Sease 2013, eq. 5.4, with the thread). Each change of the current I takes effect after the delay tau. The
+measured quantities are the angle theta and the biased rate theta' + b. The actual current differs from the
+commanded current, so an active coil adds process noise. The predictor is therefore the extended Kalman filter
+of angle and rate (prediction-error method: Ljung 1999, System Identification, sections 7.2 and 10.2). An
+output-error fit would treat the accumulated process noise as signal. Between events the state is propagated
+by a Taylor series whose error is a ten-thousandth of the noise. The derivatives with respect to the constants
+treat the filter gains as fixed, so that the expected gradient at the true constants is zero.
 
 Constants and noise levels are estimated alternately, because the information matrix has no terms between
 them. The constants are estimated from the whitened innovations, and the noise levels by Fisher scoring. The
-priors are wide and matter only for records that do not determine a value. The prior of the delay is about 20
-ms, and the prior noise levels are uncertain by a factor of 3. Events that no noise explains, such as the
+priors are wide and affect only values that the record does not determine. The prior of the delay is about 20
+ms, and the prior noise levels are uncertain by a factor of 3. Events that noise cannot explain, such as the
 release, a jolt or an outlier, restart the filter.
 
 The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978). If
@@ -36,16 +36,16 @@ from knightcube.astro.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class MotionConstants:
-    """Constants of the motion, which are divided by the inertia.
+    """Constants of the equation of motion, divided by the inertia.
 
     Attributes:
         gain: torque per current and inertia, g = n A B / J, rad/s^2/A.
         torsion: thread stiffness per inertia, kappa = k / J, 1/s^2.
-        damping: damping per inertia, delta = c / J, 1/s.
+        damping: damping coefficient per inertia, delta = c / J, 1/s.
         disturbance: constant angular acceleration d, rad/s^2, including kappa theta_0 for the thread's rest
             angle theta_0.
         bias: gyro bias b, rad/s.
-        delay: delay tau from the cycle that wrote a current to the current's effect, s.
+        delay: delay tau, s, from the control cycle that wrote a current until the current flows.
     """
 
     gain: float
@@ -56,7 +56,7 @@ class MotionConstants:
     delay: float = 0.0
 
     def to_array(self) -> FloatArray:
-        """Return the constants as an array (6,) in the order of the fields."""
+        """Return the constants as an array (6,) in the order of the dataclass fields."""
         return np.array([getattr(self, name) for name in NAMES])
 
     @classmethod
@@ -70,7 +70,7 @@ UNITS = dict(zip(NAMES, ("rad/s^2/A", "1/s^2", "1/s", "rad/s^2", "rad/s", "s"), 
 _BIAS, _DELAY = NAMES.index("bias"), NAMES.index("delay")
 
 _PRIOR_SIGMA = np.array([math.inf, math.inf, math.inf, 1.0, 0.1, 0.02])
-"""Prior standard deviations of the constants around zero."""
+"""Standard deviations of the zero-mean priors of the constants, in the order of `NAMES`."""
 _NOISE_PRIOR = math.log(3.0)
 """Prior standard deviation of the logarithms of the noise levels."""
 _MAX_DELAY = 0.1
@@ -80,7 +80,7 @@ _MAX_ROUNDS = 25
 _NOISE_STEP = 0.02
 _NOISE_CONVERGED = 0.01
 _GATES = (30.0, 8.0)
-"""Outlier gates of the innovations, first in assumed and later in estimated standard deviations."""
+"""Outlier gates of the innovations: first in assumed, then in estimated standard deviations."""
 _MAX_RESTARTS = 0.02
 """Largest fraction of samples at which the filter may restart."""
 _LAGS = 20
@@ -88,7 +88,7 @@ _LAGS = 20
 _SEGMENTS = 40
 """Number of segments of the record for the sandwich estimate."""
 _MIN_PROBABILITY = 1e-3
-"""Probability below which the innovations are not white."""
+"""Probability below which the whiteness test rejects white innovations."""
 _MAX_GAIN_ERROR = 0.25
 """Largest accepted relative standard deviation of the gain."""
 
@@ -113,12 +113,13 @@ class MotionNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovations:
-    """Innovations of one pass over a record of n samples, of which the first starts the filter.
+    """Innovations of one filter pass over a record of n samples; the first sample starts the filter.
 
     Attributes:
         error: measured minus predicted angle and rate (n - 1, 2).
         covariance: covariances (n - 1, 2, 2) of the errors.
-        gradient: derivatives (n - 1, 2, 6) of the prediction by the constants, or an empty array (0, 2, 6).
+        gradient: derivatives (n - 1, 2, 6) of the predictions with respect to the constants, or an empty
+            array (0, 2, 6).
         taken: indices (n - 1,) of the samples that have an innovation.
         restarts: indices of the samples at which the filter restarted and which have no innovation.
     """
@@ -182,7 +183,7 @@ def innovations(
 
 
 class _Predictor:
-    """Extended Kalman filter of angle and rate, with the derivatives of the state by the constants."""
+    """Extended Kalman filter of angle and rate, with the state's derivatives by the fitted constants."""
 
     def __init__(
         self, constants: MotionConstants, noise: MotionNoise, period: float, with_gradient: bool
@@ -201,13 +202,13 @@ class _Predictor:
         self._by_angle, self._by_rate = np.zeros(len(NAMES)), -self._bias_row
 
     def distance(self, angle: float, rate: float) -> float:
-        """Return the larger one of the normalised innovations of angle and rate."""
+        """Return the larger of the two normalised innovations of angle and rate."""
         by_angle = (angle - self._angle) ** 2 / (self._paa + self._r_angle)
         by_rate = (rate - self._rate - self._constants.bias) ** 2 / (self._pbb + self._r_rate)
         return math.sqrt(max(by_angle, by_rate))
 
     def propagate(self, span: float, current: float, variance: float) -> None:
-        """Propagate the state by `span` s under `current` A, whose relative variance is `variance`."""
+        """Propagate the state by `span` s under a current (A) with the relative variance `variance`."""
         c, angle, rate = self._constants, self._angle, self._rate
         cosine = math.cos(angle)
         acceleration = c.gain * current * cosine - c.torsion * angle - c.damping * rate + c.disturbance
@@ -257,7 +258,7 @@ class _Predictor:
         return error, (saa, pab, pab, sbb)
 
     def note_switch(self, jump: float) -> None:
-        """Update the derivative by the delay: with a longer delay, the old current acts longer."""
+        """Update the derivative with respect to the delay, which extends the effect of the old current."""
         self._by_rate = self._by_rate.copy()
         self._by_rate[_DELAY] -= self._constants.gain * math.cos(self._angle) * jump
 
@@ -268,7 +269,7 @@ class Whiteness:
 
     Attributes:
         variance: variance of the whitened innovations.
-        probability: probability that white innovations have an equally strong correlation over 20 lags.
+        probability: probability that white innovations have at least as strong a correlation over 20 lags.
     """
 
     variance: tuple[float, float]
@@ -276,7 +277,7 @@ class Whiteness:
 
     @property
     def passed(self) -> bool:
-        """Whether the test does not reject white innovations."""
+        """Whether the test accepts the innovations as white."""
         return min(self.probability) > _MIN_PROBABILITY
 
 
@@ -311,7 +312,7 @@ def fit(record: Record, noise: MotionNoise, progress: Callable[[int, float], Non
     try:
         return _fitted(record, noise, progress)
     except (ValueError, OverflowError) as error:
-        # A diverging prediction raises an error for the cosine of infinity or an indefinite covariance.
+        # A diverging prediction leads to the cosine of infinity or to an indefinite covariance.
         raise IdentificationError("the fit of the constants failed: the prediction diverges") from error
 
 
@@ -322,7 +323,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
     for count in range(_MAX_ROUNDS):
         passed = innovations(record, constants, noise, restarts)
         step, information = _step(passed, constants)
-        # As a function of the delay, the likelihood has a kink at each sample, so reversing steps are halved.
+        # The likelihood has kinks as a function of the delay, so a step in the reverse direction is halved.
         share *= 0.5 if step @ information @ before < 0.0 and count > 3 else 1.0
         before = step
         step = share * step
@@ -351,7 +352,7 @@ def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float],
 
 
 def first_guess(record: Record) -> MotionConstants:
-    """Return gain, torsion, damping and disturbance by regression of the change of rate in each second.
+    """Return gain, torsion, damping and disturbance by regression of the rate changes over each second.
 
     The regression ignores the noise and needs no initial values.
     """
@@ -372,7 +373,7 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return `restarts` and the samples beyond the gate.
+    """Return the samples `restarts` and all samples whose innovations exceed the gate.
 
     Raises IdentificationError if there are too many restarts.
     """

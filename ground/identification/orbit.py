@@ -1,12 +1,12 @@
-"""The description of a satellite that its attitude filter has learned in flight.
+"""Description of a satellite (inertia, coils, sensors) that its attitude filter has learned in flight.
 
 Each flight packet `description` holds the estimated inertia, coils, sensors and residual dipole with their
 standard deviations. The last packet of a run is compared with the configuration of the run, and the learned
 values are written as sections of a configuration.
 
-The motion shows only the ratios of the inertia's elements to the trace, and the ratio of the coils' dipole to
-the trace. The learned inertia is therefore scaled to the configured trace, and the coils' dipole is scaled by
-the same factor.
+From the motion, the elements of the inertia and the coils' dipole can be determined only relative to the
+trace of the inertia. The learned inertia is therefore scaled to the configured trace, and the coils' dipole
+is scaled by the same factor.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ Object = dict[str, Any]
 LEARNED = 0.5
 """Maximum ratio of estimated to configured standard deviation (rms) at which a quantity counts as learned."""
 _UNIFORM = math.sqrt(3.0)
-"""Largest value of a uniformly distributed error with a standard deviation of one."""
+"""Largest error of a uniform distribution with a standard deviation of one."""
 _FRACTIONS = np.geomspace(1.0, 1e-3, 13).tolist()
-"""Fractions of the configured accuracies of the inertia that are tried, largest first."""
+"""Fractions of the configured inertia accuracies that are tried, in decreasing order."""
 _ELEMENTS = ("xx", "yy", "zz", "yz", "zx", "xy")
 _AXES = ("x", "y", "z")
 _MATRIX = tuple(a + b for a in _AXES for b in _AXES)
@@ -47,7 +47,7 @@ _MATRIX = tuple(a + b for a in _AXES for b in _AXES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedQuantity:
-    """A quantity of the description with n elements.
+    """A quantity with n elements in the description of a satellite.
 
     Attributes:
         name: name of the quantity.
@@ -74,14 +74,14 @@ class LearnedQuantity:
 
     @property
     def change(self) -> FloatArray:
-        """Changes (n,) of learned values, in estimated standard deviations, or NaN if these are unknown."""
+        """Changes (n,) of the learned values in estimated standard deviations, or NaN if these are zero."""
         known = np.where(self.claim > 0.0, self.claim, math.nan)
         return np.asarray((self.value - self.described) / known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedDescription:
-    """The learned quantities by name, and the mission time (s) of the packet that holds them.
+    """Learned quantities by name, and the mission time (s) of the packet that contains them.
 
     The learned lens `lens` is None if the star camera has not learned its lens.
     """
@@ -93,7 +93,7 @@ class LearnedDescription:
 
 
 def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
-    """Return what the satellite had learned at the end of a run.
+    """Return the description that the satellite had learned at the end of a run.
 
     Raises InputError for a run without an estimate, and for a run in which nothing was learned.
     """
@@ -211,7 +211,7 @@ def _craft(found: LearnedDescription) -> list[str]:
 
 
 def _coils(found: LearnedDescription) -> list[str]:
-    """Return the lines of the section `coils`, whose list of coils is complete."""
+    """Return the lines of the section `coils`, which lists all coils."""
     learned, coils = found.quantities["coils"], found.config.coils
     if not learned.learned:
         return []
@@ -232,16 +232,16 @@ def _coils(found: LearnedDescription) -> list[str]:
 
 
 def _largest(matrix: LearnedQuantity) -> tuple[float, float]:
-    """Return the largest errors of the elements on and off the diagonal of a learned matrix."""
+    """Return the largest errors of the diagonal and of the off-diagonal elements of a learned matrix."""
     diagonal = np.eye(3, dtype=bool).ravel()
     claims = (matrix.claim[diagonal].max(), matrix.claim[~diagonal].max())
     return _UNIFORM * float(claims[0]), _UNIFORM * float(claims[1])
 
 
 def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
-    """Return the smallest accuracies `moments` and `axes_deg` that cover the learned inertia's uncertainty.
+    """Return the smallest values of `moments` and `axes_deg` that cover the learned inertia's uncertainty.
 
-    The accuracies do not exceed those of the configuration.
+    The values do not exceed those of the configuration.
     """
     one, accuracy = found.quantities["inertia"], found.config.craft.accuracy
     inertia = tensor(one.value)
@@ -299,7 +299,7 @@ def _camera(found: LearnedDescription) -> list[str]:
         largest = min(math.degrees(_UNIFORM * one.claim.max()), camera.accuracy.mounting_deg)
         accuracies = [f"mounting_deg: {_above(largest)}"]
     if found.lens is not None:
-        # The mounting refers to the optical axis, which the learned lens displaces.
+        # The mounting refers to the optical axis, which differs between the learned and the configured lens.
         focal, (k1, k2) = found.lens["focal_length_px"][0], found.lens["distortion"]
         learned = Lens(camera.columns, camera.rows, focal, tuple(found.lens["centre_px"]), k1, k2)
         mounting = multiply(axes_turn(camera_model(camera), learned), mounting)

@@ -1,6 +1,6 @@
 """Signals of a flight log for identification: rotation about the thread and currents, without the truth log.
 
-Attitude and rate are the samples of the inertial unit at the times of its own clock, because a busy host
+Attitude and rate are samples of the inertial unit with the times of the unit's own clock, because a busy host
 timestamps some samples late. The currents are the commanded currents after limiting and quantisation. Each
 current is assumed to flow from the cycle that requested it until the next cycle. A coil driver with its own
 thread reports a current one cycle later. The field is measured while all coils are off, because an active
@@ -20,22 +20,22 @@ from knightcube.errors import FlightError, UsageError
 
 MIN_SAMPLES = 200
 MAX_STEP = 0.025
-"""Longest step (s) between two events of a timeline."""
+"""Longest time step (s) between two events of a timeline."""
 _AT_LIMIT = 0.97
 """Fraction of a coil's current limit above which the actual current may differ from the commanded current."""
 _RESOLUTION = 1.0e-4
-"""Difference (A) above which two currents are different; one count of the PWM chip is about 4e-5 A."""
+"""Difference (A) above which two currents count as different; one PWM count is about 4e-5 A."""
 _SETTLED_FIELD = 0.5
-"""Time (s) from the switching-off of the coils to the measurement of the field."""
+"""Time (s) from switching off the coils until the field is measured."""
 _MAX_GAP = 60.0
 """Longest allowed time (s) between two samples."""
 _CLIPPED_VARIANCE = 100.0
-"""Factor on the variance of a current at the coil's limit, where the mean current is unknown."""
+"""Factor by which the variance of a current is increased at the coil's limit."""
 _MAX_VALUES = {
     "imu": {"quaternion": 1.001, "rate": 50.0, "field": 0.1},
     "control": {"current_command": 10.0, "current_written": 10.0},
 }
-"""Largest values, in SI units, that a flight can record."""
+"""Largest plausible values of recorded quantities, in SI units."""
 
 
 class IdentificationError(FlightError):
@@ -61,7 +61,7 @@ class Record:
         rate: gyro reading (n,) about the thread, rad/s.
         switch_time: times (m,) from which each current flows, s.
         current: currents (m,) in the coil on body x, A.
-        clipped: whether (m,) a current is at the coil's limit and may differ from the commanded current.
+        clipped: mask (m,) of currents at the coil's limit, which may differ from the commanded current.
         period: control period, s.
         field: measured magnetic field, or None if the coils were never off.
     """
@@ -119,7 +119,7 @@ def read_record(run: Run, stale_after: float) -> Record:
 
 
 def _refuse_impossible(run: Run, label: PacketArray) -> None:
-    """Raise IdentificationError for values, including NaN, that only a damaged log contains."""
+    """Raise IdentificationError for values, including NaN, that only a damaged log can contain."""
     for packet, fields in _MAX_VALUES.items():
         for name, largest in fields.items():
             values = run[packet][name].reshape(len(run[packet]), -1)
@@ -155,7 +155,7 @@ def _currents(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return switch times, coil currents, and whether each current is at the `limit`.
 
-    A current of zero is inserted where the driver switched the coils off after stale commands.
+    A current of zero is inserted where the driver switched the coils off because of a stale command.
     """
     time = control["time_ns"] * 1e-9
     requested, written = (
@@ -177,7 +177,7 @@ def _currents(
 def _field(
     time: FloatArray, field: FloatArray, switch_time: FloatArray, current: FloatArray
 ) -> HorizontalField | None:
-    """Return the mean horizontal field over the samples with the coils off; y is along the thread."""
+    """Return the mean horizontal field (perpendicular to the thread, axis y) while the coils are off."""
     on = np.flatnonzero(current)
     since = np.full(len(switch_time), -np.inf)  # end of the last non-zero current
     if len(on):
@@ -196,13 +196,13 @@ def _field(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timeline:
-    """Events of a record in order of time: steps under a constant current that end in a sample or a switch.
+    """Time steps with a constant current, each of which ends at an event: a sample or a change of current.
 
     Attributes:
         span: time (k,) since the previous event, s.
         current: current (k,) during that time, A.
         variance: variance (k,) of the current relative to that of an active coil, zero while the coil is off.
-        sample: index (k,) of the sample at the event, -1 for none.
+        sample: index (k,) of the sample at the event, or -1 for an event without a sample.
         jump: change (k,) of the current at the event, A.
     """
 
@@ -214,9 +214,9 @@ class Timeline:
 
     @classmethod
     def of(cls, record: Record, delay: float) -> Timeline:
-        """Return the events from the first sample to the last, with each switch delayed by `delay` s.
+        """Return the events from the first to the last sample, with current changes delayed by `delay` s.
 
-        The current before the first switch is zero. Long intervals between samples are divided.
+        The current before the first switch is zero. Intervals longer than `MAX_STEP` are divided.
         """
         switch = record.switch_time + delay
         inside = (switch > record.time[0]) & (switch < record.time[-1])
@@ -231,7 +231,7 @@ class Timeline:
         sample = np.append(np.arange(1, samples + 1), np.full(len(times) - samples, -1))
         jump = np.zeros(len(times))
         jump[samples : len(times) - len(divided)] = np.diff(record.current, prepend=0.0)[inside]
-        order = np.lexsort((sample < 0, times))  # at equal times the sample precedes the current change
+        order = np.lexsort((sample < 0, times))  # at equal times a sample precedes a change of the current
         times = times[order]
         # A current that is switched at the time of an event flows only after the event.
         flowing = np.searchsorted(switch, times, side="left")

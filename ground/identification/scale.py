@@ -1,11 +1,11 @@
-"""Inertia, torque constant, stiffness and damping from the constants per inertia.
+"""Computes inertia, torque constant, stiffness and damping from the fitted constants per inertia.
 
 Motion under a known current determines g = n A B / J, k / J and c / J, but not the inertia J itself. For
 example, a body with twice the inertia in twice the field on a thread of twice the stiffness has the same
-motion. The scale comes from prior values of the inertia and of the dipole per ampere, n A, and from the field
-by its prior and the magnetometer. The prior is Gaussian in the logarithms. The measured gain g relates
-inertia, dipole and field by the constraint ln n A + ln B - ln J - ln g = 0, which is applied as an error-free
-measurement and corrects each of the three values.
+motion. The scale follows from prior values of the inertia, the dipole per ampere n A, and the field B, which
+the magnetometer also measures. The priors are Gaussian in the logarithms of the values. The measured gain g
+relates inertia, dipole and field by the constraint ln n A + ln B - ln J - ln g = 0, which is applied as an
+error-free measurement, and corrects inertia, dipole and field.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FIELD_ERROR = 0.1
 MAGNETOMETER_ERROR = 0.02
 """Prior relative errors of inertia, dipole per ampere, field, and the magnetometer's scale factor."""
 DURATION = 200.0
-"""Usual duration (s) of the flight, which has each manoeuvre once in either direction, with pauses."""
+"""Default duration (s) of the flight: each manoeuvre once in either direction, and pauses."""
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
 _TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])
 """Coefficients of ln J, ln n A, ln B, ln g, kappa and delta in the constraint."""
@@ -37,7 +37,7 @@ _TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class PriorValue:
-    """A value and its relative standard deviation."""
+    """A prior value and its relative standard deviation."""
 
     value: float
     error: float
@@ -64,8 +64,8 @@ class PlantPrior:
 class ScaledValue:
     """An estimated value, its standard deviation, and the contribution of its own prior.
 
-    The attribute `own_prior` is the derivative of the value's logarithm by the logarithm of its prior, which
-    is 1 if the motion added no information. A value without a prior has the `own_prior` None.
+    The attribute `own_prior` is the derivative of the value's logarithm with respect to the logarithm of its
+    prior, which is 1 if the motion added no information. The attribute is None for a value without a prior.
     """
 
     value: float
@@ -75,13 +75,13 @@ class ScaledValue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsolutePlant:
-    """Constants of `knightcube.gnc.guidance.one_axis.plant` with their errors.
+    """Absolute constants of the plant in `knightcube.gnc.guidance.one_axis.plant`, with uncertainties.
 
     Attributes:
         inertia: kg m^2.
         dipole: dipole per commanded ampere, n A, m^2.
         field: T.
-        torque_constant: torque per current, n A B, N m/A.
+        torque_constant: torque per current, n A B, N m/A, at theta = 0.
         stiffness: N m/rad.
         damping: N m s/rad.
         field_measured: whether the magnetometer contributed to the field.
@@ -151,7 +151,7 @@ def absolute(found: PlantFit, prior: PlantPrior, measured: HorizontalField | Non
 
 
 def _field(prior: PlantPrior, measured: HorizontalField | None) -> PriorValue:
-    """Return the field from its prior and the magnetometer."""
+    """Return the field as the weighted mean of its prior value and the magnetometer's value."""
     own = prior.field
     if measured is None or measured.magnitude <= 0.0:
         return own
@@ -162,7 +162,7 @@ def _field(prior: PlantPrior, measured: HorizontalField | None) -> PriorValue:
 
 
 def excitation_config(config: TestbedConfig, duration: float) -> TestbedConfig:
-    """Return `config` for an identification flight: `duration` s of excitation, without camera and paths."""
+    """Return `config` changed for identification: `duration` s of excitation, without camera and paths."""
     return configuration.replace(
         config,
         name=f"identify {config.name}"[:64],
@@ -191,7 +191,7 @@ def prior_of(config: TestbedConfig) -> PlantPrior:
 
 
 def configured_constants(config: TestbedConfig) -> MotionConstants:
-    """Return the constants per inertia that follow from a configuration."""
+    """Return the constants per inertia from the values of a configuration."""
     plant = config.plant
     gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
     stiffness, damping = plant.thread_stiffness / plant.inertia, plant.thread_damping / plant.inertia
@@ -199,13 +199,13 @@ def configured_constants(config: TestbedConfig) -> MotionConstants:
 
 
 def noise_of(config: TestbedConfig) -> MotionNoise:
-    """Return the noise levels of a configuration, with which a fit starts."""
+    """Return the noise levels from a configuration, which are the initial values of a fit."""
     unit = config.inertial_unit
     return MotionNoise(max(config.estimation.current_noise, 1e-4), unit.angle_noise, unit.rate_noise)
 
 
 def plant_section(plant: AbsolutePlant, coil_turns: int) -> Plant:
-    """Return the section `plant` of a configuration. Negative stiffness and damping become zero."""
+    """Return the section `plant` of a configuration. Negative stiffness or damping is set to zero."""
     return Plant(
         inertia=plant.inertia.value,
         coil_turns=coil_turns,

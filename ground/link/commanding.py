@@ -55,7 +55,7 @@ _SILENCE_S = 5.0
 _REPEAT_NS = 5_000_000_000
 """Time (ns) after which an unanswered command is sent again."""
 _BURST_S = 0.05
-"""Time (s) over which unused transmission capacity accumulates."""
+"""Longest time (s) over which unused transmission capacity accumulates."""
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TRANSFER = LAYOUTS[TRANSFER.name]
 
@@ -79,7 +79,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line,
     ):
         own = os.path.join(folder, "answer")
-        os.chmod(folder, 0o711)  # lets the flight, which may be another user, send its answer to this socket
+        os.chmod(folder, 0o711)  # the flight software, possibly of another user, must reach the socket
         line.bind(own)
         os.chmod(own, 0o777)
         return _ask(line, to, data, timeout, to)
@@ -167,7 +167,7 @@ def failed(reports: list[Report]) -> str:
 
 
 def explained(report: Report) -> str:
-    """Return the text of a report, with the cure if the counter of the frame was used before."""
+    """Return the text of a report and, if the counter of the frame was used before, the cure."""
     if report.stage is not Stage.REPEATED:
         return report.text
     return (
@@ -195,8 +195,8 @@ def command(
     """Send a command, pass its reports to `show` and return them. Raises FlightError without a report.
 
     The call ends with the final report, if `ended` is true for the list of received reports, or after
-    `seconds` s. A ping is sent after each silence, because a link that restarts forgets the UDP address of
-    the ground, and every link forgets an address that has sent no frame for a minute.
+    `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
+    the ground when it restarts, and after a minute without a frame.
     """
     counter, packer, found = terminal.send(packet, spi), CommandPacker(), list[Report]()
     left = seconds
@@ -205,7 +205,7 @@ def command(
         left -= wait
         for report in terminal.follow(counter, spi, wait):
             if report.stage is Stage.REPEATED and found:
-                continue  # somebody repeated the frame of a command that was accepted
+                continue  # the frame of an accepted command was replayed by a third party
             show(report)
             found.append(report)
             if ended(found) or report.stage.final or report.stage is Stage.REPEATED:
@@ -220,11 +220,12 @@ def command(
 def change_key(
     terminal: Terminal, vault: Vault, changed: int, spi: int, seconds: float, show: Show
 ) -> list[Report]:
-    """Change the key of SPI `changed` with a command under the key of `spi`.
+    """Change the key of SPI `changed` by a command that is protected with the key of `spi`.
 
     The new key is stored on the ground before it is sent, and replaces the old key when the satellite has
-    confirmed it. If the result of an earlier change is unknown, a ping under that change's new key is sent
-    first. Raises UsageError if the satellite would refuse the change, and FlightError if no answer arrives.
+    confirmed it. If the result of an earlier change is unknown, a ping protected with that change's new key
+    is sent first. Raises UsageError if the satellite would refuse the change, and FlightError if no answer
+    arrives.
     """
     if not may_change(spi, changed):
         raise UsageError(
@@ -249,7 +250,7 @@ def change_key(
     reports = command(terminal, packet, spi, seconds, show)
     if obeyed(reports) and changed in COMMAND_SPIS:
         _promote(vault, changed)
-    return reports  # a new telemetry key replaces the old key at the first frame that uses it
+    return reports  # a new telemetry key is accepted at the first frame that uses it
 
 
 def _promote(vault: Vault, spi: int) -> None:
@@ -291,7 +292,10 @@ class FileSession:
         self._credit, self._credit_ns = 0.0, now_ns
 
     def ask(self, directive: Directive, now_ns: int) -> None:
-        """Send a command, and repeat it until the satellite answers; ignore late reports on earlier ones."""
+        """Send a command and repeat it until the satellite answers.
+
+        Ignore late reports on earlier commands.
+        """
         self._counters.clear()
         self._reports.clear()
         self._send(directive, now_ns)
@@ -313,11 +317,11 @@ class FileSession:
             if is_unit(packet, DOWN):
                 try:
                     self.entity.take(unit_of(packet), now_ns)
-                except PduError:  # sent by a satellite whose software release has other PDUs
+                except PduError:  # the satellite's software release may have different PDUs
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
-                # After a repeated counter, the command is sent again with a higher counter.
+                # If a counter was used before, the command is sent again with a higher counter.
                 if report.counter in self._counters and report.stage is not Stage.REPEATED:
                     if report.stage is not Stage.ACCEPTED:
                         self._asked = None

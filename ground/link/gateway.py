@@ -1,10 +1,10 @@
-"""Gateway between a ground station without keys and a protected link.
+"""Gateway between ground station software, which has no keys, and a protected link.
 
-A connection must begin with the token of the gateway. A web page can connect to loopback but does not know
-the token. After the token the connection receives every telemetry packet, live and played back, as a stream.
-The gateway adds time and CRC to each command packet or file transfer packet from the connection and sends it
-in a protected frame. The sequence count of a command packet is not changed, because `verification` packets
-identify a command by this count.
+A connection must begin with the token of the gateway. The token keeps web pages out, which can connect to
+loopback but do not know the token. After the token the connection receives every telemetry packet, live and
+played back, as a stream. The gateway adds time and CRC to each command packet or file transfer packet from
+the connection and sends it in a protected frame. The gateway keeps the sequence count of a command packet,
+because `verification` packets identify a command by this count.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _REPORT_S = 1.0
 _TOKEN_CHARACTERS = b"0123456789abcdef"
 _TOKEN_BYTES = 32
 _CHECKED_BYTES = HEADER_BYTES + 1
-"""Number of checked bytes: the primary header and the byte with the version of the packet definition."""
+"""Number of header bytes that are checked: primary header, and version of the packet definition."""
 _UNSEGMENTED = 0b11
 _LONGEST_PACKET = LONGEST_FRAME - FRAME_OVERHEAD_BYTES
 _SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES
@@ -67,7 +67,7 @@ class StreamError(FlightError):
 
 @dataclass(frozen=True, slots=True)
 class _HeaderForm:
-    """Header of one packet type: first 16 bits, limits of the packet's length, version."""
+    """Header of a packet type: first 16 bits, minimum and maximum length of the packet, and version."""
 
     identifier: bytes
     shortest: int
@@ -156,7 +156,7 @@ class CommandStream:
 
 
 def token_path(keys: Path, port: int) -> Path:
-    """Return the path of the token file of a gateway with the given keys and port, for local programs."""
+    """Return the path of the file in which local programs find the token of a gateway."""
     return keys / f"gateway-{port}.token"
 
 
@@ -164,7 +164,7 @@ def token_path(keys: Path, port: int) -> Path:
 def token_file(path: Path, token: str) -> Iterator[None]:
     """Write a token to a file that only its user can read, and remove the file at the end.
 
-    The stale file of a gateway that was killed is replaced. Raises FlightError if the file cannot be written.
+    An old file of a gateway that was killed is replaced. Raises FlightError if the file cannot be written.
     """
     new = path.with_name(f"{path.name}.{os.getpid()}")
     try:

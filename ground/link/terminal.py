@@ -50,7 +50,7 @@ from ground.telemetry import text_of
 from knightcube.errors import FlightError, UsageError
 
 DEFAULTS = Link(keys="-")
-"""Default settings of the link."""
+"""Link settings that are used without a configuration."""
 
 ADDRESSES = "HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, kiss:HOST:PORT or kiss:/dev/FILE@BAUD"
 """Forms of the address of a line to the satellite."""
@@ -58,12 +58,12 @@ ADDRESSES = "HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, kiss:HOST:PORT or k
 _STORE_EVERY = 256
 """Number of telemetry frames between two writes of the anti-replay counters."""
 _ANY_AHEAD = 2**63
-"""Width of the anti-replay window, which accepts any gap after lost telemetry."""
+"""Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
 _TURN_S = 1.0
-"""Longest time (s) to wait for another program that sends a frame with the same keys."""
+"""Longest time (s) to wait while another program sends a frame with the same keys."""
 FRAME_OVERHEAD_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
-"""Number of bytes in a telecommand frame besides the packet."""
+"""Number of bytes that a telecommand frame adds to its packet."""
 _LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))
 
 
@@ -91,7 +91,7 @@ def make_keys(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class TerminalSettings:
-    """Settings of the section `link` of a configuration that must be equal at both ends of a link."""
+    """Settings from a configuration's section `link` that must be equal at both ends of the link."""
 
     spacecraft: int = DEFAULTS.spacecraft
     frame_bytes: int = DEFAULTS.frame_bytes
@@ -142,7 +142,7 @@ class Terminal:
     Attributes:
         gate: authentication of the telemetry frames, with the numbers of refused frames.
         lost_frames: number of telemetry frames that are missing according to their authenticated counters.
-            Counters that the satellite's link process skips when it starts again are included.
+            The number includes counters that the satellite's link process skips at a restart.
         idle_frames: number of received frames of idle data.
         packet_bytes: longest packet that a telecommand frame can carry, bytes.
     """
@@ -217,7 +217,7 @@ class Terminal:
                 admitted = self.gate.admit(frame)
             except RefusedError:  # counted by the gate
                 continue
-            # A new key begins at counter 0.
+            # The counters of a new key begin at 0.
             expected = self._expected.get(admitted.spi, admitted.counter)
             self.lost_frames += max(admitted.counter - expected, 0)
             self._expected[admitted.spi] = admitted.counter + 1
@@ -231,8 +231,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        A report of a repeated frame is final if no other report came before. After other
-        reports it is skipped, because somebody else has repeated the command's frame.
+        A report that a frame was repeated is final if it is the first report. After other reports it is
+        skipped, because in that case a third party has replayed the command's frame.
         """
         reported = False
         for _, packet in self.packets(seconds):
@@ -261,7 +261,7 @@ class Terminal:
         self._line.close()
 
     def _pass_by(self, packet: bytes) -> None:
-        """Continue the counters of commands above those that the satellite has accepted.
+        """Raise the counters for commands above those that the satellite has accepted.
 
         The stored counters are behind if the folder of keys is an older copy.
         """
@@ -356,7 +356,7 @@ class StreamGround:
 
 
 def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
-    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD, or to a TNC after `kiss:`.
+    """Open the line to HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, or kiss: with the address of a TNC.
 
     The TNC speaks KISS on HOST:PORT (TCP) or /dev/FILE@BAUD.
 
@@ -388,8 +388,8 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
 def _turn_to_send(keys: Path) -> Iterator[None]:
     """Make the programs that share a folder of keys send one after the other.
 
-    The satellite refuses a frame that arrives after a frame with a higher counter. A program that blocks
-    while it sends is waited for at most `_TURN_S` s.
+    The satellite refuses a frame that arrives after a frame with a higher counter. The wait for a program
+    that blocks while it sends is limited to `_TURN_S` s.
     """
     with _reaching(str(keys)):
         file = os.open(keys / "uplink", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -1,4 +1,4 @@
-"""Report of a run from its packets: the figures of merit of the thesis, tables and pictures."""
+"""Report of a run from its packets: performance measures of the thesis, tables and pictures."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
-    """Yield name, value and unit of each figure of a summary, in the order of the report."""
+    """Yield name, value and unit of each performance measure in a summary, in the order of the report."""
     yield "duration", (summary["run"]["duration_s"], "s")
     for row in summary["thesis"]:
         yield f"worst {row['quantity']}", (row["worst"], row["unit"])

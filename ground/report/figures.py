@@ -1,4 +1,4 @@
-"""Pictures of a run of the testbed (Sease 2013, Figures 5.9 to 5.11), of a planned path and of a fit.
+"""Pictures of a run of the testbed (Sease 2013, Figures 5.9 to 5.11), of a planned path, and of a fit.
 
 The pictures are drawn with matplotlib's Figure objects, without the global state of pyplot.
 """
@@ -29,11 +29,11 @@ WIDE = (11.0, 5.2)
 TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 PATH_WINDOW_S = 20.0
-"""Length (s) of the time axis in the picture of the planned paths, which begins at the command of a step."""
+"""Length (s) of the time axis, from the command of a step, in the picture of the planned paths."""
 _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the picture of the cage is drawn."""
 _FIELD_STRIDE = 40
-"""Number of magnetometer readings in one second, of which one is drawn."""
+"""Number of magnetometer readings (one second) of which only the first is drawn."""
 
 
 def save(figure: Figure, file: Path) -> None:
@@ -154,7 +154,7 @@ def _stack(
 
 
 def _rate(signals: RunSignals) -> Figure | None:
-    """Draw the rate, and its error if the truth is known."""
+    """Draw the estimated rate and, if the truth is known, the error of the rate."""
     if not len(signals.flown.time):
         return None
     if signals.truth is None:

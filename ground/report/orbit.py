@@ -1,4 +1,4 @@
-"""Figures of a flight in orbit: detumbling, attitude knowledge, pointing, tracked objects, requirements."""
+"""Measures of a flight in orbit: detumbling, attitude knowledge, pointing, tracked objects, requirements."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ Object = dict[str, Any]
 LOST, COARSE, FINE = 0, 1, 2
 """Levels of attitude knowledge in the navigation packet."""
 WITH_STARS_S = 10.0
-"""Time after an accepted star attitude during which the estimate counts as based on stars (s)."""
+"""Time (s) after an accepted star attitude during which the estimate counts as based on stars."""
 SUNLIT = 0.99
 """Visible fraction of the solar disc above which the satellite is in sunlight."""
 JUDGED = 600
-"""Number of navigation packets, one per second, over which the residual dipole is judged."""
+"""Number of navigation packets (one per second) from which the error of the residual dipole is computed."""
 MIN_DIPOLE = 1e-9
-"""Smallest residual dipole (A m^2) used as the reference of the relative dipole error."""
+"""Smallest residual dipole (A m^2) by which the dipole error is divided."""
 SETTLED_AFTER_S = 600.0
-"""Time after the start of pointing at a target before its pointing error is judged (s)."""
+"""Time (s) from the start of pointing at a target until its pointing error is evaluated."""
 
 
 def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
-    """Return start and end, s, of each period in mode detumble, and whether the body was slow at its end."""
+    """Return start, s, and end, s, of each period in mode detumble, and whether it ended with a slow body."""
     times = np.append(seconds(run["mode"]), end)
     modes = [Mode(int(mode)) for mode in run["mode"]["mode"]]
     return [
@@ -96,11 +96,11 @@ def detumbling(run: Run) -> Object | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeErrors:
-    """Attitude errors about the body axes.
+    """Attitude errors about the body axes over time.
 
     Attributes:
         times: mission times (n,), s.
-        error: rotation vectors (n, 3), rad, from the reference attitude to the compared attitude.
+        error: rotation vectors (n, 3), rad, from the reference attitude to the evaluated attitude.
         sigma: standard deviations (n, 3) of the attitude estimate, rad.
         source: origin of the flown attitude, "truth" or "estimate".
     """
@@ -176,7 +176,7 @@ def camera_errors(run: Run) -> AttitudeErrors:
     errors, packets, true = attitude_errors(run), run["description"], run["true_description"]
     if not len(packets) or not len(true) or not len(errors.times):
         return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    # The misalignment changes slowly, so it is combined with the attitude of the same control cycle.
+    # The estimated misalignment changes slowly, so the attitude error of the same control cycle is used.
     at = np.searchsorted(errors.times, seconds(packets))
     inside = at < len(errors.times)
     packets, at = packets[inside], at[inside]
@@ -225,10 +225,10 @@ def learned_description(run: Run) -> list[Object]:
 
 
 def dipole_errors(run: Run) -> dict[str, float]:
-    """Return the rms error of the residual dipole divided by its size, in sunlight and in shadow.
+    """Return the relative rms error of the residual dipole, in sunlight and in shadow.
 
-    Only the last ten minutes in sunlight and in shadow are judged. The two values are NaN without an estimate
-    or a truth log.
+    Only the last ten minutes in sunlight and in shadow are evaluated. The two values are NaN without an
+    estimate or a truth log.
     """
     packets, truth = run["navigation"], run["orbit_truth"]
     packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
@@ -251,7 +251,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def pointing_errors(run: Run) -> AttitudeErrors:
-    """Return the rotations from the target attitude to the flown one in the pointing modes.
+    """Return the rotations from the target attitude to the flown attitude in the pointing modes.
 
     The flown attitude is the true one if the run has a truth log, otherwise the estimate.
     """
@@ -268,10 +268,10 @@ def pointing_errors(run: Run) -> AttitudeErrors:
 
 
 def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Object | None:
-    """Return the figures of each target, or None for a run without pointing.
+    """Return the pointing results of each target, or None for a run without pointing.
 
-    A target's error is judged from `SETTLED_AFTER_S` s after the target's first pointing cycle, or from the
-    end of its first slew if that is later. The pointing axis in body axes is `axis` (3,).
+    A target's error is evaluated from `SETTLED_AFTER_S` s after the target's first pointing cycle, or from
+    the end of its first slew if that is later. The pointing axis in body axes is `axis` (3,).
     """
     found = pointing_errors(run)
     if not len(found.times):
@@ -306,13 +306,13 @@ def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Objec
 
 
 def object_tracks(run: Run) -> list[PacketArray]:
-    """Return the packets of each tracked object, by its number."""
+    """Return the packets of each tracked object, in the order of object numbers."""
     packets = run["track"]
     return [packets[packets["number"] == number] for number in np.unique(packets["number"])]
 
 
 def objects(run: Run) -> list[Object]:
-    """Return the figures of each tracked object, in the order of detection."""
+    """Return the results for each tracked object, in the order of detection."""
     rows = []
     for packets in object_tracks(run):
         detected = packets["seen"] > 0
@@ -341,9 +341,9 @@ def requirements(
     pointed: Object | None,
     seen: Object | None,
 ) -> list[Object]:
-    """Return each figure that the configuration's section `requirements` limits, with a verdict.
+    """Return each value that the configuration's section `requirements` limits, with a verdict.
 
-    The arguments `detumbled`, `known`, `pointed` and `seen` are the report's figures of detumbling, attitude
+    The arguments `detumbled`, `known`, `pointed` and `seen` are the report's results on detumbling, attitude
     knowledge, pointing and the star camera.
     """
     limits = config.requirements
@@ -354,7 +354,7 @@ def requirements(
         slowed_at = [one["begin_s"] + one["duration_s"] for one in periods if one["slowed"]]
         fine_at = known["fine_after_s"]
         fine = [math.inf if math.isnan(fine_at) else max(0.0, fine_at - at) for at in slowed_at]
-        # The body's attitude would include the mounting error, so the star camera's attitude is judged.
+        # The star camera's attitude is evaluated, because the body's attitude includes the mounting error.
         camera = known.get("star_camera") or known
         error = [math.degrees(camera["with_stars_error_rms_rad"])]
         rows.append(("time from detumbling to fine attitude", fine, limits.fine_within, "s"))

@@ -38,9 +38,9 @@ from knightcube.gnc.guidance.three_axes.slew_model import Cone, heat_matrix, sho
 from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
 
 SPIN_MARGIN = 0.2
-"""Time shown before and after detumbling, as a fraction of the time of detumbling."""
+"""Time shown before and after detumbling, as a fraction of the duration of detumbling."""
 POWER_MEAN_S = 30.0
-"""Time (s) over which the power is averaged, because the coils pause every one or two seconds."""
+"""Time (s) over which the power is averaged, because the coils are off every one or two seconds."""
 SHADOW = 0.5
 """Visible fraction of the solar disc below which the satellite is drawn in shadow."""
 TRACK_INTERVAL_S = 10.0
@@ -73,7 +73,7 @@ def spin_figure(signals: RunSignals) -> Figure | None:
 
 
 def _detumbling_rate(ax: Axes, run: Run) -> None:
-    """Draw the true or gyro rate and the magnetometer's rate with its uncertainty; detumbling is shaded."""
+    """Draw the true rate or gyro rate, and the rate from the magnetometer with its uncertainty."""
     time, speed, source = body_speeds(run)
     spin = magnetometer_rates(run)
     if len(spin):
@@ -142,7 +142,7 @@ def pointing_figure(signals: RunSignals) -> Figure | None:
     speed = np.degrees(np.linalg.norm(run[name]["rate"].astype(float), axis=1))
     rate.semilogy(seconds(run[name]), np.maximum(speed, 1e-4), color=panels.BLUE, linewidth=0.9)
     panels.style(rate, "rate, deg/s", "Body rate", "")
-    # Without averaging, the pauses of the coils for the magnetometer would fill the picture.
+    # Cycles without a dipole are omitted: the coils pause often for the magnetometer.
     acting = run["attitude"][run["attitude"]["dipole"].any(axis=1)]
     panels.vectors(dipole, seconds(acting), 1e3 * acting["dipole"].astype(float))
     dipole.set_yscale("symlog", linthresh=1.0)
@@ -230,7 +230,7 @@ def _shade(ax: Axes, packets: PacketArray) -> None:
 def track_figure(signals: RunSignals) -> Figure | None:
     """Return the picture of the ground track in sunlight and shadow.
 
-    Returns None for an unknown true position.
+    Returns None if the true position is unknown.
     """
     packets = signals.run["orbit_truth"]
     if not len(packets):
@@ -401,7 +401,7 @@ def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patc
 
 
 def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
-    """Draw the torque that the motion requires across and along the magnetic field."""
+    """Draw the components of the required torque perpendicular to and along the magnetic field."""
     task, path = made.task, made.plan.path
     reference, craft, around = path.references(times), task.craft, task.along(times)
     q = reference.quaternion
@@ -418,7 +418,7 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
     ax.plot(times, 1e6 * across, color=panels.BLUE, linewidth=1.3, label="across the field")
     label = "along the field, not available"
     ax.plot(times, 1e6 * along, color=panels.VERMILLION, linewidth=1.3, label=label)
-    # The dipole across the field that makes this torque, as the largest share of the limit of a body axis.
+    # Dipole perpendicular to the field that produces this torque, relative to the dipole limit (worst axis).
     share = np.max(np.abs(np.cross(field, torque)) / size[:, None] ** 2 / craft.limit, axis=1)
     if share.max() > 0.3:
         label = "limit across the field in this direction"
@@ -435,7 +435,7 @@ def day_figure(
     Args:
         prediction: orbit of the satellite over the span that is drawn.
         stations: ground stations.
-        targets: start, s after the begin of the span, and name of each target.
+        targets: start (s after the begin of the span) and name of each target.
     """
     rows = len(stations) + bool(targets)
     figure = Figure(figsize=(13.0, 3.6 + 0.45 * rows), layout="constrained")

@@ -1,4 +1,4 @@
-"""Panels of the pictures of a run, each of which is drawn on given axes.
+"""Functions that draw the panels of a run's pictures on given axes.
 
 The colours are from the Okabe-Ito palette, which can be distinguished with all common kinds of colour vision.
 """
@@ -40,8 +40,10 @@ PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
 DASHED = (0, (5, 2))
 _MAX_ERROR = 1e9
-"""Largest plausible rate error (mrad/s); a larger error comes from a damaged log and does not affect
-the scale."""
+"""Largest plausible rate error (mrad/s).
+
+A larger error comes from a damaged log and does not affect the axis scale.
+"""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class RunSignals:
 
     @cached_property
     def flown(self) -> ThreadMotion:
-        """True motion, or the estimated motion without a truth log."""
+        """True motion, or the estimated motion if the run has no truth log."""
         return self.truth or self.estimate
 
     @cached_property
@@ -77,7 +79,7 @@ class RunSignals:
 
     @cached_property
     def current_limit(self) -> float:
-        """Configured limit (A) of a coil current, or without a configuration the limit of the thesis."""
+        """Limit (A) of a coil current from the run's configuration, or else the limit of the thesis."""
         run = self.run["run"]
         return float(run["current_limit"][0]) if len(run) else limits.CURRENT_LIMIT_A
 
@@ -191,7 +193,7 @@ def current(ax: Axes, signals: RunSignals) -> None:
 
 
 def power(ax: Axes, signals: RunSignals) -> None:
-    """Draw the supply power, its averages and, on the testbed, the 0.10 W of the thesis (Figure 5.11)."""
+    """Draw the supply power, its averages and, for the testbed, the thesis's 0.10 W (Figure 5.11)."""
     found = signals.power
     if found is None:
         return
@@ -208,7 +210,7 @@ def power(ax: Axes, signals: RunSignals) -> None:
         averages.insert(1, (measured_at, average, PURPLE, "average at the bus"))
     for times, average, colour, name in averages:
         ax.plot(times, average, color=colour, linewidth=1.6, label=f"{name}, {1e3 * average[-1]:.1f} mW")
-    if not len(signals.run["spin"]):  # the limit is that of the testbed
+    if not len(signals.run["spin"]):  # the limit applies only to the testbed
         level(ax, limits.AVERAGE_SUPPLY_POWER_LIMIT_W, "thesis, 100 mW")
     ax.set_ylim(bottom=0.0)
     style(ax, "power, W", "Coil power")
@@ -282,7 +284,7 @@ def rate_error(ax: Axes, signals: RunSignals) -> None:
     _error_bars(ax, middle[known], difference[known], sigma[known], r"streaks minus true, $\pm\sigma$")
     everything = np.concatenate([np.abs(error), bound, np.abs(1e3 * difference[known])])
     everything = everything[everything < _MAX_ERROR]
-    if len(everything):  # a start-up transient must not determine the scale
+    if len(everything):  # a start-up transient must not determine the axis scale
         span = 1.5 * float(np.percentile(everything, 99.0)) or 1.0
         ax.set_ylim(-span, span)
     style(ax, "error, mrad/s", "Error of the rate")

@@ -27,12 +27,12 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 
 Object = dict[str, Any]
 _TRUTH_GAP_NS = 100_000_000
-"""Longest interval (ns) between two records across which the truth is interpolated."""
+"""Longest interval (ns) between two truth records over which the truth is interpolated."""
 
 
 @dataclass(frozen=True)
 class ThreadMotion:
-    """Rotation of the body about the testbed's thread.
+    """Rotation of the testbed's body about the thread.
 
     Attributes:
         time: mission times (n,), s.
@@ -55,8 +55,9 @@ class PowerHistory:
         time: start times (n,) of the intervals, s.
         end: end of the last interval, s.
         supply: mean of V |I| (n,), W, which the coils draw from their supply.
-        heat: mean of R I^2 (n,), W, which is the heat of steady currents and the planner's cost function.
-        source: "truth" for the simulated coils, "written" for the commanded currents.
+        heat: mean of R I^2 (n,), W, the ohmic heat of constant currents, which the planner minimises.
+        source: "truth" if computed from the simulated coils, "written" if computed from the commanded
+            currents.
     """
 
     time: FloatArray
@@ -84,7 +85,7 @@ class PowerHistory:
         return float(power[inside] @ spans / spans.sum()) if inside.any() else float("nan")
 
     def running_average(self, power: FloatArray) -> FloatArray:
-        """Return the mean of `supply` or `heat` from the start to the end of each interval (n,), W."""
+        """Return the means (n,), W, of `supply` or `heat` from the start of the run to each interval end."""
         return np.asarray(np.cumsum(power * self.spans) / np.cumsum(self.spans))
 
 
@@ -97,7 +98,7 @@ def last_time(run: Run) -> float:
     """Return the mission time (s) at which the logs of a run end, or 0 for empty logs.
 
     A log that was downloaded from a satellite has no truth, and a satellite in orbit writes no control
-    packets, so the time is the newest one of five packet types.
+    packets, so the result is the latest time of five packet types.
     """
     names = ("control", "attitude", "health", "truth", "event")
     return max((float(seconds(run[name])[-1]) for name in names if len(run[name])), default=0.0)
@@ -106,8 +107,8 @@ def last_time(run: Run) -> float:
 def true_quaternions(truth: PacketArray, packets: PacketArray) -> FloatArray:
     """Return the true quaternion (n, 4) at the time of each packet, NaN where the truth is not known.
 
-    The packets of a flight in real time lie between the records of the truth. The truth is interpolated
-    between two records that are at most `_TRUTH_GAP_NS` apart.
+    In a flight in real time, the times of the packets lie between those of the truth records. The truth is
+    interpolated between two records that are at most `_TRUTH_GAP_NS` apart.
     """
     found = np.full((len(packets), 4), np.nan)
     if not len(truth):
@@ -210,8 +211,8 @@ def mean_rates(truth: PacketArray, start: FloatArray, stop: FloatArray) -> Float
 def streaks(run: Run) -> Object:
     """Return the number of frames and rates from streaks, and the errors of the rates.
 
-    The errors are those of the camera: the true misalignment of a simulated camera is not part of them. A
-    rate of unknown sign (status `ambiguous`) is counted, but has no error. `normalised` is the mean of e'
+    The errors are those of the camera's rate, so the true misalignment of a simulated camera does not count.
+    A rate of unknown sign (status `ambiguous`) is counted, but has no error. `normalised` is the mean of e'
     P^-1 e / 3 over the rates with a positive definite covariance P. The mean is 1 if the covariances are
     correct.
     """
@@ -235,7 +236,8 @@ def star_attitudes(run: Run) -> Object:
     """Return the number of frames and attitudes of the star tracker, and the errors of the attitudes.
 
     The value `rms_error` (rad) is the rms error about the body axes. The value `normalised` is the mean of e'
-    P^-1 e / 3 as in `streaks`. The true misalignment of a simulated camera is not part of the errors.
+    P^-1 e / 3 over the attitudes with error e and covariance P. The true misalignment of a simulated camera
+    is not part of the errors.
     """
     packets, truth = run["stars"], run["truth"]
     solved = packets[np.all(np.isfinite(packets["quaternion"]), axis=1)]
@@ -260,7 +262,7 @@ def star_attitudes(run: Run) -> Object:
 
 
 def failed_frames(run: Run) -> list[Object]:
-    """Return number, time and reasons of each frame that gave neither a rate nor an attitude."""
+    """Return number, time and reason of failure of each frame that gave neither a rate nor an attitude."""
     stars = run["stars"]
     solved = set(stars["sequence"][np.all(np.isfinite(stars["quaternion"]), axis=1)].tolist())
     reasons = {int(row["sequence"]): text_of(row["status"]) for row in stars}
@@ -281,7 +283,7 @@ def estimate_errors(run: Run) -> Object | None:
     """Return the rms errors of the estimated angle and rate about the thread, or None without a truth.
 
     A name that ends with `_normalised` is the rms of the error divided by the estimated standard deviation.
-    The ratio is 1 if the standard deviations are correct.
+    This rms value is 1 if the standard deviations are correct.
     """
     control, truth = run["control"], run["truth"]
     control = control[np.isfinite(control["angle"]) & np.isfinite(control["rate"])]
