@@ -1,18 +1,19 @@
-"""Attitude and rate from one frame, by the decision tree of the vision worker and of `knightcube solve`.
+"""Attitude and rate from one frame, by the decision tree that the vision worker and `knightcube solve` share.
 
 1. In flight, the motion over the exposure is estimated for every frame, because each frame reports a rate.
    For an image from a file, the motion is only estimated if a fast survey of the bright areas shows streaks.
-   If the streaks give no attitude, as those of a fence or a striped wall, the points of the image are
-   identified.
+   If the streaks give no attitude, for example because they are the bars of a fence, the points of the image
+   are identified.
 
-2. Stars that are points are searched near their predicted positions if there is a prior attitude. Without a
+2. Point stars are searched near their predicted positions if a prior attitude is available. Without a
    prior attitude, or if the stars are not found near their predictions, the whole frame is searched.
 
-3. The positions of streaked stars at mid-exposure are identified like points. The streaks are fitted a second
-   time with a corrected focal length or with the directions of the identified stars.
+3. Streaked stars are identified by their positions at mid-exposure, by the same method as point stars. After
+the identification, the streaks are fitted a second time, with a corrected focal length or with the directions
+of the identified stars.
 
-The control process creates the job and receives the result. The streak estimators and scipy, which occupy
-tens of MB, are imported at their first use, because the control process does not need them.
+The control process creates the job and receives the result. The streak estimators and scipy occupy tens of MB
+and are not needed by the control process. They are therefore imported at their first use.
 """
 
 from __future__ import annotations
@@ -59,12 +60,12 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
-# Relative error of the assumed focal length above which the motion is fitted a second time.
+# Relative correction of the assumed focal length above which the motion is fitted a second time.
 _SCALE_TOLERANCE = 0.01
 # Motion (px) of a star over the exposure below which the star is measured as a point.
 _POINT_PX = 1.0
-# Predicted streak length (px) below which stars are measured as points if no motion can be fitted.
-# In a crowded sky, merged star images can look like streaks.
+# Predicted streak length (px) below which stars are measured as points if no motion can be fitted. In a dense
+# star field, merged star images can look like streaks.
 _SHORT_PX = 4.0
 # Largest uncertainty (px) of the predicted motion of a star that is included in the model of its image.
 _KNOWN_PX = 0.3
@@ -76,8 +77,8 @@ class TrackerSettings:
 
     Attributes:
         solve: settings of star detection, identification and attitude.
-        scale: lowest and highest factor by which the focal length may be wrong, (1, 1) for a calibrated lens.
-        index: file of the sky index; None: the default index.
+        scale: lowest and highest ratio of the true to the assumed focal length, (1, 1) for a calibrated lens.
+        index: file of the sky index, or None for the default index.
     """
 
     solve: SolveSettings
@@ -86,7 +87,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Interface of an alternative estimator of the motion from streaks, which must support pickling."""
+    """Interface of an alternative estimator of the motion from streaks. Its objects must support pickling."""
 
     def motion(
         self,
@@ -124,13 +125,13 @@ class FrameJob:
         exposure: exposure time, s.
         estimator: settings of the maximum-likelihood estimator, or an alternative estimator of streaks.
         tracker: settings of the star identification. If `tracker` is None, stars are not identified.
-        rate_prior, attitude_prior: predicted rate and attitude of the camera; None: unknown.
+        rate_prior, attitude_prior: predicted rate and attitude of the camera, or None if unknown.
         previous_checksum: checksum of the previous frame. Identical checksums indicate a frozen camera.
         motion_first: whether the motion is always estimated, instead of only if a survey shows streaks.
         objects: settings of the measurement of objects. If `objects` is None, objects are not measured.
-        kept: folder in which the frame is kept on disk; None: it is not kept.
-        lens: knowledge of the lens from earlier frames, with which the frame is solved, and the time since
-            the last frame, s. If `lens` is None, the lens is not learned.
+        kept: folder in which the frame is saved on disk, or None if the frame is not saved.
+        lens: estimated lens parameters from earlier frames, with which the frame is solved, and the time
+            since the last frame, s. If `lens` is None, the lens parameters are not estimated.
         detection: settings of the detection of points if no stars are identified.
     """
 
@@ -149,10 +150,10 @@ class FrameJob:
     detection: DetectionSettings = field(default_factory=DetectionSettings)
 
     def with_lens(self) -> FrameJob:
-        """Return the job with the learned lens, if it is usable, instead of the configured lens.
+        """Return the job with the estimated lens parameters, if usable, instead of the configured parameters.
 
-        The priors are in the axes of the configured lens, and those of the result in the axes of the learned
-        lens.
+        The priors of this job refer to the camera axes of the configured lens. The priors of the returned job
+        refer to the camera axes of the estimated lens.
         """
         if self.lens is None or not self.lens[0].usable:
             return self
@@ -190,11 +191,11 @@ class FrameFound:
         solution: attitude at mid-exposure, or None if stars were not identified.
         objects: points that may be space objects instead of stars, or None if they were not measured or the
             attitude is unknown.
-        lens: knowledge of the lens after the frame, or None if the lens is not learned.
-        field: points of light, for the search for objects without a star catalogue; None if not measured.
+        lens: estimated lens parameters after the frame, or None if they are not estimated.
+        field: points of light for the search for objects without a star catalogue, or None if not measured.
         problem: reason why no sky index could be used; empty if there is none.
-        turn: quaternion (4,) from the axes of the configured lens to those of the lens with which the frame
-            was solved; None: the same axes.
+        turn: quaternion (4,) from the camera axes of the configured lens to the camera axes of the lens with
+            which the frame was solved, or None if the axes are the same.
     """
 
     motion: FrameMotion
@@ -248,10 +249,10 @@ def run(job: FrameJob) -> FrameFound:
 
 
 def run_with_lens(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
-    """Return attitude and rate from a frame with the learned lens, and the lens after the frame.
+    """Return attitude and rate from a frame solved with the estimated lens, and the updated lens estimate.
 
-    Rate and attitude are in the axes of the lens with which the frame was solved.
-    If the frame contradicts the learned lens, the frame is solved again with the configured lens.
+    Rate and attitude refer to the camera axes of the lens with which the frame was solved. If the frame
+    contradicts the estimated lens, the frame is solved again with the configured lens.
     """
     through = job.with_lens()
     found = attitude_and_rate(through, through.tracker or tracker, sky)
@@ -281,7 +282,7 @@ def _without_catalogue(job: FrameJob, problem: str) -> FrameFound:
 
 
 def _sky(tracker: TrackerSettings | None) -> tuple[SkyIndex | None, str]:
-    """Return the sky index, or None with the reason, which is empty without a star tracker."""
+    """Return the sky index, or None, and the reason; the reason is empty if stars need not be identified."""
     if tracker is None:
         return None, ""
     try:
@@ -350,23 +351,24 @@ def found_in_image(
     rate_prior: RatePrior | None = None,
     lens: LensKnowledge | None = None,
 ) -> FrameFound:
-    """Return the solution of an image (rows, columns), and the knowledge of the lens after it.
+    """Return the solution of an image (rows, columns), and the lens parameters estimated up to this image.
 
     Args:
         pixels: counts of the image (rows, columns).
-        camera: assumed camera, of the size of the image.
-        scale: lowest and highest factor by which the tangents of field angles may be wrong, (1, 1) for a
+        camera: assumed camera, with the same numbers of rows and columns as the image.
+        scale: lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for a
             calibrated camera.
         exposure: exposure time, s.
         sky: the guide stars.
         settings: settings of star detection, identification and attitude.
         attitude_prior: predicted attitude. Stars are first searched near their predicted positions.
-        rate_prior: predicted rate. The predicted rate determines the sign of the rotation, which a single
+        rate_prior: predicted rate. The predicted rate determines the sense of the rotation, which a single
             frame does not show.
-        lens: knowledge of the lens from earlier images of the camera; None: the lens is not learned.
+        lens: lens parameters estimated from earlier images of the camera, or None if they are not estimated.
     """
     tracker = TrackerSettings(settings, scale)
-    # The attitude needs only the positions of the stars, so a poorly determined rate is accepted as well.
+    # The attitude depends only on the positions of the stars, so that a rate with a large uncertainty is
+    # accepted.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
@@ -378,7 +380,8 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate from a frame by the decision tree in the module docstring."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    # The fit of a few short streaks is uncertain, but the positions of all stars can be predicted.
+    # A fit to a few short streaks is uncertain. In this case, the stars are searched near their predicted
+    # positions.
     trails, prior = _short_trails(job), job.attitude_prior
     if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, trails)
@@ -395,7 +398,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: FrameMotion) -> FrameFound:
-    """Return the attitude from a frame of streaks by the method of the job's streak estimator."""
+    """Return the attitude from a frame of streaks, computed by the method of the job's streak estimator."""
     if isinstance(motion, MotionResult):
         return _from_streaks(job, tracker, sky, motion)
     assert not isinstance(job.estimator, LikelihoodSettings)  # it makes a MotionResult
@@ -413,7 +416,7 @@ def _of_picture(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> Frame
         found = _from_motion(job, tracker, sky, _motion(job))
         if found.solution is None or found.solution.status is SolveStatus.SOLVED:
             return found
-    # A fence or a striped wall looks like streaks, but the sky beside it shows points.
+    # The bars of a fence look like streaks, but the stars in the sky beside the fence are points.
     points = _from_points(job, tracker, sky, seen)
     if found is not None and points.status is not SolveStatus.SOLVED:
         return found
@@ -436,7 +439,8 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         assert isinstance(again, MotionResult)  # Both fits use the same estimator.
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
-        # For a single image, a second fit would add half the computing time for a small gain.
+        # For a single image, a second fit would increase the computing time by a half and the accuracy only
+        # slightly.
         return FrameFound(motion, solution)
     from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
@@ -471,7 +475,7 @@ def _shows_no_motion(job: FrameJob, motion: FrameMotion) -> bool:
 
 
 def _short_trails(job: FrameJob) -> ShortTrails | None:
-    """Return the predicted motion of the stars over the exposure, or None if it is too uncertain."""
+    """Return the predicted short streaks of the stars, or None if the predicted motion is too uncertain."""
     prior, estimator = job.rate_prior, job.estimator
     if prior is None or prior.sigma * job.exposure * job.camera.focal_length > _KNOWN_PX:
         return None
@@ -485,7 +489,7 @@ def _short_trails(job: FrameJob) -> ShortTrails | None:
 def _predicted_within(job: FrameJob, length: float) -> bool:
     """Return whether the priors predict streaks shorter than `length`, px.
 
-    Without a predicted rate, the rate is taken as zero.
+    If no rate is predicted, the rate is assumed to be zero. If no attitude is predicted, the result is False.
     """
     if job.attitude_prior is None:
         return False

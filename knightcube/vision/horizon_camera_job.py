@@ -1,10 +1,10 @@
 """Job of the worker process `wide`: Sun and nadir in body axes from the images of the horizon cameras.
 
-The solar strings determine which camera is read first. The solar strings also give the Sun direction if no
-camera finds the Sun. The nadir direction is fitted to the limbs in all images at once. If no image shows a
-limb, the Earth may fill one camera while the others are dark. The brightness of all images gives a coarse
-nadir direction if no image shows a limb. The modules of the estimators are imported at their first use,
-because the control process does not need them.
+The solar strings determine which camera is read first. If no camera finds the Sun, the Sun direction is
+computed from the solar strings. The nadir direction is fitted to the limbs in all images at once. If no image
+shows a limb, the Earth may fill one camera while the others are dark. The brightness of all images gives a
+coarse nadir direction if no image shows a limb. The modules of the estimators are imported at their first
+use, because the control process does not need them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from knightcube.vision.horizon.structure import StructureMap
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
-"""Count that pixels of the sunlit Earth exceed, but pixels with stray light from the Earth do not."""
+"""Threshold (counts) between pixels of the sunlit Earth and pixels with stray light from the Earth."""
 LIT_SIGMA = 0.3
 """Largest standard deviation (rad) of an attitude that is used to predict the Sun direction."""
 EARTHLIGHT_SIGMA = 0.1
@@ -41,7 +41,8 @@ class HorizonCameraJob:
         knowledge: prior knowledge, with directions and attitude in body axes.
         strings: model of the solar strings and the currents (n,), A, of the strings. Without a recent reading
             of the currents, `strings` is None.
-        response: response of the cameras' detectors to light intensity; None: linear.
+        response: response of the cameras' detectors to light intensity, or None for linear detectors; None:
+            linear.
         structure: maps of the spacecraft's own structure in the images, by the index of the camera.
         earth_only: indices of the cameras in whose images the Sun is not searched.
     """
@@ -79,8 +80,8 @@ class HorizonCameraResult:
 
     Attributes:
         sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
-        false: reasons, by camera index, why the content of an image contradicts an accurately known attitude.
-            If the attitude is not accurately known, images are not checked and `false` is None.
+        false: reasons, by camera index, why an image contradicts an accurately known attitude. If the
+            attitude is not accurately known, images are not checked and `false` is None.
         structure: maps of the spacecraft's own structure, updated with these images, by camera index.
     """
 
@@ -144,7 +145,7 @@ def _nadir(
 
 
 def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
-    """Return the reasons why the content of images contradicts an accurately known attitude, by camera index.
+    """Return the reasons, by camera index, why images contradict an accurately known attitude.
 
     The result is None if the attitude is not accurately known.
     """
@@ -171,7 +172,7 @@ def _masks(job: HorizonCameraJob) -> dict[int, BoolArray]:
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the nadir (3,) in body axes predicted by a rough attitude, or None if too uncertain."""
+    """Return the nadir (3,) in body axes predicted by a rough attitude, or None if it is too uncertain."""
     rough, position = knowledge.attitude, knowledge.position
     if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
         return None

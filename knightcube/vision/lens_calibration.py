@@ -6,10 +6,11 @@ with residuals above five standard deviations are then rejected. The three attit
 are eliminated frame by frame with the Schur complement. The remaining system is 5 x 5 for any number of
 frames.
 
-The data may not determine all parameters. In a narrow field, a shift of the optical axis looks like a
-rotation of the camera, and a single frame hardly separates the two. Each parameter therefore has a prior
-around an ideal lens with the initial focal length, the optical axis in the image centre and no distortion.
-Parameters whose standard deviation exceeds half the prior standard deviation are listed in `undetermined`.
+The data may not determine all parameters. In a narrow field, a shift of the optical axis has nearly the same
+effect as a rotation of the camera, so that a single frame hardly separates the two. Each parameter therefore
+has a prior around an ideal lens with the initial focal length, the optical axis in the image centre and no
+distortion. Parameters whose standard deviation exceeds half the prior standard deviation are listed in
+`undetermined`.
 """
 
 from __future__ import annotations
@@ -49,26 +50,29 @@ from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
 MIN_STARS = 24
-"""Minimum number of accepted matches of stars: three per parameter of the lens and of one attitude."""
+"""Minimum number of accepted star matches: three per parameter (five of the lens, three of an attitude)."""
 _ROBUST_STEPS = 20
 _MAX_STEPS = 50
 _MAX_SELECTIONS = 10
 _CONVERGED = 1e-6
 """Predicted decrease of chi-square at which the fit is converged."""
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
-"""Rounding error of a position, relative to the size of a frame."""
+"""Rounding error of a computed star position, relative to the distances in the frame."""
 _DETERMINED = 0.5
 """Ratio of posterior to prior standard deviation below which a lens parameter counts as determined."""
 _MAX_EXCESS = 3.0
-"""Excess of chi-square, in its standard deviations, above which star position errors count as too small."""
+"""Excess of chi-square (in its standard deviations) above which the star position errors are increased."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
-"""Prior standard deviations that fix omitted lens terms (px for the centre), in the order of omission."""
+"""Prior standard deviations that fix omitted lens terms (px for the centre).
+
+Terms are omitted in this order.
+"""
 _USUAL_SHAPE = 0.02
 """Prior standard deviation of aspect, of shear, and of the tangential displacement of an image corner."""
 _SHOWN = 18.4
-"""Chi-square (2 degrees of freedom, probability 1e-4) above which the stars show a pair of lens terms."""
+"""Chi-square (2 degrees of freedom, probability 1e-4) above which a pair of lens terms is significant."""
 _ROUNDS = 3
-"""Number of passes over the images, in each of which the stars are identified with the latest lens.
+"""Number of passes over the images. Each pass identifies the stars with the lens of the previous pass.
 
 With a better lens model, more stars in the image corners match.
 """
@@ -123,9 +127,9 @@ class Calibration:
 
     Attributes:
         lens: calibrated camera model.
-        covariance: covariance (9, 9) of PARAMETERS, including the prior. If the residuals exceed their
-            standard deviations significantly, the covariance is multiplied by chi-square per degree of
-            freedom.
+        covariance: covariance (9, 9) of the lens parameters PARAMETERS, including the prior. If the residuals
+            exceed their standard deviations significantly, the covariance is multiplied by chi-square per
+            degree of freedom.
         undetermined: names of the PARAMETERS that are determined by the prior instead of the stars.
         attitudes: attitudes (m, 4) of the frames, from reference axes to camera axes.
         used: for each frame, mask (n,) of the accepted matches of stars.
@@ -214,7 +218,8 @@ def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:
             quaternion = solve(in_camera, frame.directions, sigma / np.sqrt(weight)).quaternion
             fit = LensFit(parameters_of(lens), quaternion[None])
             (weight,) = cauchy_weights(residual_lengths([frame], fit))
-            # Weights stay positive, so that matches rejected with a poor initial attitude can recover.
+            # Weights stay positive, so that correct matches that do not fit a poor initial attitude can
+            # regain weight.
             weight = np.maximum(weight, 1e-6)
     except AttitudeError as error:
         raise CalibrationError(f"frame {number}: {error}") from error
@@ -229,7 +234,8 @@ def _converged(
     expected: FloatArray,
 ) -> FitStep:
     """Return the last step of the converged fit to the accepted matches `used`."""
-    least = 0.0  # chi-square from rounding errors, below which the fit cannot converge
+    # chi-square of rounding errors, which limits the decrease of chi-square that shows convergence
+    least = 0.0
     for frame, chosen in zip(frames, used, strict=True):
         length = fit.parameters[0] + np.linalg.norm(frame.points[chosen], axis=1)
         least += 2.0 * float(np.sum((_ROUNDING * length / frame.sigma[chosen]) ** 2))
@@ -252,7 +258,7 @@ def _result(
 ) -> Calibration:
     """Return the calibration from the last step of the fit."""
     focal_length, x, y, k1, k2, *shape = last.fit.parameters.tolist()
-    # Terms that the prior holds at zero are exactly zero in the lens.
+    # Terms with a prior that fixes them at zero are exactly zero in the lens.
     shape = [value if known < NONE**-2 / 4.0 else 0.0 for value, known in zip(shape, prior[5:], strict=True)]
     try:
         lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2, *shape)
@@ -317,11 +323,11 @@ class DeterminedLens:
     """A calibration that includes only the lens terms determined by the stars.
 
     Attributes:
-        calibration: calibration in which the omitted terms have their assumed values and almost no
+        calibration: calibration in which the omitted terms have their assumed values and nearly zero
             uncertainty.
         omitted: omitted lens terms by their names "k1", "k2" and "centre".
-        accuracy: standard deviations of the lens by the keys of `camera.accuracy` in a configuration, without
-            keys that the stars do not determine.
+        accuracy: standard deviations of the lens by the keys of `camera.accuracy` in a configuration. A key
+            is missing if the stars do not determine its term.
     """
 
     calibration: Calibration
@@ -330,7 +336,7 @@ class DeterminedLens:
 
 
 def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -> DeterminedLens:
-    """Return the lens of the frames with only the determined terms, starting from the camera `initial`.
+    """Return the lens of the frames from a fit of the determined terms only, starting from `initial`.
 
     Lens terms are omitted one at a time, starting with k2, if they are undetermined or if a distortion
     coefficient is smaller than its standard deviation. The remaining terms are fitted again after each
@@ -356,7 +362,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
 
 
 def _shape_prior(frames: Sequence[MatchedFrame], initial: CameraModel) -> LensPrior:
-    """Return the prior in which those of aspect, shear and tangential terms are free that the stars show."""
+    """Return the prior in which each pair of terms without symmetry about the axis is free if significant."""
     corner = math.hypot(*initial.ideal.centre) / initial.focal_length
     free = LensPrior(pixels=_USUAL_SHAPE, tangential=_USUAL_SHAPE / corner)
     try:
@@ -390,11 +396,11 @@ def lens_accuracy(
 ) -> dict[str, float]:
     """Return the standard deviations of a lens by the keys of `camera.accuracy` in a configuration.
 
-    The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
-    accuracy of the focal length includes the difference from the focal length of the fit `whole` with all
-    terms. The accuracy of the distortion is given as the relative displacement of an image corner. The
-    accuracy of the distortion includes the uncertainty with all terms and the difference between the fits
-    with and without the omitted terms.
+    The standard deviations of focal length and centre are taken from the fit `found`, which does not include
+    the omitted terms. The standard deviation of the focal length includes its difference from the fit
+    `whole`, which includes all terms. The standard deviation of the distortion is the relative displacement
+    of an image corner. It includes the uncertainty of the fit with all terms, and the difference between the
+    two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -416,9 +422,9 @@ def calibrate_one_lens(
 ) -> tuple[DeterminedLens, dict[int, str]]:
     """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    A frame with another focus or zoom, or with a wrong solution, is excluded. A frame is excluded if its
-    focal length differs from the median by more than 5 standard deviations and 1 %, or if a fit rejects more
-    than half of its matches.
+    A frame is excluded if it was taken with another focus or zoom, or if its solution is wrong. The criteria
+    are a focal length that differs from the median by more than 5 standard deviations and by more than 1 %,
+    and a fit that rejects more than half of the frame's matches.
 
     Args:
         frames: the frames.
@@ -473,7 +479,7 @@ class LensCalibration:
         determined: lens, standard deviations, omitted terms and accuracy, or None if no image was solved.
         images: images in the given order, each with its solution or the reason for excluding it.
         mirrored: whether the images show the mirrored sky. For mirrored images, `lens` describes the given
-            images, and the solutions refer to the images with left and right exchanged.
+            images, but the solutions refer to the images after left and right are swapped.
     """
 
     determined: DeterminedLens | None
@@ -500,22 +506,24 @@ def calibrate_lens(
     fov_deg: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> LensCalibration:
-    """Return the lens of a camera from images of the night sky: focal length, axis, distortion and pixels.
+    """Return the lens of a camera from images of the night sky.
 
     All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
-    images are excluded. Ten images with stars in the corners give a better calibration than a hundred
-    without. Lens terms that the stars do not determine are omitted. If most images show the mirrored sky, as
-    behind a mirror or with reversed rows, they are mirrored back for the calibration.
+    images are excluded. Ten images with stars in the corners give a better calibration than a hundred images
+    without stars in the corners. Lens terms that the stars do not determine are omitted. If most images show
+    a mirrored sky, because of a mirror or a reversed order of the rows, they are mirrored back for the
+    calibration.
 
     Args:
-        images: arrays (rows, columns) of counts, all of one shape. The luminance of colour images
-            (rows, columns, 3) is used.
+        images: arrays (rows, columns) of counts, all of one shape. Colour images (rows, columns, 3) are
+            converted to luminance.
         fov_deg: approximate field of view across the columns, deg. If `fov_deg` is None, fields from 4 to 60
             deg are tried.
-        progress: function that is called before each image with the pass and the image number, both from 1.
+        progress: function that is called before each image with the number of the pass and the number of the
+            image, both counted from 1.
 
     Raises:
-        UsageError: if there are no images, or images of different shapes.
+        UsageError: if no image is given, or if the images have different shapes.
         InputError: if the field of view is not between 1 and 120 deg.
         CalibrationError: if the solved images do not determine a lens.
     """

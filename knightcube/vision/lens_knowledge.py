@@ -1,14 +1,16 @@
-"""Knowledge of a camera lens that the star tracker learns from its own solved frames.
+"""Estimation of the lens parameters of a camera by the star tracker, from its own solved frames.
 
 The lens has the parameters of `knightcube calibrate`: focal length, optical axis, and distortion. The line
-time of the shutter and the width of the point spread are learned with the lens. The prior of all parameters
-is their configured values and standard deviations. Each solved frame improves the parameters by a weighted
-least-squares fit in pixels, in which the attitude of the frame is unknown. The three attitude parameters are
-eliminated with the Schur complement, as in the calibration on the ground. The estimate after one frame is the
-prior of the fit to the next frame. Between frames, the variances grow by a slow random walk.
+time of the shutter and the width of the point spread function are estimated together with the lens
+parameters. The prior of all parameters is their configured values and standard deviations. Each solved frame
+improves the parameters by a weighted least-squares fit in pixels, in which the attitude of the frame is
+unknown. The three attitude parameters of a frame are eliminated with the Schur complement, as in the
+calibration on the ground. The estimate after one frame is the prior of the fit to the next frame. Between
+frames, the variances grow as in a slow random walk.
 
-A frame that contradicts the learned parameters, but agrees with the configuration, shows that the lens has
-changed. The learned parameters are then discarded, and the lens is learned again from the configuration.
+A frame that contradicts the estimated parameters, but agrees with the configuration, indicates that the lens
+has changed. In this case, the estimated parameters are discarded, and the estimation starts again from the
+configuration.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 
 PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2", *SHAPE_TERMS)
 _CUT = 5.0
-"""Residual, in standard deviations, above which the match of a star is rejected."""
+"""Residual (standard deviations) above which the match of a star is rejected."""
 _CAUCHY = 2.385
 """Tuning constant of the Cauchy weights, for 95 % efficiency without outliers."""
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
@@ -50,7 +52,7 @@ _MIN_INDEPENDENCE = 1e-10
 _MIN_COSINE = 0.05
 """Minimum cosine of the angle between a star in the image and the optical axis."""
 NONE = 1e-7
-"""Prior standard deviation of a lens term that is held at zero."""
+"""Prior standard deviation by which a lens term is fixed at zero."""
 MIN_SIGMA_PX = 0.02
 """Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 
@@ -69,8 +71,8 @@ class MatchedFrame:
         directions: unit vectors (n, 3) to the stars in any reference frame.
         covariance: covariances (n, 2, 2) of the star positions, px^2, used instead of `sigma`, or None if the
             errors along both axes are equal.
-        late: displacements (n, 2) of the stars per line time of the shutter, px/s. The tenth lens parameter
-            is then the line time. If `late` is None, the lens has nine parameters.
+        late: derivatives (n, 2) of the star positions by the line time of the shutter, px/s. The line time is
+            then the tenth parameter of the fit. If `late` is None, the fit has nine lens parameters.
     """
 
     points: FloatArray
@@ -80,14 +82,14 @@ class MatchedFrame:
     late: FloatArray | None = None
 
     def weighted(self, displacements: FloatArray) -> FloatArray:
-        """Return displacements (n, 2, ...), px, in standard deviations of the star positions."""
+        """Return displacements (n, 2, ...), px, divided by the standard deviations of the star positions."""
         if self.covariance is None:
             return np.asarray(displacements / self.sigma.reshape(-1, *[1] * (displacements.ndim - 1)))
         root = np.linalg.inv(np.linalg.cholesky(self.covariance))
         return np.asarray(np.einsum("nij,nj...->ni...", root, displacements))
 
     def select(self, chosen: BoolArray) -> MatchedFrame:
-        """Return the frame with the `chosen` (n,) stars only."""
+        """Return the frame with only the stars in the mask `chosen` (n,)."""
         parts = (None if part is None else part[chosen] for part in (self.covariance, self.late))
         return MatchedFrame(self.points[chosen], self.sigma[chosen], self.directions[chosen], *parts)
 
@@ -184,7 +186,7 @@ def step(
         free, coupling = inverse @ (turn.T @ misfit), inverse @ (turn.T @ lens)
         turns.append((free, coupling))
         decrease += float(free @ (turn.T @ misfit))
-        beyond = lens - turn @ coupling  # effect of the lens parameters that no rotation can compensate
+        beyond = lens - turn @ coupling  # effect of the lens parameters that a rotation cannot compensate
         information += beyond.T @ beyond
         gradient += beyond.T @ misfit
     gradient += prior @ (expected - fit.parameters)
@@ -209,7 +211,7 @@ def _linearised(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return weighted derivatives by lens parameters (2n, 9 or 10) and rotation (2n, 3), and residuals (2n,).
 
-    The lens is that of `Lens`. A small rotation moves a direction v by v x rotation.
+    The lens parameters are those of `Lens`. A small rotation moves a direction v by v x rotation.
     """
     misfit = residuals(frame, fit, number)
     usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
@@ -274,7 +276,7 @@ def cauchy_weights(lengths: Sequence[FloatArray]) -> list[FloatArray]:
 
 
 def accepted_matches(lengths: Sequence[FloatArray]) -> tuple[BoolArray, ...]:
-    """Return the mask (n,) of each frame's stars whose residuals, of `lengths` (n,), are acceptable."""
+    """Return the mask (n,) of each frame's stars with acceptable `lengths` (n,) of their residuals."""
     cut = _CUT * residual_spread(lengths)
     return tuple(length <= cut for length in lengths)
 
@@ -291,8 +293,9 @@ def matched_frame(
         solution: a solved frame.
         sky: the guide stars of the solution.
         velocity: velocity of the camera (3,), m/s, for the correction of aberration, or None.
-        shutter: line time with which the frame was solved, and its standard deviation, s. With `shutter`, the
-            matched frame includes the covariances of the positions and the effect of the line time.
+        shutter: line time with which the frame was solved, and its standard deviation, s. If `shutter` is
+            given, the matched frame includes the covariances of the positions and the effect of the line
+            time.
     """
     matched = solution.matched
     own, points = solution.covariance[matched], solution.points[matched]
@@ -310,35 +313,35 @@ def matched_frame(
 
 
 LEARNED = (*PARAMETERS[:5], "line_time", "psf_sigma")
-"""Names of the learned parameters: px, px, px, -, -, s, px."""
+"""Names of the parameters that are estimated from frames. Units: px for three, none for k1 and k2, s, px."""
 _LINE_TIME, _PSF = 9, 10
 _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
-"""Indices of the learned parameters among PARAMETERS, line time and point spread."""
+"""Indices of the estimated parameters LEARNED in an array of PARAMETERS, line time and point-spread width."""
 _SECOND_TERM = 1.0 / 3.0
-"""Ratio of the prior standard deviations of second and first distortion term at the image corner."""
+"""Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
 _FOURTH_LEFT = 0.058
-"""RMS difference between the fourth power and its replacement by a constant and a quadratic term."""
+"""RMS error of the approximation of a fourth power by a constant and a quadratic term."""
 _PSF_PRIOR, _PSF_NOISE = 0.3, 0.05
 """Relative standard deviations of the configured point-spread width, and of the width measured in a frame."""
 _DRIFT = 0.02
-"""Random walk of the lens per square root of an hour, relative to the configured standard deviations."""
+"""Random walk of the lens parameters per square root of an hour, in configured standard deviations."""
 _FOCAL_KNOWN = 2e-3
-"""Relative standard deviation of the focal length below which a learned lens replaces the configured lens."""
+"""Relative standard deviation of the focal length below which the estimated lens is used."""
 _CONTRADICTION = 40.0
-"""Chi-square (6 degrees of freedom, probability 5e-7) above which a frame contradicts the learned lens."""
+"""Chi-square (6 degrees of freedom, probability 5e-7) above which a frame contradicts the estimated lens."""
 _LEAST_MATCHED = 6
-"""Minimum number of matched stars in a frame from which the lens is learned."""
+"""Minimum number of matched stars in a frame that is used to estimate the lens parameters."""
 _PLAUSIBLE = 5.0
 """Largest deviation of stored values from the configuration, in configured standard deviations."""
 _ROBUST_ROUNDS, _MOST_ROUNDS, _SETTLED = 5, 8, 1e-4
-"""Numbers of fit steps with and without robust weights, and decrease of chi-square that ends the steps."""
+"""Number of fit steps with robust weights, maximum number without, and last decrease of chi-square."""
 
 
 def axes_turn(configured: CameraModel, learned: CameraModel) -> FloatArray:
-    """Return the quaternion (4,) from the camera axes of a configured lens to those of a learned lens.
+    """Return the quaternion (4,) from the camera axes of the configured lens to those of the estimated lens.
 
-    The boresight of either lens is its optical axis. The pixel on the optical axis of the configured lens
-    shows the same direction through both lenses, so that a learned axis does not change the mounting.
+    The boresight of each lens is its optical axis. The pixel on the optical axis of the configured lens shows
+    the same direction through both lenses, so that an estimated optical axis does not change the mounting.
     """
     x, y, _ = learned.unit_vectors(np.array([configured.centre]))[0].tolist()
     sine = math.hypot(x, y)
@@ -346,25 +349,28 @@ def axes_turn(configured: CameraModel, learned: CameraModel) -> FloatArray:
 
 
 def _exact(lens: Lens) -> FloatArray:
-    """Return the standard deviations (11,) of exactly known parameters, so small that they do not change."""
+    """Return standard deviations (11,) so small that an update does not change the parameters."""
     return NONE * np.array([lens.focal_length, *[1.0] * 8, 1e-5, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensKnowledge:
-    """A lens that is learned from solved frames, with its covariance. `update` returns improved knowledge.
+    """Lens parameters estimated from solved frames, with their covariance.
 
-    The learned parameters are LEARNED: focal length (px), pixel of the optical axis (px), two coefficients of
-    radial distortion, line time of the shutter (s), and standard deviation of the point spread (px).
+    `update` returns the estimate after a frame.
+
+    The estimated parameters (LEARNED) are the focal length (px), the pixel of the optical axis (px), two
+    coefficients of radial distortion, the line time of the shutter (s), and the standard deviation of the
+    point spread function (px).
 
     Attributes:
-        configured: the configured camera, whose terms of pixels and tangential distortion are not learned.
-        prior: configured values (11,) of PARAMETERS, line time and point spread.
-        spread: configured standard deviations (11,) of these values.
-        values: learned values (11,).
+        configured: the configured camera, whose aspect, shear and tangential distortion are not estimated.
+        prior: configured values (11,) of PARAMETERS, line time and point-spread width.
+        spread: configured standard deviations (11,) of the values in `prior`.
+        values: estimated values (11,) of the same parameters.
         covariance: covariance (11, 11) of `values`.
-        frames: number of frames from which the values were learned.
-        contradictions: number of times that a frame contradicted the learned values.
+        frames: number of frames from which the values were estimated.
+        contradictions: number of times that a frame contradicted the estimated values.
     """
 
     configured: Lens
@@ -385,14 +391,14 @@ class LensKnowledge:
         line_time: float | None = None,
         psf_sigma: float = 1.0,
     ) -> LensKnowledge:
-        """Return the knowledge of a camera before its first frame.
+        """Return the lens parameters of a camera as configured, before its first frame.
 
         Args:
             camera: the configured camera.
             accuracy: standard deviations of the configured camera.
             scale_error: largest relative error of the focal length.
-            line_time: configured line time of the shutter, s; None: unknown.
-            psf_sigma: configured standard deviation of the point spread, px.
+            line_time: configured line time of the shutter, s, or None if unknown.
+            psf_sigma: configured standard deviation of the point spread function, px.
         """
         lens = Lens.of(camera)
         line_sigma = accuracy.line_time
@@ -409,12 +415,12 @@ class LensKnowledge:
 
     @property
     def usable(self) -> bool:
-        """Whether the learned lens is accurate enough to replace the configured lens."""
+        """Whether the estimated lens is accurate enough to replace the configured lens."""
         return self.frames > 0 and math.sqrt(self.covariance[0, 0]) < _FOCAL_KNOWN * float(self.values[0])
 
     @property
     def camera(self) -> Lens:
-        """The learned lens; the configured lens until the learned lens is usable."""
+        """The estimated lens if it is usable, otherwise the configured lens."""
         if not self.usable:
             return self.configured
         f, x, y, k1, k2 = self.values[:5].tolist()
@@ -422,20 +428,20 @@ class LensKnowledge:
 
     @property
     def turn(self) -> FloatArray:
-        """The quaternion (4,) from the axes of the configured lens to those of the learned lens."""
+        """The quaternion (4,) from the camera axes of the configured lens to those of the estimated lens."""
         return axes_turn(self.configured, self.camera)
 
     @property
     def psf_sigma(self) -> float:
-        """The learned standard deviation of the point spread, px."""
+        """The estimated standard deviation of the point spread function, px."""
         return float(self.values[_PSF])
 
     @property
     def shutter(self) -> tuple[float, float]:
         """The line time with which frames are fitted, and its standard deviation, s.
 
-        A line time that does not differ significantly from zero is taken as zero, because a frame of a global
-        shutter is fitted faster.
+        A line time that does not differ significantly from zero is replaced by zero, because the fit of a
+        frame is faster for a global shutter.
         """
         values, sigma = (self.values, self.sigma) if self.usable else (self.prior, self.spread)
         time, doubt = float(values[_LINE_TIME]), float(sigma[_LINE_TIME])
@@ -445,7 +451,7 @@ class LensKnowledge:
 
     @property
     def sigma(self) -> FloatArray:
-        """Standard deviations (11,) of the learned values."""
+        """Standard deviations (11,) of the estimated values."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -455,7 +461,7 @@ class LensKnowledge:
 
     @property
     def accuracy(self) -> CameraKnowledge:
-        """The accuracy of the learned lens, with the covariance for the fit of streaks.
+        """The accuracy of the estimated lens, including the covariance that the fit of streaks needs.
 
         The attribute `distortion` is the standard deviation of the radial displacement of an image corner,
         including the effect of the focal length.
@@ -481,7 +487,7 @@ class LensKnowledge:
         )
 
     def restored(self, values: FloatArray, covariance: FloatArray, changed: float) -> LensKnowledge | None:
-        """Return the knowledge that starts from stored values (7,) and their covariance (7, 7).
+        """Return an estimate that starts from stored values (7,) of LEARNED and their covariance (7, 7).
 
         Since the values were stored, each may have changed by the fraction `changed` of its configured
         standard deviation. Returns None for values that are further than five configured standard deviations
@@ -503,13 +509,13 @@ class LensKnowledge:
         velocity: FloatArray | None = None,
         elapsed: float = 0.0,
     ) -> LensKnowledge:
-        """Return the knowledge after a frame. A frame without enough stars has no effect.
+        """Return the estimate after a frame. A frame with too few stars has no effect.
 
-        If the frame contradicts the learned lens, the result is the configured lens, and the number of
-        `contradictions` is one higher. The frame should then be solved again with the configured lens.
+        If the frame contradicts the estimated lens, the result is the configured lens, the attribute
+        `contradictions` is increased by one, and the frame should be solved again with the configured lens.
 
         Args:
-            solution: the frame, solved with `camera` and `shutter` of this knowledge.
+            solution: the frame, solved with `camera` and `shutter` of this object.
             sky: the guide stars with which the frame was solved.
             velocity: velocity of the camera (3,), m/s, with which the frame was solved, or None.
             elapsed: time since the last frame, s.
@@ -549,7 +555,8 @@ class LensKnowledge:
     def _path_error(self, length: float) -> float:
         """Return the position error (px) of streaks of `length` px due to an error of the distortion.
 
-        A wrong distortion bends the path of a star, and the middle of the fitted path is displaced.
+        A distortion error changes the curvature of a star's path and thus displaces the middle of the fitted
+        path.
         """
         corner = math.hypot(*self.configured.ideal.centre)
         square = (corner / float(self.values[0])) ** 2
@@ -557,9 +564,10 @@ class LensKnowledge:
         return 0.5 * float(distortion) * corner * (length / corner) ** 2
 
     def _with_psf(self, measured: float) -> LensKnowledge:
-        """Return the knowledge after a frame with the point-spread width `measured` (px), or NaN if unknown.
+        """Return the estimate updated with a measured point-spread width, px, which is NaN if unknown.
 
-        A width that contradicts the learned width starts again from the configured width.
+        If the measured width contradicts the estimated width, the estimation starts again from the configured
+        width.
         """
         if not measured > 0.0:
             return self
@@ -581,8 +589,9 @@ class _FrameFit:
         parameters: fitted lens parameters (10,) with the line time.
         covariance: covariance (10, 10) of the parameters.
         objective: chi-square of residuals and prior.
-        used: mask (n,) of the stars that agree.
-        excess: chi-square of the residuals per degree of freedom if it exceeds 1 significantly, or 1.
+        used: mask (n,) of the stars that agree with the fit.
+        excess: chi-square of the residuals per degree of freedom if it is significantly greater than 1,
+            otherwise 1.
     """
 
     parameters: FloatArray
@@ -607,7 +616,8 @@ class _FrameFit:
         Raises CalibrationError if the frame does not determine its attitude, or if few stars agree.
         """
         expected = known.values[:_PSF]
-        # The covariance is inverted in units of its standard deviations, which differ by many orders.
+        # The covariance is scaled by its standard deviations before the inversion, because they differ by
+        # many orders of magnitude.
         sigma = known.sigma[:_PSF]
         inverse = np.linalg.inv(known.covariance[:_PSF, :_PSF] / np.outer(sigma, sigma))
         prior = inverse / np.outer(sigma, sigma)
@@ -628,7 +638,8 @@ class _FrameFit:
         off, unit = fit.parameters - expected, np.sqrt(np.diag(last.information + prior))
         scaled = np.linalg.inv((last.information + prior) / np.outer(unit, unit))
         covariance = scaled / np.outer(unit, unit)
-        own = len(off) - float(np.sum(prior * covariance))  # parameters that the stars determine
+        # effective number of parameters that the stars determine
+        own = len(off) - float(np.sum(prior * covariance))
         freedom = max(2.0 * len(squares) - 3.0 - own, 1.0)
         excess = float(squares.sum()) / freedom
         significant = excess > 1.0 + 3.0 * math.sqrt(2.0 / freedom)

@@ -2,20 +2,20 @@
 
 A solar string is a series connection of solar cells on one face of the body, so that all its cells carry the
 same current. The current of a string is proportional to the cosine of the angle between the Sun and the
-string's normal, and zero if the Sun is behind the string. The Earth also illuminates the solar strings, at
-most a third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light
-from the half of the sky that is centred on nadir e. Light from the Earth correlates the errors of the
-strings. The correlation of the errors can be computed if nadir is known; otherwise the mean correlation over
-all nadir directions is used. The covariance of the Sun direction includes the correlation of the strings'
-errors by light from the Earth.
+string's normal, and zero if the Sun is behind the string. The Earth also illuminates the solar strings, with
+at most a third of the intensity of the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of
+the light from the half of the sky that is centred on nadir e. Light from the Earth causes correlated errors
+of the strings. The correlation of the errors can be computed if nadir is known; otherwise the mean
+correlation over all nadir directions is used. The covariance of the Sun direction includes the correlation of
+the strings' errors by light from the Earth.
 
-The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if any
-one string fails in any way. The magnetic field does not determine the rotation about the field direction. All
-rotations about the field direction are therefore tried, and each predicts the illumination of the strings by
-Sun and Earth. A rotation is possible if all strings except at most one agree with it, and if this exception
-is the same string in each reading. Between readings, the possible rotations are propagated with the gyro. The
-covariance of the attitude covers all possible rotations (solution separation as in receivers of satellite
-navigation, Brown 1992, Navigation 39).
+The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if one
+string fails, in whatever way. The magnetic field does not determine the rotation about the field direction.
+The estimator therefore tries rotations by all angles about the field direction, and predicts for each the
+illumination of the strings by Sun and Earth. A trial rotation is possible if all strings agree with it, or if
+all readings contradict it in at most one string, which is the same in each reading. Between readings, the
+possible rotations are propagated with the gyro. The covariance of the attitude includes all possible
+rotations (solution separation as in receivers of satellite navigation, Brown 1992, Navigation 39).
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from knightcube.errors import UsageError
 
 _MOST_STEPS = 15
 _SOFT = 0.05
-"""Range of the cosine of the incidence angle in which a string's current rises smoothly from zero.
+"""Width of the range of the incidence angle's cosine in which the modelled current rises smoothly from zero.
 
-The smooth rise gives a nonzero slope if the Sun is normal to a face and adjacent faces have zero current.
+The smooth rise makes the derivative nonzero for faces that are parallel to the Sun direction.
 """
 _RARE = 3.09
-"""Deviation, in standard deviations, that a normal variable exceeds with a probability of 1 in 1,000."""
+"""Deviation (standard deviations) that a normal variable exceeds with a probability of 1 in 1,000."""
 
 
 class CoarseSunStatus(Enum):
-    """Outcome of the Sun direction from solar strings."""
+    """Outcome of the estimation of the Sun direction from solar strings."""
 
     FOUND = "found"
     DARK = "dark"
@@ -50,7 +50,7 @@ class CoarseSunStatus(Enum):
     UNCERTAIN = "uncertain"
     """No Sun direction explains the currents, whatever the amount of light from the Earth.
 
-    A dead string often cannot be distinguished from a string on a dark face.
+    A failed string often cannot be distinguished from a string on a dark face.
     """
 
 
@@ -63,10 +63,10 @@ class SolarStringModel:
         peaks: currents (n,) in full sunlight at normal incidence, A.
         sigma: standard deviation of a reading relative to its peak, from calibration errors and departures
             from the cosine law.
-        albedo: brightness of an Earth that would fill half the sky, relative to the Sun, as a mean over day
+        albedo: illumination by an Earth that would fill half the sky, relative to the Sun, as a mean over day
             and night.
         albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
-        dark: fraction of the peak current below which a string counts as dark.
+        dark: fraction of its peak current below which a string counts as dark.
 
     Raises:
         UsageError: if a value is out of range.
@@ -154,7 +154,8 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
         step = inverse @ (weighted @ (readings - modelled))
-        # Each step is limited to half a radian, because the linear model is poor far from the Sun direction.
+        # Each step is limited to half a radian, because the linearisation is inaccurate far from the
+        # solution.
         step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
         direction = direction + step @ basis
         direction = direction / np.linalg.norm(direction)
@@ -162,7 +163,8 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # The limit of chi-square is exceeded with a probability of 1 in 1,000 (Wilson and Hilferty 1931).
+    # The limit of chi-square, which correct currents exceed with a probability of 1 in 1,000, is computed by
+    # the approximation of Wilson and Hilferty (1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
@@ -171,7 +173,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
 
 
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return relative string currents, and their derivatives, at the cosines of the incidence angles.
+    """Return the relative string currents at given cosines of the incidence angle, and their derivatives.
 
     `cosines` (...) are the cosines of the angles between the Sun and the normals of the strings. The current
     is 0 if the Sun is behind the string.
@@ -199,13 +201,13 @@ _TURNS = 180
 _IMPROBABLE = 1e-4
 """Probability of the measured currents below which a trial rotation is rejected."""
 _MEMORY = 120.0
-"""Time (s) for which a rejected trial rotation stays rejected, limited by the drift of the gyro."""
+"""Time (s) in which the evidence against a trial rotation decays from its upper limit to zero."""
 _MOST_VIOLATION = 3.0
 """Upper limit of a trial rotation's accumulated excess chi-square, as a multiple of the rejection limit."""
 _CERTAIN = 5.0
-"""Distance from the attitude to the farthest possible rotation, in standard deviations of the attitude."""
+"""Number of standard deviations from the estimated rotation angle to the farthest possible rotation angle."""
 _COMMON = 0.02
-"""Relative error common to all strings, for instance from the distance of the Sun and the temperature."""
+"""Relative error common to all strings, for instance due to the distance of the Sun and the temperature."""
 _STEP = 2.0 * math.pi / _TURNS
 _ANGLES = _STEP * np.arange(_TURNS)
 
@@ -217,7 +219,7 @@ class KnownDirections:
     Attributes:
         field: magnetic field vector (3,), T.
         sun, nadir: unit vectors (3,) to the Sun and to nadir.
-        light: brightness of an Earth that would fill half the sky, relative to the Sun.
+        light: illumination by an Earth that would fill half the sky, relative to the Sun.
         light_sigma: standard deviation of `light`.
     """
 
@@ -262,12 +264,12 @@ class FieldAndStrings:
         self.wrong = ""
 
     def forget(self) -> None:
-        """Make all rotations about the field possible again, after the body has rotated without gyro data."""
+        """Reset all rotations about the field to possible, after the body has rotated without gyro data."""
         self._base = None
         self._against[:] = 0.0
 
     def turn(self, rotation: FloatArray, seconds: float) -> None:
-        """Propagate the possible rotations over a `rotation` (4,) of the body that took `seconds`."""
+        """Propagate the possible rotations over a `rotation` (4,) of the body within `seconds`, s."""
         if self._base is not None:
             self._base = multiply(rotation, self._base)
         self._against = np.maximum(self._against - _MOST_VIOLATION * seconds / _MEMORY, 0.0)
@@ -296,7 +298,8 @@ class FieldAndStrings:
             return None
         base = self._aligned(axis, sky.field / strength)
         whole, without = self._misfits(attitude_matrix(base), shares, axis, math.hypot(across, blur), sky)
-        # Excess chi-square is summed separately for each trial rotation and each string that may have failed.
+        # Excess chi-square is accumulated separately for each trial rotation and each assumption of a failed
+        # string.
         one, fewer, all_ = self._bounds
         least = without.min(axis=1)
         against = np.maximum(without / fewer, (without - least[:, None]) / one)
@@ -325,7 +328,8 @@ class FieldAndStrings:
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # For opposite directions, the base attitude is first rotated by 180 deg about a normal of `axis`.
+            # If the two directions are nearly opposite, the base attitude is first rotated by 180 deg about
+            # an axis normal to `axis`.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))

@@ -2,8 +2,8 @@
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
-The class `StarTracker` combines the steps of `knightcube.vision.startracker` with those for streaked stars,
-by the decision tree of `knightcube.vision.frame_job`.
+The class `StarTracker` combines the methods of `knightcube.vision.startracker` for point stars with the
+methods for streaked stars, by the decision tree of `knightcube.vision.frame_job`.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 UNKNOWN_FOV_DEG = 4.0, 60.0
 """Range of the field of view (deg) that is searched if the field of view is unknown."""
 _SQUARES, _LEAST_COARSE_PX = (3, 5), 330
-"""Sizes (px) of the squares in which the pixels of large images are summed if the image was not solved, and
-shortest side of an image of sums."""
+"""Side lengths (px) of squares over which an unsolved image is summed, and shortest side (px) of the result.
+"""
 FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, relative to the field of view."""
 
@@ -79,7 +79,7 @@ class StarSolution:
     """The attitude of a camera from one image of the sky, or the reason why the image was not solved.
 
     A solution is true (`if solution:`) if the image was solved. If the image was not solved, angles,
-    quaternion and covariance are NaN, `stars` is empty, and `reason` says why.
+    quaternion and covariance are NaN, `stars` is empty, and `reason` states the cause.
 
     Attributes:
         status: outcome: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".
@@ -96,9 +96,10 @@ class StarSolution:
             The field of view is fitted to the stars unless the camera is calibrated.
         field_of_view_sigma: standard deviation of the field of view, rad. The deviation is 0 for a calibrated
             camera.
-        log10_false_alarm: log10 of an upper limit of the probability that randomly placed points are solved.
+        log10_false_alarm: log10 of an upper limit of the probability that points at random positions are
+            solved.
         mirrored: whether the image is a mirror image of the sky. The attitude of a mirror image is that of
-            the image with left and right exchanged.
+            the image after left and right are swapped.
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
             is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
@@ -180,11 +181,11 @@ class StarTracker:
             of `fov_deg`, or zero for a given `camera`.
         camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`), given instead of
             `fov_deg`.
-        settings: tolerances and methods of detection, identification and attitude. None: the defaults.
+        settings: settings of detection, identification and attitude estimation. None: the defaults.
         index: a sky index, or the path of a sky index file. None: the default index.
-        learn: whether the lens is learned from the solved images, which must be of one camera. The learned
-            lens is the attribute `lens`. The accuracy of the given field of view or camera is
-            `settings.lens`, or that of an uncalibrated camera.
+        learn: whether the lens parameters are estimated from the solved images, which must be taken by one
+            camera. The attribute `lens` contains the estimated lens parameters. The accuracy of the given
+            field of view or camera is `settings.lens`, or that of an uncalibrated camera.
 
     Raises:
         InputError: if a field of view is out of range or is given together with a camera, or if the index
@@ -237,8 +238,8 @@ class StarTracker:
                 and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is None, the
                 epoch of the index is used, without aberration.
             attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
-                predicted positions, which is faster. If the search near the predicted positions does not
-                succeed, the whole sky is searched.
+                predicted positions, which is faster than a search of the whole sky. If the search near the
+                predicted positions does not succeed, the whole sky is searched.
             attitude_sigma: standard deviation of the predicted attitude about each axis, rad.
             rate: predicted angular velocity (3,) in camera axes, rad/s. The predicted rate determines the
                 sign of a measured rate.
@@ -263,7 +264,7 @@ class StarTracker:
         rates = None if rate is None else RatePrior(np.asarray(rate, dtype=float), rate_sigma)
         found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
         self.lens, frame = found.lens, found.solution
-        assert frame is not None  # the settings of the star tracker are given
+        assert frame is not None  # the job contains the settings of the star tracker
         if frame.fix is None and exposure is None and self._camera is None and not self._learn:
             frame = self._solved_coarser(image, sky, settings) or frame
         if frame.status is SolveStatus.NO_MATCH and scale[0] < scale[1]:
@@ -273,10 +274,11 @@ class StarTracker:
         return _solution(frame, sky, settings.velocity, exposure is not None)
 
     def _solved_coarser(self, image: Image, sky: SkyIndex, settings: SolveSettings) -> FrameSolution | None:
-        """Return the solution of a large image whose pixels are summed in squares, or None.
+        """Return the solution of a large image after its pixels are summed in squares, or None if it fails.
 
-        The stars of large photographs are often several pixels wide, and compression or interpolation makes
-        the noise of neighbouring pixels alike, so that the uncertainties of their positions are too small.
+        The stars of large photographs are often several pixels wide. Compression or interpolation correlates
+        the noise of neighbouring pixels, so that the computed uncertainties of the star positions are too
+        small.
         """
         for size in _SQUARES:
             if min(image.shape) < _LEAST_COARSE_PX * size:
@@ -289,7 +291,7 @@ class StarTracker:
         return None
 
     def _described(self, camera: CameraModel, scale: tuple[float, float]) -> LensKnowledge:
-        """Return the knowledge of the lens before the first image."""
+        """Return the lens parameters and their uncertainties before the first image."""
         accuracy, shutter = self._settings.lens or CameraKnowledge(), self._settings.likelihood
         return LensKnowledge.of(
             camera,
@@ -399,7 +401,7 @@ def _solution(
     pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
     if fix is None:
         matched = matched[:0]
-    # The aspect of the pixels changes the focal length along the columns.
+    # The aspect of the pixels makes the focal length along y different from that along x.
     camera = frame.camera.rescaled(1.0 / (1.0 + float(frame.bend[ASPECT])))
     fov = math.nan if fix is None else field_of_view(camera)
     star = frame.star[matched]

@@ -3,12 +3,12 @@
     solution = find_sun(image, camera)
 
 Only every n-th row of the image is read (`stride`), and bright patches on the rows are candidates for the
-Sun. The rim of a bright patch is traced along spokes from its centre, and a circle on the sphere is fitted to
-the rim points. The centre of this circle is the centre of the Sun, even if the disc is saturated, has glare,
-or is truncated by the edge of the image. An initial circle is found by consensus among triples of rim points,
-and is then refined by geometric least squares (Gauss-Newton). Tukey's biweight of each point's distance from
-the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on the
-rim.
+Sun. The edge of a bright patch is traced along radial lines (spokes) from its centre, and a circle on the
+sphere is fitted to the edge points. The centre of this circle is the centre of the Sun, even if the disc is
+saturated, has glare, or is truncated by the edge of the image. The initial circle is the consensus among
+circles through triples of edge points. It is refined by geometric least squares (Gauss-Newton). Tukey's
+biweight of each point's distance from the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud
+beside the disc or a hot pixel on its edge.
 
 The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
 solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
@@ -36,21 +36,21 @@ from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus
 class SunSettings:
     """Settings that distinguish the Sun from other bright objects, and assumed errors of the Sun direction.
 
-    At a given exposure, the bright disc of the Sun with its glare has a fixed radius. The radius limits
-    should enclose the radius of the disc with its glare within about a fifth. With wider radius limits, a
-    cloud may be mistaken for the Sun. The default values fit a logarithmic camera like the Fuga 15d; `LINEAR`
-    fits a linear camera in which white clouds are close to saturation.
+    At a given exposure, the bright disc of the Sun, including its glare, has a fixed radius. The radius
+    limits should differ from the radius of the disc with its glare by about a fifth. If the radius limits are
+    wider, a cloud may be mistaken for the Sun. The default values fit a logarithmic camera like the Fuga 15d;
+    `LINEAR` fits a linear camera in which white clouds are close to saturation.
 
     Attributes:
         level: threshold of the Sun's image, counts. For a logarithmic camera, the threshold is well above the
-            brightest cloud, so that only the disc remains. For a linear camera, the threshold is slightly
-            below saturation.
+            brightest cloud, so that only the disc of the Sun exceeds it. For a linear camera, the threshold
+            is slightly below saturation.
         stride: distance between the rows that are read first, px.
         least_radius: radius below which a bright patch counts as a hot pixel, rad. The Sun itself has a
             radius of 0.0047 rad.
         greatest_radius: radius above which a bright patch counts as a cloud or the Earth, rad.
         tolerance: largest rms distance of the rim of the Sun's disc from a circle, px.
-        least_agreement: minimum fraction of the disc's rim within the image that must lie on the circle.
+        least_agreement: minimum fraction of the disc's edge points within the image that lie on the circle.
         least_arc: minimum visible arc of the disc's rim, rad.
         rim_sigma: minimum standard deviation of a point on the disc's rim, px.
         floor_sigma: minimum standard deviation of the disc's centre per axis, from the finite pixel size, px.
@@ -95,13 +95,13 @@ class SunStatus(Enum):
 
     FOUND = "found"
     PARTIAL = "partial"
-    """The Sun is found, but the edge of the image truncates its disc, which increases the covariance."""
+    """The Sun is found, but the edge of the image truncates its disc, so that the covariance is larger."""
     NO_SUN = "no-sun"
     """No part of the image is bright enough for the Sun."""
     NOT_THE_SUN = "not-the-sun"
     """A patch of the image is bright enough for the Sun, but too small, too large or not round.
 
-    The attribute `reason` says why the patch is not the Sun.
+    The attribute `reason` of the solution states why the patch is not the Sun.
     """
 
 
@@ -114,8 +114,8 @@ class SunMeasurement:
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
         tangent_covariance: covariance (2, 2) of the direction error along `basis`, without the error of the
             lens calibration, rad^2.
-        point: position of the Sun's centre (2,) in the image, px. The position is NaN if the Sun's centre is
-            outside the range of the lens.
+        point: position of the Sun's centre (2,) in the image, px. The position is NaN if the lens does not
+            image the direction of the Sun's centre.
         radius: radius of the bright disc with its glare, rad.
         residual: rms distance of the used rim points from the circle, px.
         arc: arc of the disc's rim that was used in the fit, rad.
@@ -166,7 +166,7 @@ class SunSolution:
 _MOST_PATCHES = 4
 """Maximum number of bright patches that are examined, starting with the largest."""
 _LEAST_PATCH = 3
-"""Minimum number of pixels of a bright patch on the rows that are read, to exclude hot pixels."""
+"""Minimum number of bright pixels of a patch on the rows that are read, by which hot pixels are excluded."""
 _SPOKES = 48
 """Number of spokes along which the rim of a bright patch is traced."""
 _STEP = 0.5
@@ -190,10 +190,11 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     """
     settings = LINEAR if settings is None else settings
     check_image(image, camera)
-    # Towards the corners, a pinhole camera stretches a disc by the squared secant of the field angle.
+    # Off the axis, a pinhole camera stretches a disc by at most the squared secant of the field angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch
-    # A truncated disc must show at least half its width, because its rim would otherwise be too short.
+    # A truncated disc that shows less than half of its width is excluded, because its visible edge is too
+    # short.
     narrowest = settings.least_radius * camera.focal_length - settings.stride
     patches, wide = _bright_patches(image, settings, narrowest, 2.0 * reach)
     read = camera.columns * len(range(settings.stride // 2, camera.rows, settings.stride))
@@ -215,7 +216,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if reasons:
             return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
         return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
-    # If several bright patches are round, the largest counts as the Sun.
+    # If several bright patches are round, the largest is the Sun.
     sun = max(found, key=lambda one: one.radius)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
@@ -232,7 +233,8 @@ def _bright_patches(
     bright = image[stride // 2 :: stride] >= settings.level
     if not bright.any():
         return [], False
-    # Only the box around all bright pixels is labelled, because labelling takes time for every pixel.
+    # Only the smallest rectangle around all bright pixels is labelled, because the time for labelling grows
+    # with the number of pixels.
     down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
     top, left = int(down[0]), int(across[0])
     labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])
@@ -275,7 +277,7 @@ class _Rim:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Disc:
-    """A bright disc: its rim, the circle fitted to the rim, and px per rad (2, 2) along the rim's basis."""
+    """A bright disc: its rim, the circle fitted to the rim, and the image scale (2, 2), px/rad."""
 
     rim: _Rim
     circle: Circle
@@ -306,7 +308,7 @@ def _disc(
     step = 1e-4
     for _ in range(_ROUNDS):
         rim = _trace(strip, first, camera, axis, settings.level, reach)
-        # The scale at the boresight is used if the surroundings of the axis are outside the lens's range.
+        # The image scale at the boresight is used if the lens does not image the surroundings of the axis.
         ends = camera.project(np.concatenate([axis + step * rim.basis, axis - step * rim.basis]))
         scale = (ends[:2] - ends[2:]).T / (2.0 * step)
         scale = scale if np.all(np.isfinite(scale)) else camera.focal_length * np.eye(2)
@@ -379,7 +381,7 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     if used * 2.0 * np.pi / _SPOKES < settings.least_arc:
         return f"too short an arc of a rim, {used * 360 // _SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
-    # If the lens stretches the disc, a round blur in the image is elongated in directions on the sphere.
+    # If the lens stretches the disc, a blur that is circular in the image is elongated on the sphere.
     widest, narrowest = np.linalg.svd(disc.scale, compute_uv=False)
     if residual > settings.tolerance * math.sqrt(float(widest / narrowest)):
         return f"a rim {residual:.2f} px rms off a circle"
@@ -393,7 +395,7 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
     backward = np.linalg.inv(disc.scale)
     floor = settings.floor_sigma**2 * backward @ backward.T
     axis = disc.axis
-    # The basis vectors of the rim are rotated so that they are normal to the fitted centre.
+    # The basis vectors of the rim are made normal to the direction of the fitted centre.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
     return SunMeasurement(
@@ -412,13 +414,13 @@ _LEAST_POINTS = 6
 """Minimum number of points for the fit of a circle."""
 _CIRCLE_STEPS = 10
 _LAST_STEP = 1e-2
-"""Step of the circle fit at which the iteration stops, relative to the error of a point."""
+"""Step of the circle fit below which the iteration ends, relative to the error of a point."""
 _MOST_CORRELATED = 0.9
 """Largest assumed correlation between the errors of neighbouring points."""
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Fraction of the best circle's number of points from which a smaller circle is preferred.
+"""Fraction of the best circle's number of points with which a smaller circle is preferred.
 
 Stray light enlarges discs, so that a smaller circle is more likely the Sun.
 """
@@ -447,7 +449,8 @@ class Circle:
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     """Return the circle through rim `points` (n, 2), which are in order around it; None if there is none.
 
-    The argument `scale` is the standard deviation of a good point, in the unit of the points.
+    The argument `scale` is the standard deviation of a point that is not an outlier, in the unit of the
+    points.
     """
     solution = _consensus(points, 2.5 * scale) if len(points) >= _LEAST_POINTS else None
     if solution is None:
@@ -487,9 +490,9 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the circle (x, y, radius) with most points within `gate`, of circles through three points.
+    """Return the circle (x, y, radius) through three points that has most points within the distance `gate`.
 
-    The three points are evenly spaced, by an eighth to a third of the rim.
+    The three points of a circle have equal spacings, between an eighth and a third of the rim.
     """
     count = len(points)
     place = np.arange(0, count, 3)
@@ -498,7 +501,8 @@ def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
         for apart in sorted({max(count // part, 1) for part in (3, 4, 6, 8)})
     ]
     first, second, third = np.moveaxis(points[np.concatenate(triples)], 1, 0)
-    # The circumcentre relative to the first point is the intersection of the bisectors of two chords.
+    # The circumcentre, relative to the first point, is the intersection of the perpendicular bisectors of two
+    # chords.
     b, c = second - first, third - first
     cross = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     sound = np.abs(cross) > 1e-9 * np.sum(b * b + c * c, axis=1)
@@ -516,13 +520,13 @@ def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
 
 
 _SIGMAS = 3.0
-"""Number of standard deviations of the coarse Sun direction within which the Sun is expected."""
+"""Radius of the region in which the Sun is expected, in standard deviations of the coarse Sun direction."""
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _SHARES = (1.0 / 6.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 5.0 / 6.0, 1.0)
-"""Angular distances of these directions, as fractions of the largest expected distance."""
+"""Angular distances from the coarse Sun direction at which directions are tested, relative to the largest."""
 _CONTRADICTED = 5.0
-"""Largest distance of measured and coarse Sun direction, in standard deviations of the coarse direction."""
+"""Largest accepted angle between measured and coarse Sun direction, in standard deviations of the latter."""
 _CUT = np.radians(0.05)
 """Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 
@@ -558,7 +562,8 @@ def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[Cam
     angle = np.arange(_RING) * (2.0 * np.pi / _RING)
     root = np.linalg.cholesky(sun.tangent_covariance)
     ring = _SIGMAS * np.stack([np.cos(angle), np.sin(angle)], axis=1) @ root.T @ sun.basis
-    # Solar strings in one plane leave one angle open, so that the samples are spaced by equal angles.
+    # If the normals of the lit strings lie in one plane, one angle is nearly undetermined. The tested
+    # directions are therefore spaced by equal angles.
     reach = np.linalg.norm(ring, axis=1, keepdims=True)
     spaced = (ring / reach * np.tan(share * np.arctan(reach)) for share in _SHARES)
     around = np.concatenate([sun.direction[None, :], *(sun.direction + offset for offset in spaced)])
@@ -597,7 +602,7 @@ def sun_of_cameras(
     strings: CoarseSun,
     settings: SunSettings,
 ) -> SunOfCameras:
-    """Return the Sun in body axes from the first camera that finds it, or else from the solar strings.
+    """Return the Sun direction in body axes from the first camera that finds it, or from the solar strings.
 
     A camera is not read if the solar strings exclude that the Sun is in its field of view. A measured Sun
     that contradicts the solar strings is rejected.

@@ -1,8 +1,8 @@
 """Sub-pixel edges along scan lines of an image, as pixel positions and as directions.
 
-Some columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1.
-Each change from dark to bright is then located at the point of maximum slope of the brightness, smoothed by a
-Gaussian. The width of the smoothing Gaussian is doubled as long as the edge is wider than the Gaussian
+Selected columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section
+3.1. Each change from dark to bright is then located at the point of maximum slope of the brightness, smoothed
+by a Gaussian. The width of the smoothing Gaussian is doubled as long as the edge is wider than the Gaussian
 (Lindeberg 1998, International Journal of Computer Vision 30, 117). Sharp edges and edges a hundred pixels
 wide are therefore both located at the steepest point of the brightness.
 """
@@ -19,7 +19,7 @@ from knightcube.vision.camera.lens import CameraModel, Lens
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
-"""Window (px) of the majority filter that removes short fluctuations of dark and bright pixels."""
+"""Window (px) of the majority filter that removes short runs of dark or bright pixels."""
 
 
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
@@ -38,15 +38,16 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
 
 
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""Standard deviations (px) of the Gaussians that smooth the brightness along a scan line, for all scales."""
+"""Standard deviations (px) of the Gaussians that smooth the brightness along a scan line, ascending."""
 _REACH = 3.0
-"""Largest distance of an edge from the change of dark to bright pixels, in Gaussian standard deviations."""
+"""Largest distance of an edge from the change from dark to bright, in standard deviations of the Gaussian."""
 _TAIL = 3.5
 """Distance from the centre at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
-"""Ratio of an edge's step heights under two successive Gaussians above which the wider Gaussian is used."""
+"""Minimum ratio of an edge's step heights with a wider and with a narrower Gaussian for the wider to be used.
+"""
 _MARGIN = 4.0
-"""Distance from the image border (px) within which edges are ignored; some detectors have a black frame."""
+"""Distance from the image border (px) within which edges are ignored. Some detectors have a black border."""
 _FLOOR, _SHARE = 0.1, 0.05
 """Prior error of an edge's position: a constant (px), and a fraction of the Gaussian's standard deviation."""
 _SAMPLES = 2048
@@ -56,9 +57,9 @@ _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
 _STANDS_OUT = 6.0
 """Threshold above which a pixel counts as bright, in standard deviations of the dark pixels."""
 _LEAST_LIT = 16
-"""Minimum number of bright pixels next to an edge, because fewer pixels may be a hot pixel or a star."""
+"""Minimum number of bright pixels of an image; fewer bright pixels may be hot pixels or stars."""
 _WINDOW = 9
-"""Minimum distance (px) along a scan line of an edge from hidden pixels."""
+"""Minimum distance (px) along a scan line between an edge and a hidden pixel."""
 _PROFILE: IntArray = np.arange(-_WINDOW, 6)
 """Positions of the samples of a stored brightness profile, in px from the edge towards the bright side."""
 
@@ -126,8 +127,8 @@ class ScanEdges:
         sigma: standard deviation of each edge position along the scan line before a fit of the limb (n,), px.
         background: brightness of the dark side (n,), which is low at the limb and the terminator, and higher
             at a coast or a cloud.
-        profile: brightness along the scan line around the edge, from dark to bright (n, m), or NaN outside
-            the image.
+        profile: brightness samples along the scan line around each edge, from dark to bright (n, m); NaN
+            outside the image.
     """
 
     points: FloatArray
@@ -186,7 +187,7 @@ def find_edges(
 
 
 def _touches(hidden: BoolArray, edges: ScanEdges) -> BoolArray:
-    """Return which edges (n,) have hidden pixels among the pixels that determine their position."""
+    """Return which edges (n,) are so close to hidden pixels that these affect the position of the edge."""
     reach = np.maximum(_WINDOW, (_REACH + _TAIL) * edges.scale)
     steps = np.linspace(-1.0, 1.0, 2 * _WINDOW + 1)
     points = edges.points[:, None] + edges.towards[:, None] * (reach[:, None] * steps)[..., None]
@@ -202,7 +203,7 @@ def _at(mask: BoolArray, points: FloatArray) -> BoolArray:
 
 
 def _levels(light: list[FloatArray], masked: list[BoolArray] | None = None) -> Levels:
-    """Return the brightness levels of scan lines; dark and bright level are equal if no pixel is bright.
+    """Return the brightness levels of scan lines; both levels are equal if too few pixels are bright.
 
     The bright level is the median of all pixels that exceed the noise of the dark pixels, so that the Sun's
     disc and hot pixels have no effect. Pixels in the masks `masked` of the scan lines are not used.
@@ -224,7 +225,8 @@ def _levels(light: list[FloatArray], masked: list[BoolArray] | None = None) -> L
     dark = np.abs(np.concatenate(steps)[values <= least + 0.1 * (most - least)])
     middle = len(dark) // 2
     noise = float(np.partition(dark, middle)[middle]) * _STEP_TO_SIGMA
-    # The second percentile lies two standard deviations below the mean of the dark pixels.
+    # The second percentile of the pixels lies about two standard deviations below the mean of the dark
+    # pixels.
     low = least + 2.0 * noise
     lit = order[np.searchsorted(order, low + max(_STANDS_OUT * noise, 0.05 * (most - low)), "right") :]
     if len(lit) < _LEAST_LIT or most <= low:
@@ -300,8 +302,9 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
     """Return the steepest point of the brightness near each of k changes between dark and bright.
 
     The three returned arrays (k,) are the distance of the point from the start of the change, px, the
-    standard deviation of the Gaussian that found the point, px, and the step height. The step height is that
-    of a sharp step with the same slope. A point with a step height below `weak` is not an edge.
+    standard deviation of the Gaussian that found the point, px, and the step height. The step height is the
+    height of an unblurred step that has the same slope after the smoothing. A point with a step height below
+    `weak` is not an edge.
     """
     count = len(changes.start)
     offset, height, scale = np.zeros(count), np.zeros(count), np.ones(count)
@@ -320,7 +323,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
         left, peak, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
         bend = np.minimum(left - 2.0 * peak + right, -1e-300)
         place = best - reach + np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
-        # A step lower than the threshold `weak` is noise and does not end the search for a wide edge.
+        # A step lower than the threshold `weak` is noise, so that the search continues with wider Gaussians.
         before = height[open_]
         gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
         open_ = open_[gains]
@@ -330,7 +333,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 
 @lru_cache(maxsize=16)
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
-    """Return the matrix that gives the smoothed slope at p positions from the brightness at w pixels.
+    """Return the matrix that computes the smoothed slope at p positions from the brightness of w pixels.
 
     The three returned values are the offsets of the pixels from the centre (w,), px, the slope matrix (w, p),
     and the largest offset of a slope position, px. The smoothing Gaussian has the standard deviation `size`,
@@ -339,7 +342,8 @@ def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)
     kernel = x * np.exp(-0.5 * (x / size) ** 2)
-    # The response of the derivative kernel to a step between two pixels is the sum over half of the kernel.
+    # The response of the derivative kernel to a step between two pixels is the sum of the kernel's positive
+    # half.
     kernel = kernel / np.sum(kernel[x > 0])
     window = np.arange(-reach - half, reach + half + 1)
     matrix = np.zeros((len(window), 2 * reach + 1))
@@ -360,8 +364,8 @@ class EdgeRays:
 
     Attributes:
         rays: unit vectors to the edges (n, 3), camera axes.
-        brighter: change of the unit vector to each edge per pixel along the scan line towards the bright side
-            (n, 3).
+        brighter: derivative of the unit vector to each edge (n, 3) by the position along the scan line, per
+            pixel towards the bright side.
         pixel: angular size of a pixel at each edge (n,), rad.
     """
 
@@ -404,7 +408,8 @@ class Observation:
         space: distance between the scan lines, px.
         edges: edges of the image as pixel positions.
         rays: edges of the image as directions.
-        across, down: change of an edge's unit vector per pixel to the right and per pixel downwards (n, 3).
+        across, down: derivatives of the unit vector to each edge (n, 3), per pixel to the right and per pixel
+            downwards.
         samples: directions and brightness of sampled pixels on the scan lines.
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
     """
@@ -418,7 +423,7 @@ class Observation:
     hidden: BoolArray | None = None
 
     def visible(self, points: FloatArray) -> BoolArray:
-        """Return which points (n, 2), px, have no hidden pixels around them, at which edges can be found."""
+        """Return which points (n, 2), px, are far enough from hidden pixels for edges to be found there."""
         if self.hidden is None:
             return np.ones(len(points), dtype=bool)
         around = np.stack(np.meshgrid(*(_WINDOW * np.arange(-1.0, 2.0),) * 2), axis=-1).reshape(-1, 2)
@@ -430,7 +435,7 @@ class Observation:
 def observe(
     edges: ScanEdges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
 ) -> Observation:
-    """Return edges and sampled pixels as directions, without edges beyond the field of the lens.
+    """Return edges and sampled pixels as directions, except edges at pixels that the lens does not image.
 
     If `samples` is given, these samples are used instead of samples of the scan lines.
     """
@@ -485,7 +490,7 @@ def _sample_levels(light: FloatArray, levels: Levels) -> FloatArray:
 
 
 def _hidden_samples(masked: BoolArray) -> BoolArray:
-    """Return which sampled pixels of scan lines with a mask (n, m) have hidden pixels in their averages."""
+    """Return which samples of scan lines include hidden pixels, given the mask (n, m) of hidden pixels."""
     size, half = masked.shape[1], _AVERAGED + _AVERAGED // 2
     index = _sample_places(size)[:, None] + np.arange(-half, half + 1)
     return np.asarray(masked[:, np.clip(index, 0, size - 1)].any(axis=2).ravel())

@@ -1,10 +1,11 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
 The significance of a horizon is an upper bound of the expected number of equally good horizons that chance
-edges form, such as coasts and the rims of clouds. The density of chance edges is estimated from the edges
-that lie beside the limb. A coast or the rim of a cloud with radius R that touches the limb stays within a
-distance g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of a coast or
-cloud are not independent, so that the test counts segments of this length instead of scan lines.
+edges form. Chance edges are edges such as coasts and the borders of clouds. The density of chance edges is
+estimated from the number of edges beside the limb. A coast or the border of a cloud with the radius of
+curvature R, tangent to the limb, stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan
+lines that cross the same segment of a coast or cloud are not independent. The test therefore counts limb
+segments of this length instead of scan lines.
 """
 
 from __future__ import annotations
@@ -48,19 +49,19 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
-"""Minimum cosine of the angle between scan line and limb normal; oblique scan lines are inaccurate."""
+"""Minimum cosine of the angle between scan line and limb normal. Oblique scan lines are inaccurate."""
 _LOWEST_SUN = np.radians(1.0)
 """Minimum elevation of the Sun (rad) at a limb point; with a lower Sun the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size at the limb (m) below which the stored samples do not cover the brightness profile of air."""
+"""Pixel size at the limb (m) below which the profile samples do not cover the air's brightness profile."""
 _CORRELATED = 10.0
 """Correlation length (px), along the limb, of the brightness of the ground behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
-"""Standard deviation (px) of the blur that a square pixel causes."""
+"""Standard deviation (px) of the blur by the averaging of light over a square pixel."""
 _LEAST_SPREAD = 0.03
-"""Minimum standard deviation (px) of a limb position that is fitted to a brightness profile."""
+"""Minimum assumed standard deviation (px) of a limb position that is fitted to a brightness profile."""
 _OTHER_AIR = 500.0
-"""Error of the limb height (m) between bright and dark ground, due to the unknown density of the air."""
+"""Error of the limb height (m) due to the unknown brightness of the ground and density of the air."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +95,7 @@ def near_limb(view: LimbView, observation: Observation, tolerance: float) -> Boo
 def _limb_points(
     view: LimbView, observation: Observation, members: BoolArray, sun: FloatArray | None
 ) -> LimbPoints:
-    """Return limb points from those edges in `members` (n,) that are sunlit and on no oblique scan line."""
+    """Return limb points from the sunlit edges in the mask `members` (n,), except on oblique scan lines."""
     chosen = np.flatnonzero(members)
     rays = observation.rays.rays[chosen]
     if sun is not None:
@@ -125,7 +126,7 @@ def _placed_by_profile(
     shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
     rays = limb.rays + shift[:, None] * observation.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
-    # Scan lines closer to each other than the size of ground features are not independent.
+    # Scan lines whose spacing is smaller than the ground features are not independent.
     correlated = np.sqrt(max(1.0, _CORRELATED / observation.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
     sigma = correlated * np.hypot(spread, least) * limb.inward * limb.pixel
@@ -133,11 +134,11 @@ def _placed_by_profile(
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""Trial distances (px) from the limb within which edges count; the most significant result is used."""
+"""Trial distances (px) from the limb within which edges are counted. The most significant result is used."""
 _ROUND = 0.1
-"""Assumed radius of curves on which chance edges lie, such as coasts, as a fraction of the image size."""
+"""Assumed radius of curvature of coasts and other lines of chance edges, as a fraction of the image size."""
 _BESIDE = 0.05
-"""Distance from the limb within which chance edges are counted, as a fraction of the image size."""
+"""Largest distance of counted chance edges from the limb, as a fraction of the image size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +171,8 @@ def limb_in_view(
         step = np.abs(np.roll(points, -1, axis=0) - points)
     both = [kept & np.roll(kept, -1) for kept in (inside & due, inside)]
     size = np.hypot(step[:, 0], step[:, 1])
-    # A step along the limb crosses scanned columns by its x component and scanned rows by its y component.
+    # The x component of a step along the limb gives the number of crossed columns, and the y component the
+    # number of crossed rows.
     crossings = np.sum(step * (step > _GRAZING * size[:, None]) / np.array(space), axis=1)
     return LimbInView(
         *(float(np.sum(each)) for each in (size[both[0]], crossings[both[0]], crossings[both[1]]))
@@ -180,11 +182,11 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of an upper bound of the expected number of chance limbs that fit equally well.
+    """Return log10 of the upper bound of the expected number of chance limbs that fit equally well.
 
     Args:
         limb: length of the limb in the image, and its crossings with scan lines.
-        residuals: distances of the k edges on the limb from the limb (k,), px.
+        residuals: distances from the fitted limb of the k edges that belong to the limb (k,), px.
         others: distances of all other edges from the limb (m,), px.
         camera: camera that took the image.
         unknowns: number of fitted parameters, 2 for nadir alone and 3 for nadir and altitude.
@@ -192,7 +194,8 @@ def log10_chance(
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
     beside = _BESIDE * size
-    # One edge is added, so that the density of chance edges is positive even if no edge lies beside the limb.
+    # One edge is added, so that the density of chance edges is positive even if the limb has no edges beside
+    # it.
     near = np.count_nonzero(np.abs(others) < beside) + 1.0
     density = near / (2.0 * beside * max(limb.all_crossings, lines))
     best = math.inf
@@ -201,7 +204,8 @@ def log10_chance(
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        # Chernoff's bound (log10) of the probability that chance edges hit the fraction `share` of segments.
+        # The variable `tail` is Chernoff's bound (log10) of the probability that chance edges lie on at least
+        # the fraction `share` of the limb segments.
         tail = 0.0
         if share > chance:
             rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))
@@ -211,15 +215,18 @@ def log10_chance(
 
 
 _UNKNOWN_TURN = 1.0
-"""Prior standard deviation (rad) of an unknown rotation about nadir, which has no effect for a sphere."""
+"""Prior standard deviation (rad) of an unknown rotation about nadir.
+
+The rotation has no effect for a sphere.
+"""
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun at a limb point (rad) below which the limb is too dark to show an edge."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
-"""Number of points along the limb for computing its coverage by edges, and for its significance."""
+"""Number of limb points for the coverage by edges, and number for the length of the limb in the image."""
 _BORDER = 8.0
-"""Distance from the image border (px) within which the limb need not show edges."""
+"""Width of the zone along the image border (px) in which no edges of the limb are expected."""
 _NEAR = 0.0375
-"""Distance of an edge within which a limb point counts as covered, as a fraction of the image size."""
+"""Largest distance from an edge at which a limb point counts as covered, as a fraction of the image size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,19 +236,21 @@ class Hypothesis:
     Attributes:
         fit: the fitted limb.
         members: mask of the image's edges that lie on the fitted horizon (n,).
-        squares: squared distance of each edge from the fitted horizon in standard deviations (n,); infinite
-            for an edge away from the horizon, and NaN for an edge near it to which the horizon is not fitted.
+        squares: squared distance of each edge from the fitted horizon in standard deviations (n,). The value
+            is infinite for an edge away from the horizon, and NaN for an edge near the horizon that the fit
+            does not use.
         limb: limb points from the edges on the fitted horizon.
         residual: rms distance of the fitted edges from the limb, px.
         guess: initial guess from which the fit started.
-        lighting: agreement of the horizon with the brightness of the image.
+        lighting: agreement of the brightness of the image with the view of the Earth that the horizon
+            implies.
         coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 if the image shows no
             sunlit limb.
         night: fraction of the edges on the horizon at which the Sun is well below the horizon.
-        allowance: standard deviation per axis, rad, that is added to the nadir for effects that are not
-            modelled.
+        allowance: standard deviation per axis, rad, by which the uncertainty of the nadir is increased for
+            unmodelled effects.
         chance: log10 of the expected number of equally good chance horizons, from `log10_chance`.
-        breadth: median width of the edges on the horizon, relative to the width expected from the air's
+        breadth: ratio of the median width of the edges on the horizon to the width expected from the air's
             brightness profile.
         not_space: why the image beyond the horizon is not space, or an empty string if it may be space.
         altitude_off: distance of a fitted altitude from the range `HorizonSettings.altitudes`, in standard
@@ -294,7 +303,7 @@ def examine(
     squares[limb.index] = (fit.residuals / limb.sigma) ** 2
     pixel = float(np.median(observation.rays.pixel[used]))
     air = UNIT_DEPTH_HEIGHT / (view.limb_distance * pixel)
-    # The part of the limb that is known to be on the night side is not expected to show edges.
+    # No edges are expected on the part of the limb that is known to be on the night side.
     rays = limb_rays(view, _FINE_RAYS)
     points = camera.project(rays)
     inside = camera.contains(points, -_BORDER) & observation.visible(points)

@@ -1,23 +1,23 @@
 """Comparison of images with the brightness that an assumed view of the Earth predicts, and a coarse nadir.
 
-A correctly assumed view of the Earth agrees with the whole image: sky and night side are dark, and the sunlit
-limb has edges along its entire length. A view that was fitted to the terminator instead of the limb does not
-agree with the image. Meller et al., section 3.3, do not state how to distinguish the limb from the
-terminator.
+If the assumed view of the Earth is correct, the whole image agrees with it: sky and night side are dark, and
+the sunlit limb has edges along its entire length. A view that was fitted to the terminator instead of the
+limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish the limb from
+the terminator.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
 al., section 4.1). If the Earth fills the field of one camera, `coarse_nadir` tries nadir directions that
 cover the sphere. For each trial nadir, `coarse_nadir` predicts that the samples on the sunlit part of the
 Earth's disc are bright. The coarse nadir is the mean of the trial directions, weighted by their likelihood
 given the samples, and the covariance of the nadir is the spread of the weighted directions. If the direction
-of the Sun is unknown, any sample on the Earth's disc may be dark.
+of the Sun is unknown, any sample on the Earth's disc may be dark, because it may be on the night side.
 
 The function `why_not_space` tests whether the dark side of an assumed limb looks like space.
 
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
 attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An
-image that contradicts the attitude is taken by a camera that is dead, blinded, mounted upside down or sends
-random data. The comparison excludes samples near the limb, in the twilight zone and near the Sun.
+image contradicts the attitude if its camera has failed, is blinded, is mounted upside down or sends random
+data. The comparison excludes samples near the limb, in the twilight zone and near the Sun.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from knightcube.vision.horizon.edges import Samples
 from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals
 
 _TWILIGHT = np.radians(12.0)
-"""Depression of the Sun below the horizon (rad) above which ground and air count as dark."""
+"""Depression angle of the Sun below the horizon (rad) above which ground and air count as dark."""
 DAYLIGHT = np.radians(8.0)
 """Elevation of the Sun (rad) above which ground and limb count as sunlit."""
 GLARE = np.radians(12.0)
@@ -49,9 +49,10 @@ class Agreement:
     """Agreement of an assumed view of the Earth with the brightness of an image.
 
     Attributes:
-        stray: fraction of the samples in the sky and on the night side that are bright.
-        missing: fraction of the samples on sunlit ground that are dark.
-        dark_samples, lit_samples: number of samples in the sky and on the night side, and on sunlit ground.
+        stray: fraction of bright samples among the samples in the sky or on the night side.
+        missing: fraction of dark samples among the samples on sunlit ground.
+        dark_samples, lit_samples: number of samples in the sky or on the night side, and number of samples on
+            sunlit ground.
     """
 
     stray: float
@@ -100,16 +101,18 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
 
 
 _LEAST_GLARE, _IN_GLARE = 4, 0.8
-"""Minimum number and fraction of the bright samples in the sky that lie in the glare of an unknown Sun."""
+"""Minimum number of bright samples in the sky, and minimum fraction in the glare, that indicate the Sun."""
 _ROUND_GLARE = 0.85
-"""Minimum fraction of bright samples among as many samples around the Sun as the glare has bright ones."""
+"""Minimum fraction of bright samples among the k samples nearest to the Sun for round glare of k samples."""
 
 
 def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> BoolArray:
     """Return which rays (n, 3) are outside the glare of a Sun whose direction is unknown.
 
-    The Sun is assumed at the mean of the samples in the `sky` (n,) that are `bright` (n,), if most of these
-    samples are within its glare and form a round patch. A band of clouds is not round.
+    The assumed direction of the Sun is the mean direction of the bright samples in the sky, if most of these
+    samples are within the glare of this direction and form a round patch. The masks `sky` (n,) and `bright`
+    (n,) mark the samples in the sky and the bright samples. A band of clouds is not round and is therefore
+    not glare.
     """
     everywhere = np.ones(len(rays), dtype=bool)
     bright = bright & sky
@@ -128,25 +131,25 @@ def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> Boo
 
 
 _LEAST_SKY = 8
-"""Minimum number of samples in the sky to judge whether the sky is space."""
+"""Minimum number of samples in the assumed sky for the test whether the sky looks like space."""
 _DIM_AIR = 30e3
-"""Height (m) above the limb at which the air has 3 % of its brightness, for images without darker sky."""
+"""Height (m) above the limb at which the air has 3 % of its brightness, for images that show no sky above."""
 _CLEAR = 24.0
-"""Distance from the limb (px) beyond which no pixel that contributes to a sample images the Earth."""
+"""Distance from the limb (px) beyond which the pixels averaged in a sample do not image the Earth."""
 _DARKEST = 0.15
 """Largest median brightness of space, as a fraction of the range from the dark to the bright level."""
 _BLACKEST = 0.35
 """Largest dark level of an image of space, as a fraction of the bright level."""
 _SMOOTHEST, _NOISES = 0.01, 2.0
-"""Largest mottle of space: an absolute value, and a multiple of the noise of a sample."""
+"""Largest mottle (texture) of space: an absolute value, and a multiple of the noise of a sample."""
 
 
 def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixel: float) -> str:
-    """Return why the image beyond an assumed limb is not space, or an empty string if it may be space.
+    """Return why the image beyond an assumed limb does not look like space, or an empty string if it does.
 
-    Space is dark and has no texture beyond the noise of the detector. Stray light is smooth. Ground below a
-    bright sky, and clouds, have texture. Medians are compared, so that stars and structure of the spacecraft
-    in less than half of the sky have no effect.
+    Space is dark and has no texture beyond the noise of the detector. Stray light is smooth. Clouds have
+    texture, and so has ground in front of a bright sky. The test compares medians, so that stars and
+    spacecraft structure have no effect if they cover less than half of the sky.
 
     Args:
         view: assumed view of the Earth.
@@ -178,7 +181,7 @@ def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixe
 
 
 def limb_rays(view: LimbView, count: int) -> FloatArray:
-    """Return unit vectors (count, 3) in camera axes to points that are spaced around the limb."""
+    """Return unit vectors (count, 3) in camera axes to points at equal intervals around the limb."""
     stretching = view.surface.stretching(view.limb_height)
     centre = -(stretching @ view.position)
     size = float(np.linalg.norm(centre))
@@ -196,9 +199,9 @@ _SAMPLES = 8
 _DIRECTIONS = 2000
 """Number of trial directions of nadir, about 4.5 deg apart."""
 _STRAY = 0.03
-"""Probability that a sample in the sky is bright, and that a sample on sunlit ground is dark."""
+"""Probability that a sample in the sky is bright, equal to that of a dark sample on sunlit ground."""
 _WEIGHT = 0.2
-"""Weight of a sample in the log-likelihood; below 1 because neighbouring samples have correlated errors."""
+"""Weight of a sample in the log-likelihood, below 1 because neighbouring samples have correlated errors."""
 _WIDEST = math.radians(30.0)
 """Largest standard deviation per axis (rad) of a coarse nadir."""
 _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
@@ -207,7 +210,7 @@ _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageBrightness:
-    """Samples of one image: unit vectors (n, 3) in body axes, and which samples are bright (n,)."""
+    """Samples of one image: unit vectors (n, 3) in body axes, and mask of the bright samples (n,)."""
 
     rays: FloatArray
     bright: BoolArray
@@ -220,7 +223,7 @@ class ImageBrightness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseNadir:
-    """A nadir with an uncertainty of some degrees.
+    """An estimated nadir with an uncertainty of several degrees.
 
     Attributes:
         direction: unit vector (3,) in body axes.
@@ -243,10 +246,10 @@ def image_brightness(
 ) -> ImageBrightness:
     """Return which of 8 x 8 samples of an image (rows, columns) are bright, with their directions.
 
-    Samples in the mask `hidden` (rows, columns) are left out.
+    Samples in the mask `hidden` (rows, columns) are omitted.
 
-    The argument `bright` is the threshold, counts. The threshold must be below the brightness of a dark sea
-    under a low Sun, and above stray light beside the Earth.
+    The argument `bright` is the threshold, counts. The threshold must be lower than the counts of a dark sea
+    under a low Sun, and higher than the counts of stray light beside the Earth.
     """
     rows, columns = (_sample_indices(size) for size in image.shape)
     lit = bright < image[np.ix_(rows, columns)].T
@@ -313,7 +316,7 @@ def _bright_probability(
 
 
 def _sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, distance: float) -> FloatArray:
-    """Return the sine of the Sun's elevation where rays meet the surface of a sphere.
+    """Return the sine of the Sun's elevation at the points where rays meet the surface of a sphere.
 
     Args:
         cosine: cosine of the angle between each ray from the camera and nadir.
@@ -331,7 +334,7 @@ def _sample_indices(size: int) -> IntArray:
 
 @lru_cache(maxsize=8)
 def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
-    """Return which sample positions the lens images, and unit vectors (m, 3) to them, camera axes."""
+    """Return a mask of the samples that the lens images, and the unit vectors (m, 3) of these samples."""
     x, y = np.meshgrid(_sample_indices(lens.columns), _sample_indices(lens.rows), indexing="ij")
     rays = lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
     imaged = np.isfinite(rays[:, 0])
@@ -349,15 +352,18 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle (rad) from the limb within which air and an attitude error of 1 deg affect samples."""
+"""Angle (rad) from the limb within which the air or an attitude error of 1 deg may change a sample."""
 _DAY = DAYLIGHT + math.radians(12.0)
 """Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
 """Angle between the Sun and the nearest sample (rad) below which stray light may cover the whole image."""
 _LEAST = 8
-"""Minimum number of compared samples, out of 64, to judge whether an image contradicts the attitude."""
+"""Minimum number of comparable samples, out of 64, for the test whether an image contradicts the attitude."""
 _MOST = 0.6
-"""Threshold of the fraction of samples that contradict the attitude; clouds alone do not exceed it."""
+"""Fraction of contradicting samples above which an image contradicts the attitude.
+
+Clouds alone cause less.
+"""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:

@@ -1,18 +1,18 @@
 """Initial guess of a horizon: the cone with which most edges agree, and the camera's rotation about nadir.
 
-All rays u to the limb of a sphere make the same angle rho with the nadir n, so that u.g = 1 with g = n / cos
-rho, an equation that is linear in g (Christian & Robinson 2016). If the angle rho is known, two rays to the
-limb determine the nadir up to two solutions. If the angle rho is unknown, three rays to the limb determine
-rho and the nadir. Every pair of edges gives a trial cone, or every triple if the altitude is unknown. If
-there are too many pairs or triples of edges, an evenly spaced selection is used. An edge agrees with a cone
-if the edge lies near the cone and its bright side is towards nadir. The edges of the best cone are removed
-and the search is repeated, so that the terminator, a coast or a band of clouds gives a separate cone. The
-search for cones is a sample consensus (Fischler & Bolles 1981) without random selection.
+All rays u to the limb of a sphere make the same angle rho with the nadir n. Therefore u.g = 1 with g = n /
+cos rho, and this equation is linear in g (Christian & Robinson 2016). If the angle rho is known, two rays to
+the limb determine the nadir up to two solutions. If the angle rho is unknown, three rays to the limb
+determine rho and the nadir. Every pair of edges gives a trial cone, or every triple if the altitude is
+unknown. If there are too many pairs or triples of edges, an evenly spaced selection is used. An edge agrees
+with a cone if the edge lies near the cone and the bright side of the edge is towards nadir. The edges of the
+best cone are removed and the search is repeated, so that the terminator, a coast or a band of clouds gives a
+separate cone. The search for cones is a sample consensus (Fischler & Bolles 1981) without random selection.
 
 A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
 flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. The
 rotation about nadir is derived from a rough attitude, the coarse direction of the Sun or the magnetic field.
-The angles between nadir and the known directions are also known, so that a nadir at a different angle is
+The angle between nadir and each known direction is also known, so that a nadir at a different angle is
 rejected.
 """
 
@@ -43,7 +43,7 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _PARALLEL = 1e-12
-"""Squared sine of the angle between two rays below which they count as parallel."""
+"""Squared sine of the angle between two rays below which the rays count as parallel."""
 
 
 def nadirs_of_pairs(first: FloatArray, second: FloatArray, cosine: float) -> FloatArray:
@@ -98,7 +98,7 @@ class ConeCandidate:
 def best_cone(
     edges: EdgeRays, free: BoolArray, cosines: tuple[float, float], tolerance: float, tries: int
 ) -> ConeCandidate | None:
-    """Return the cone with which most of the `free` edges agree, or None if no cone can be formed.
+    """Return the cone with which most edges in the mask `free` agree, or None if no cone can be formed.
 
     Args:
         edges: edges of the image as directions.
@@ -132,7 +132,7 @@ def best_cone(
 
 
 def left_free(edges: EdgeRays, free: BoolArray, cone: ConeCandidate, tolerance: float) -> BoolArray:
-    """Return which of the `free` edges (n,) are farther from a cone than twice the `tolerance` (px)."""
+    """Return which edges in the mask `free` (n,) are farther from a cone than twice the `tolerance` (px)."""
     near = _agreeing(edges, cone.direction[None], np.array([cone.cosine]), 2.0 * tolerance)[0]
     return np.asarray(free & ~near & ~cone.members)
 
@@ -148,10 +148,11 @@ def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
 
 
 def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of up to `tries` triples of `count` items, with short and long distances."""
+    """Return the indices of up to `tries` triples of `count` items, with differences of all sizes."""
     number = np.arange(tries)
     first = number % count
-    # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the distances evenly.
+    # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the index differences
+    # evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -174,9 +175,12 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
 
 
 MOST_MISMATCH = 4.0
-"""Largest accepted disagreement of a nadir with a coarse sensor, in standard deviations."""
+"""Largest accepted difference between a nadir and a coarse sensor's measurement, in standard deviations."""
 _GUESS_SIGMA = math.radians(0.2)
-"""Error (rad) of the nadir from a cone before the limb is fitted; measured errors are 0.07 to 0.3 deg."""
+"""Standard deviation (rad) of the nadir from a cone, before the fit of the limb.
+
+Measured errors are 0.07 to 0.3 deg.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,11 +188,12 @@ class Orientation:
     """The attitude of a camera for an assumed nadir, with the rotation about nadir from known directions.
 
     Attributes:
-        rotation: rotation matrix (3, 3) from inertial to camera axes; it agrees with the assumed nadir.
+        rotation: rotation matrix (3, 3) from inertial to camera axes, consistent with the assumed nadir.
         sigma: standard deviation of the camera's rotation about nadir, rad; infinite if the rotation is
             unknown.
-        mismatch: largest disagreement of a known direction with the assumed nadir, in standard deviations.
-        share: fraction of all nadir directions that agree with the known directions.
+        mismatch: largest difference between the measured and the expected angle from the assumed nadir to a
+            known direction, in standard deviations.
+        share: fraction of the sphere on which a nadir agrees with the known directions.
     """
 
     rotation: FloatArray
@@ -253,7 +258,7 @@ def _length(vector: Vector) -> float:
 def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     """Return the smallest rotation (3, 3) from one unit vector to another.
 
-    For opposite vectors, the result is a half turn about an arbitrary normal axis.
+    For opposite vectors, the result is a rotation of 180 deg about an arbitrary axis normal to both.
     """
 
     def half_turn(axis: FloatArray, square: float) -> FloatArray:
@@ -263,14 +268,15 @@ def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     square = float(middle @ middle)
     if square < 1e-12:
         return half_turn(tangent_basis(source)[0], 1.0)
-    # A half turn about `source` and a half turn about `middle` give the smallest rotation to `target`.
+    # A rotation of 180 deg about `source` followed by one about `middle` is the smallest rotation to
+    # `target`.
     return np.asarray(half_turn(middle, square) @ half_turn(source, 1.0))
 
 
 SPHERE_ALTITUDE_SIGMA = 10e3
-"""Error (m) of a fitted altitude above the mean sphere due to the flattening of the Earth."""
+"""Standard deviation (m) of a fitted altitude above the mean sphere due to the flattening of the Earth."""
 _RADIUS_SIGMA = math.sqrt(4.0 / 45.0) * (SEMI_MAJOR_AXIS - SEMI_MINOR_AXIS)
-"""Standard deviation (m) of the Earth's radius over all places on a sphere, 6.4 km."""
+"""Standard deviation (m) of the Earth's radius over all positions on the sphere, 6.4 km."""
 _TURNS = 24
 """Number of trial rotations about nadir if the rotation is unknown."""
 
@@ -305,19 +311,19 @@ def above_sphere(altitude: float, sigma: float = 0.0) -> Place:
 
 
 def limb_radius_sigma(altitude: float) -> float:
-    """Return the standard deviation (m) of the mean radius of the limb from an unknown place.
+    """Return the standard deviation (m) of the limb's mean radius if the position of the camera is unknown.
 
     The difference between the ellipsoid and the mean sphere is a spherical harmonic of degree 2. The mean of
-    this harmonic over the limb is the value below the camera, multiplied by the Legendre polynomial P2 of the
-    cosine of the angle between the limb and the camera at the Earth's centre. `altitude` is above the mean
-    sphere, m.
+    this harmonic over the limb is its value at the sub-camera point multiplied by P2(cos a). P2 is the
+    Legendre polynomial, and a is the angle at the Earth's centre between the camera and the limb. The
+    `altitude`, m, is measured from the mean sphere.
     """
     cosine = MEAN_RADIUS / (MEAN_RADIUS + altitude)
     return _RADIUS_SIGMA * abs(1.5 * cosine**2 - 0.5)
 
 
 def limb_tilt_sigma(view: LimbView, stand: Orientation, settings: HorizonSettings) -> float:
-    """Return the standard deviation per axis (rad) of the tilt of the limb by an unknown flattening.
+    """Return the standard deviation per axis (rad) of the limb's tilt by a flattening of unknown direction.
 
     The tilt is 0 if the rotation about nadir, and with it the direction of the flattening, is known.
     """
@@ -332,14 +338,14 @@ def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | 
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
     if knowledge.altitude is not None:
-        # A larger Earth has the same effect on the limb as a lower altitude.
+        # A larger Earth radius has the same effect on the limb as a lower altitude.
         nearer = (MEAN_RADIUS + knowledge.altitude) / MEAN_RADIUS
         return above_sphere(knowledge.altitude, nearer * limb_radius_sigma(knowledge.altitude))
     return None
 
 
 def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the unit vector (3,) to the Sun, inertial axes, or None if Sun or position are unknown."""
+    """Return the unit vector (3,) to the Sun, inertial axes, or None if Sun or position is unknown."""
     if knowledge.sun is None or not place.located:
         return None
     return np.asarray(knowledge.sun / np.linalg.norm(knowledge.sun))
@@ -367,9 +373,9 @@ def initial_guess(
 ) -> InitialGuess:
     """Return the initial guess of a horizon from a cone; `place` is None if the altitude is unknown.
 
-    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If the direction of the Sun
-    is known, several trial rotations about nadir are compared with the brightness of the image, and the best
-    is used.
+    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If in addition the direction
+    of the Sun is known, several trial rotations about nadir are compared with the brightness of the image,
+    and the best is used.
     """
     if place is None:
         sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))

@@ -1,8 +1,8 @@
 """The Earth's limb: its direction from a camera, its brightness profile, and robust fits of both.
 
-A scaling along the axes of the Earth's ellipsoid transforms the ellipsoid into the unit sphere, whose limb is
-a circular cone about the direction of the centre. The scaling transforms rays into rays, so that a ray lies
-on the ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016,
+A scaling along the axes of the Earth's ellipsoid transforms the ellipsoid into the unit sphere. The limb of
+the sphere is a circular cone about the direction of its centre. A scaled ray is a ray as well, so that a ray
+lies on the ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016,
 "Noniterative Horizon-Based Optical Navigation by Cholesky Factorization", Journal of Guidance, Control, and
 Dynamics 39, 2757). The residual of a ray is the angle between the scaled ray and the scaled direction of the
 centre, minus the half-angle of the limb cone. The residual of a ray is 0 on the limb and positive outside of
@@ -11,16 +11,16 @@ the Earth. The gradient of the residuals is analytic.
 The limb cone is fitted by a Gauss-Newton iteration. Huber's weights, with zero weight beyond five standard
 deviations, exclude clouds, glare and the ends of the terminator. The standard deviation of the residuals is
 estimated from the median of the residuals if this estimate exceeds the stated standard deviation. The limb
-height, the rotation about nadir and the altitude, which the limb does not determine, have a prior, so that
-the covariance includes their uncertainty.
+does not determine the limb height, the rotation about nadir and the altitude. These parameters have a prior,
+so that the covariance includes their uncertainty.
 
 Along a line of sight with the tangent height h, the optical depth of the air is t(h) = t0 exp(-h/H) with t0 =
 t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and H
 the scale height of the air. A line of sight with a tangent height h < 0 ends on the ground at an elevation
 whose sine is sqrt(-2h/R). The brightness of sunlit air at the optical depth t is 1 - exp(-t), and the air
-attenuates the ground by exp(-t). Without blur, the brightness falls fastest at the optical depth t = 1, at a
-tangent height of 15.4 km. Refraction is neglected. Refraction lowers the apparent limb by 1 to 2 km, which is
-within `HorizonSettings.limb_height_sigma`.
+attenuates the light from the ground by the factor exp(-t). Without blur, the brightness falls fastest at the
+optical depth t = 1, at a tangent height of 15.4 km. Refraction is neglected. Refraction lowers the apparent
+limb by 1 to 2 km, which is within `HorizonSettings.limb_height_sigma`.
 
 The brightness profile across an edge is fitted by background + a air(h) + b ground(h), where a and b are
 free, and the tangent height h falls by a known number of metres per pixel. The position of unit optical depth
@@ -58,7 +58,7 @@ class Ellipsoid:
     polar: float
 
     def stretching(self, height: float = 0.0) -> FloatArray:
-        """Return the symmetric L (3, 3) with |L x| = 1 for points x on the ellipsoid raised by `height` m."""
+        """Return a symmetric matrix L (3, 3): |L x| = 1 for x on the ellipsoid enlarged by `height`, m."""
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:
@@ -91,7 +91,7 @@ def mean_sphere() -> Ellipsoid:
 PARAMETERS = 5
 """Number of fitted parameters: a small rotation in camera axes (3, rad), limb height (m), altitude (m)."""
 LIMB_HEIGHT, ALTITUDE = 3, 4
-"""Indices of limb height and altitude among the fitted parameters."""
+"""Indices of the limb height and of the altitude in an array of the fitted parameters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +121,7 @@ class LimbView:
         return math.sqrt(max(float(self.position @ self.position) - self.surface.equatorial**2, 1.0))
 
     def moved(self, step: FloatArray) -> LimbView:
-        """Return the view of the camera after a step (5,) of the fitted parameters."""
+        """Return the view after the fitted parameters change by a step (5,)."""
         distance = float(np.linalg.norm(self.position))
         return LimbView(
             turn(step[:3]) @ self.rotation,
@@ -176,8 +176,8 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     lengths = np.sqrt(np.einsum("ij,ij->i", stretched, stretched))
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
-    # The derivative with respect to the scaled ray is transformed into camera axes.
-    # The matrix product also gives the permuted components for the cross product with the ray.
+    # The derivative with respect to the scaled ray is transformed into camera axes. The same matrix product
+    # also computes the permuted components that the cross product with the ray needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
@@ -186,7 +186,8 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     gradients = np.empty((len(rays), PARAMETERS))
     # A small rotation d of the camera displaces a fixed direction u by -d x u.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # The variable `by_size` is minus the derivative of the cone's half-angle arcsin(1 / size) by `size`.
+    # The variable `by_size` is the negative derivative of the cone's half-angle arcsin(1 / size) with respect
+    # to `size`.
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -230,8 +231,9 @@ class FittedLimb:
         covariance: covariance (5, 5) of the fitted parameters.
         residuals: angles of the edges from the fitted limb (n,), rad, positive outside the limb.
         used: mask of the edges that lie within five standard deviations of the limb (n,).
-        correlation: factor by which correlation of the residuals increases the variance of their mean.
-        prior: chi-square of the prior.
+        correlation: factor by which the correlation of neighbouring residuals increases the variance of their
+            mean.
+        prior: chi-square of the fitted parameters' deviations from their prior values.
     """
 
     view: LimbView
@@ -280,7 +282,8 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
             return None
         last = float(np.max(np.abs(step[:3])))
     factor = _correlation_factor(view.nadir, rays[used], (residuals / sigma)[used])
-    # The weights include the median residual; a few large residuals increase the variances further.
+    # The weights include the spread estimated from the median residual. The factor `excess` also takes into
+    # account a few large residuals.
     fitted = weights[used] * residuals[used] ** 2
     excess = max(1.0, float(np.sum(fitted)) / max(len(fitted) - 3, 1))
     covariance = _solved((normal - information) / (factor * excess) + information, np.eye(PARAMETERS))
@@ -292,7 +295,7 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
 def shared_error(
     fit: FittedLimb, rays: FloatArray, sigma: FloatArray, prior: Prior, groups: IntArray, error: FloatArray
 ) -> FloatArray:
-    """Return the covariance (5, 5) of a fit's parameters due to errors that all rays of a group share.
+    """Return the covariance (5, 5) of a fit's parameters due to errors common to the rays of a group.
 
     Args:
         fit: the fitted limb, whose covariance assumes independent errors of the rays.
@@ -300,12 +303,12 @@ def shared_error(
         sigma: standard deviations of the rays (n,), rad.
         prior: the prior of the fit.
         groups: index of the group to which each ray belongs (n,).
-        error: standard deviation of the error that the rays of each group share (groups,), rad.
+        error: standard deviation of the common error of the rays of each group (groups,), rad.
     """
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
     inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
-    assert inverse is not None  # the equations are not singular, because the fit has already solved them
+    assert inverse is not None  # the fit has already solved these equations, so that they are not singular
     moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
     return np.asarray((moved * (error**2)[:, None]).T @ moved)
 
@@ -345,18 +348,19 @@ def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, Bool
 
 
 def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray) -> float:
-    """Return the factor by which correlation of the residuals increases the variance of their mean.
+    """Return the factor by which the correlation of neighbouring residuals increases their mean's variance.
 
     Clouds and coasts behind the limb displace neighbouring points in the same direction. If neighbours around
     the limb have the correlation r (first-order process), the factor is (1 + r)/(1 - r). The residuals
-    `scaled` (n,) are in standard deviations.
+    `scaled` (n,) are given in standard deviations.
     """
     square = float(scaled @ scaled)
     if len(scaled) < 3 or square == 0.0:
         return 1.0
     aside = rays @ tangent_basis(nadir).T
     azimuth = np.arctan2(aside[:, 1], aside[:, 0])
-    # The order around the limb starts at the widest gap: points on its two sides are not neighbours.
+    # The sequence of points around the limb starts at the widest gap, because the points on both sides of the
+    # gap are not neighbours.
     order = np.argsort(azimuth)
     gaps = np.diff(azimuth[order], append=azimuth[order[0]] + 2.0 * np.pi)
     along = scaled[np.roll(order, -1 - int(np.argmax(gaps)))]
@@ -365,7 +369,7 @@ def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray)
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
-    """Return the solution of normal equations with unknowns of different units, or None if singular."""
+    """Return the solution of normal equations for unknowns of different units, or None if singular."""
     diagonal = normal.diagonal()
     if not diagonal.min() > 0.0:
         return None
@@ -397,11 +401,11 @@ UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
 _LOWEST, _HIGHEST, _STEP = -320e3, 240e3, 500.0
 """Lowest and highest tangent height of the brightness table, and the step between its heights (m)."""
 _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
-"""Smallest and largest blur in the brightness table (standard deviation, m), and number of blurs."""
+"""Smallest and largest blur of the brightness table (standard deviation, m), and number of blurs."""
 
 
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
-    """Return brightness of air and of ground, and their slopes per m, at tangent heights, as (4, n, k).
+    """Return the brightness of air and ground at tangent heights, and their derivatives, 1/m, as (4, n, k).
 
     Brightness is relative to sunlit air of infinite optical depth, and to ground without air. The blur is
     rounded to the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
@@ -422,7 +426,7 @@ def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=1)
 def _limb_table() -> FloatArray:
-    """Return the brightness of air and of ground and their slopes per m, as (4, blurs, heights)."""
+    """Return the brightness of air and ground and their derivatives, 1/m, as a table (4, blurs, heights)."""
     heights = np.arange(_LOWEST, _HIGHEST, _STEP)
     # For lines of sight that end on the ground, the optical depth is integrated from the ground outwards.
     sines = np.sqrt(np.maximum(-2.0 * heights / SEMI_MAJOR_AXIS, 0.0))
@@ -445,9 +449,9 @@ def _limb_table() -> FloatArray:
 
 
 def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
-    """Return a profile (m,) after Gaussian blurs with standard deviations `widths` (k,), m, as (k, m).
+    """Return a profile (m,) blurred by k Gaussians of standard deviations `widths` (k,), m, as (k, m).
 
-    Beyond both ends, the profile is continued with the end values.
+    The profile is extended at both ends by repeating its end values.
     """
     margin = int(4.0 * _BROADEST / _STEP)
     padded = np.pad(profile, margin, mode="edge")
@@ -458,9 +462,9 @@ def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
 
 _PROFILE_STEPS = 2
 _OUTSIDE, _INSIDE = -8.0, 4.0
-"""Limits of the fitted section of a profile, in px from the steepest point towards the bright side."""
+"""Start and end of the fitted section of a profile, in px from the steepest point towards the bright side."""
 _FLOOR, _SHARE = 0.02, 0.08
-"""Noise of a profile's sample: a fraction of the profile's maximum plus a fraction of the sample."""
+"""Noise of a profile sample: a fraction of the profile's maximum plus a fraction of the sample's value."""
 _FARTHEST = 2.0
 """Largest distance (px) of the fitted limb from the steepest point."""
 _LEAST_SAMPLES = 7
@@ -469,7 +473,7 @@ _LEAST_SAMPLES = 7
 def fit_profiles(
     profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return limb positions on n scan lines, px, standard deviations, px, and a mask of valid positions.
+    """Return the limb positions on n scan lines, px, their standard deviations, px, and a mask of valid fits.
 
     Args:
         profiles: brightness along n scan lines (n, m), or NaN for missing samples.

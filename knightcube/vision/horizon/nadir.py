@@ -6,15 +6,15 @@
 
 `find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
 the edges of each cone. Each fitted limb is tested against chance edges, the width of the atmosphere's
-brightness profile, the darkness of space, the brightness of the whole image, the coarse sensors and the
-rough attitude. If exactly one limb passes all tests, this limb gives the nadir. If several limbs pass all
-tests, the image is ambiguous. If no limb passes all tests, the image is refused and the reason is stated.
+brightness profile, the darkness of space, the brightness of the whole image, the coarse sensors and the rough
+attitude. If exactly one limb passes all tests, this limb gives the nadir. If several limbs pass all tests,
+the image is ambiguous. If no limb passes all tests, the image is refused, and the result contains the reason.
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
 searched again with the nadir of the other cameras as prior knowledge. One common limb is then fitted to the
-limb points of all images. The unknown height of the air displaces every limb outwards, which displaces the
-nadir only if a single side of the limb is visible.
+limb points of all images. The unknown height of the air displaces every limb outwards. This error displaces
+the nadir only if the images show one side of the limb but not the opposite side.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class HorizonStatus(Enum):
 
     FOUND = "found"
     AMBIGUOUS = "ambiguous"
-    """Several horizons fit the image."""
+    """Several different horizons are consistent with the image."""
     NO_HORIZON = "no-horizon"
     """The image has too few edges, or its edges do not lie on a common horizon."""
     REFUSED = "refused"
@@ -153,26 +153,26 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Factor that widens the altitude range in the search for cones, because a cone of three edges is
-inaccurate."""
+"""Factor that widens the altitude range in the search for cones. A cone through three edges is inaccurate."""
 _MOST_ALTITUDE = 3.0
 """Largest distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 """Thresholds of three tests that a horizon must pass.
 
-The thresholds are the largest fraction of bright samples in the sky and on the night side, the minimum
-coverage of the sunlit limb by edges, and the largest fraction of limb points on the night side.
+The first threshold is the largest fraction of bright samples in the sky and on the night side. The second is
+the minimum coverage of the sunlit limb by edges. The third is the largest fraction of limb points on the
+night side.
 """
 _RIVAL = 0.3
 """Fraction of the best horizon's edge count above which a second horizon makes the result ambiguous."""
 _SAME = np.radians(1.0)
 """Angle (rad) between two nadirs from one image below which they count as the same nadir."""
 _MOST_CHANCE = -6.0
-"""Largest accepted log10 of the number of cones that random edges are expected to support like a horizon."""
+"""Largest accepted log10 of the expected number of equally good horizons formed by chance edges."""
 _BREADTH = 0.125, 2.0
-"""Minimum and maximum ratio of the width of the limb's edges to the width expected from the air."""
+"""Minimum and maximum ratio of the width of the limb's edges to that of the air's brightness profile."""
 _OFF = 9.0
-"""Largest chi-square of an edge in the comparison of horizons of different focal lengths."""
+"""Upper limit of an edge's chi-square in the comparison of the horizons of different trial focal lengths."""
 _GAIN = 1.5
 """Minimum ratio by which a second search on more scan lines must increase the number of horizon edges."""
 
@@ -187,8 +187,8 @@ def find_nadir(
     """Return the nadir from the Earth's limb in an image, or the reason why no nadir is found.
 
     The first search reads few columns and rows of the image. If the first search finds a horizon with few
-    edges, more columns and rows are read near this horizon. If the first search finds edges but no horizon,
-    more columns and rows are read in the whole image.
+    edges, a second search reads more columns and rows near this horizon. If the first search finds edges but
+    no horizon, a second search reads more columns and rows of the whole image.
 
     Args:
         image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
@@ -199,7 +199,8 @@ def find_nadir(
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
 
     Raises:
-        ValueError: if image or mask do not have the size of the camera, or if pixels are not finite.
+        ValueError: if the size of the image or mask differs from that of the camera, or if pixels are not
+            finite.
 
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
@@ -227,11 +228,11 @@ def find_nadir(
 
 
 _FIELD_STEPS: FloatArray = np.linspace(-2.5, 2.5, 11)
-"""Trial focal lengths, in standard deviations from the most probable one."""
+"""Trial focal lengths, as deviations from the most probable focal length in standard deviations."""
 _FIELD_ROUNDS, _RESOLVED = 4, 0.3
-"""Maximum number of refinements of the trial focal lengths, and standard deviation that ends them."""
+"""Maximum number of searches with refined trial focal lengths, and relative spread above which they end."""
 _MOST_REFUSED = 0.5
-"""Probability of focal lengths whose horizon contradicts the image, above which the image is refused."""
+"""Total probability of the focal lengths with a refused horizon above which the image is refused."""
 
 
 def nadir_of_uncertain_field(
@@ -244,10 +245,11 @@ def nadir_of_uncertain_field(
 ) -> HorizonSolution:
     """Return the nadir if the camera's focal length has the relative standard deviation `sigma`.
 
-    The image is searched with eleven focal lengths. Nadir and altitude are the means of all horizons,
-    weighted with the probability of focal length and misfit; their uncertainties include the differences
-    between the horizons. The brightness of the image does not determine the focal length: horizons that
-    contradict it keep their weight, and if they have most of it, the image is refused. See `find_nadir`.
+    The image is searched with eleven trial focal lengths. Nadir and altitude are means over the horizons of
+    all focal lengths. The weight of a horizon is the probability of its focal length and of its misfit. The
+    uncertainties include the differences between the horizons. A horizon that contradicts the brightness of
+    the image keeps its weight, because the brightness does not determine the focal length. If such horizons
+    have more than half of the total weight, the image is refused. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)
@@ -309,9 +311,9 @@ def _by_field(
     settings: HorizonSettings,
     hidden: BoolArray | None,
 ) -> tuple[list[_FieldTrial], FloatArray]:
-    """Return the horizons of trial focal lengths, and their probabilities (k,).
+    """Return the best horizon of each of k trial focal lengths, and the probabilities (k,) of these lengths.
 
-    A focal length with which the limb contradicts prior knowledge is omitted.
+    A focal length is omitted if its search finds no limb, or a limb that contradicts prior knowledge.
     """
     centre, width = 0.0, 1.0
     trials: list[_FieldTrial] = []
@@ -331,7 +333,8 @@ def _by_field(
         # Only edges whose distance from the horizon is known for all focal lengths are compared.
         squares = np.minimum(squares[:, ~np.isnan(squares).any(axis=0)], _OFF)
         loss = squares.sum(axis=1)
-        # The best fit shows how much of the misfit and of its correlation is due to ground and clouds.
+        # The misfit of the best fit and its correlation are attributed to ground and clouds, and scale the
+        # misfit of the other fits.
         best_fit = int(np.argmin(loss))
         on = squares[best_fit] < _OFF
         mean = float(squares[best_fit][on].sum()) / max(int(np.count_nonzero(on)), 1)
@@ -355,8 +358,8 @@ class _Search:
     Attributes:
         observation: edges and sampled pixels as directions.
         levels: brightness levels of the dark and bright pixels of the image.
-        hypotheses: horizons that were fitted to the edges, the best first.
-        read: number of pixels read.
+        hypotheses: horizons that were fitted to the edges, in descending order of quality.
+        read: number of pixels that the search read.
         altitudes: range of an unknown altitude, m.
     """
 
@@ -443,7 +446,7 @@ def _hypotheses(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> list[Hypothesis]:
-    """Return the horizons that were fitted to the cones with which most edges agree, the best first."""
+    """Return the horizons fitted to the cones with which most edges agree, in descending order of quality."""
     if place is None:
         least, most = settings.altitudes
         low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
@@ -478,7 +481,7 @@ def _hypotheses(
 
 
 def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
-    """Return the status of the search, and its reason, from the hypotheses in order of quality."""
+    """Return the status of the search and the reason, from the hypotheses in descending order of quality."""
     best = hypotheses[0]
     flaw = _flaw(best)
     if flaw:
@@ -532,9 +535,9 @@ def _measurement(
     altitudes: tuple[float, float],
     residual: float,
 ) -> NadirMeasurement:
-    """Return the nadir of a fitted limb, with an unknown altitude limited to the range `altitudes`, m.
+    """Return the nadir of a fitted limb; an unknown altitude is limited to the range `altitudes`, m.
 
-    `place` is the camera's position from prior knowledge; its altitude may be unknown.
+    The argument `place` is the camera's position from prior knowledge, or None if the altitude is unknown.
     """
     view, used = fit.view, int(np.count_nonzero(fit.used))
     altitude, nadir = view.surface.height_of(view.position), view.nadir
@@ -542,7 +545,8 @@ def _measurement(
     sigma = fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA if free else 0.0)
     if free:
         mean, share = limited_normal(altitude, sigma, altitudes)
-        # The altitude is correlated with the rotation d (3,) of the camera, which displaces nadir n by d x n.
+        # The error of the altitude is correlated with the rotation error d (3,) of the camera, and a rotation
+        # d displaces nadir n by d x n.
         gain = np.cross(fit.covariance[:3, ALTITUDE] / sigma**2, nadir)
         nadir = nadir + (mean - altitude) * gain
         nadir = nadir / np.linalg.norm(nadir)
@@ -555,7 +559,8 @@ def limited_normal(mean: float, sigma: float, limits: tuple[float, float]) -> tu
     """Return the mean of a normal distribution limited to a range, and its variance divided by sigma^2."""
     low, high = ((limit - mean) / sigma for limit in limits)
     x = np.linspace(max(low, min(-8.0, high - 1.0)), min(high, max(8.0, low + 1.0)), 2001)
-    # The exponent is relative to the most probable value, so that a distant range does not underflow.
+    # The density is normalised to its maximum in the range, so that it does not underflow if the range is far
+    # from the mean.
     nearest = min(max(0.0, low), high)
     weight = np.exp(0.5 * (nearest**2 - x**2))
     weight /= weight.sum()
@@ -566,9 +571,9 @@ def limited_normal(mean: float, sigma: float, limits: tuple[float, float]) -> tu
 _IMPROBABLE = 1e-6
 """Probability below which the difference between the nadirs of two cameras is significant."""
 _COMMON = 2.0
-"""Factor by which the variance of the difference of two nadirs may exceed the sum of their variances.
+"""Assumed ratio of the variance of the difference of two nadirs to the sum of their variances.
 
-The factor is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
+The ratio is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
 opposite directions.
 """
 _UNKNOWN_TURN = 1.0
@@ -582,9 +587,9 @@ class JointNadir:
     """The nadir from the images of several cameras at one instant.
 
     Attributes:
-        status, reason: outcome of the search, and why no nadir was found.
+        status, reason: outcome of the search, and reason why no nadir was found.
         nadir: the measured nadir in body axes, or None unless the status is FOUND.
-        cameras: indices of the cameras whose limb points were used.
+        cameras: indices of the cameras whose limb points were used in the fit.
         each: result of the search in each image, by the index of the camera, in camera axes.
         limb_height: fitted height of the limb above the ellipsoid, m, or NaN if no nadir was found.
     """
@@ -599,7 +604,7 @@ class JointNadir:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """A horizon in the image of one camera, as a proposal for the common nadir.
+    """A nadir from the image of one camera, which is compared with the nadirs of the other cameras.
 
     Attributes:
         camera: index of the camera.
@@ -649,7 +654,7 @@ def nadir_of_cameras(
         return JointNadir(*_why_none(each), None, (), each)
     vote = max(group, key=lambda one: one.edges)
     view = each[vote.camera].view
-    assert view is not None  # the camera of each vote has a fitted horizon
+    assert view is not None  # each vote comes from a camera with a fitted horizon
     position = knowledge.position if knowledge.position is not None else view.position
     sigma = float(np.sqrt(0.5 * np.trace(vote.covariance)))
     sensed = (*knowledge.sensed, SensedDirection(vote.nadir, -position, _COMMON * sigma))
@@ -686,10 +691,10 @@ def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> lis
 
 
 def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
-    """Return the votes for the nadir on which most cameras agree, or no vote and the reason.
+    """Return the votes for the nadir on which most cameras agree, or an empty list and the reason.
 
     If two nadirs are supported by the same number of cameras, the nadir with more edges is selected. Two
-    candidates of the same camera never support each other.
+    candidates of the same camera never count as agreeing.
     """
     groups = []
     for first in votes:
@@ -704,7 +709,7 @@ def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
     for other in groups[1:]:
         if any(v is w for v in other for w in best) or any(_same(v, w) for v in other for w in best):
             continue
-        # A smaller group of cameras never makes the result of a larger group ambiguous.
+        # A second nadir makes the result ambiguous only if as many cameras agree on it as on the first.
         if len(other) == len(best) and sum(v.edges for v in other) > _RIVAL * count:
             apart = np.degrees(_angle(other[0].nadir, best[0].nadir))
             return [], f"the cameras show two horizons {apart:.1f} deg apart"
@@ -740,7 +745,7 @@ def _joint_fit(
     """Return the nadir of one limb fitted to the limb points of all agreeing cameras."""
     most = max(numbers, key=lambda number: len(each[number].limb))
     view, camera = each[most].view, cameras[most]
-    assert view is not None  # each agreeing camera has found a horizon
+    assert view is not None  # each of these cameras has found a horizon
     place = place_of(knowledge, settings)
     located = place is not None and place.located
     body = replace(view, rotation=camera.to_camera.T @ view.rotation, limb_height=UNIT_DEPTH_HEIGHT)

@@ -1,7 +1,8 @@
 """Settings of the horizon search, the response of the detector, and prior knowledge for one image.
 
 A horizon does not determine the rotation about nadir. Prior knowledge (position, Sun, rough attitude,
-directions from other sensors) determines the rotation about nadir and tests a fitted horizon.
+directions from other sensors) determines the rotation about nadir. A fitted horizon is also tested against
+this knowledge.
 """
 
 from __future__ import annotations
@@ -49,18 +50,19 @@ class RoughAttitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HorizonKnowledge:
-    """Optional data from GPS, ephemerides and coarse sensors for one image.
+    """Optional prior knowledge for one image, from GPS, ephemerides and coarse sensors.
 
     Attributes:
         position: position (3,) of the camera, m from the Earth's centre, inertial axes.
-        altitude: height of the camera above the Earth's mean radius, m, used if the position is unknown.
+        altitude: height of the camera above the Earth's mean radius, m, which is used if the position is
+            unknown.
         sun: direction (3,) to the Sun, inertial axes, of any length.
         pole: direction (3,) of the Earth's rotation axis, inertial axes.
         attitude: approximate attitude of the camera, for instance as predicted by a filter.
         sensed: directions measured by coarse sensors.
 
     Raises:
-        ValueError: if a value is not finite, has another shape, or lies inside the Earth.
+        ValueError: if a value is not finite or has a wrong shape, or if the position is inside the Earth.
     """
 
     position: FloatArray | None = None
@@ -150,22 +152,23 @@ class HorizonSettings:
 
     Attributes:
         edges: settings of the search for edges.
-        limb_height_sigma: standard deviation of the apparent limb's height, m. The default limb height error
-            holds for air of unknown scale height (6.5 to 9.5 km) and unknown haze; use 1,000 m if scale
-            height and haze are known.
+        limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
+            of the limb height is valid for air of unknown scale height (6.5 to 9.5 km) and unknown haze. The
+            value 1,000 m is valid if scale height and haze are known.
         altitude_sigma: standard deviation of the altitude of a known position, m.
-        altitudes: range of an unknown altitude, m. The default range is for low orbits; a range without
-            limits would accept any bright disc as the Earth, for instance a lens ghost.
+        altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
+            would accept any bright disc as the Earth, for instance a lens ghost.
         tolerance: largest distance of an edge from the circular cone of a horizon, px; it must cover the
             flattening of the Earth.
         least_edges: minimum number of edges on a horizon.
         enough_edges: number of edges on a horizon below which the image is searched again on more scan lines.
         some_edges: number of edges in an image below which the image is not searched again.
-        candidates: maximum number of horizons that are searched for in one image.
+        candidates: maximum number of candidate horizons in one image.
         tries: maximum number of pairs or triples of edges that are tried for each horizon.
-        sphere_sigma: standard deviation per axis, rad, of the tilt of a limb near the camera by the Earth's
-            flattening, added to nadir if the direction of the flattening is unknown. The tilt of the limb
-            decreases with the square of the distance from the Earth's centre.
+        sphere_sigma: standard deviation per axis, rad, of the limb's tilt by the Earth's flattening for a
+            camera close to the surface. It is added to the uncertainty of nadir if the direction of the
+            flattening is unknown. The tilt of the limb decreases with the square of the distance from the
+            Earth's centre.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)

@@ -1,11 +1,11 @@
 """Masks of the spacecraft's own structure in the images of the horizon cameras.
 
-A mask comes from the configuration (polygons or an image file), or is learned from successive frames. While
-the limb moves over the image, the brightness of every pixel of the scene changes again and again, and the
-brightness of the structure does not. `StructureMap` compares the mean brightness of square blocks of pixels
-with the last frame that counted. A frame counts if it differs in a quarter of its blocks. A block that did
-not change in `_QUIET_FRAMES` successive counted frames shows structure. A block whose brightness changes is
-at once removed from the mask, so that a wrong mask does not hide a limb.
+A mask is configured (polygons or an image file), or is estimated from successive frames. While the limb moves
+over the image, the brightness of each pixel of the scene changes repeatedly, whereas the brightness of the
+structure stays constant. `StructureMap` compares the mean brightness of square blocks of pixels with that in
+the last counted frame. A frame is counted if a quarter of its blocks have changed. A block that did not
+change in `_QUIET_FRAMES` successive counted frames shows structure. A block whose brightness changes is at
+once removed from the mask, so that a wrong mask does not hide a limb.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 _BLOCK = 8
 """Width and height of a block, px."""
 _CHANGE = 0.08
-"""Smallest change of a block's brightness that counts, as a fraction of the brightness range of the image."""
+"""Threshold for a change of a block's mean brightness, relative to the brightness range of the image."""
 _MOVED = 0.25
-"""Smallest fraction of changed blocks with which a frame counts."""
+"""Minimum fraction of changed blocks for a frame to be counted."""
 _QUIET_FRAMES = 12
 """Number of counted frames without a change after which a block shows structure."""
 _LARGEST = 0.4
-"""Largest fraction of the image that a learned mask may cover; a larger mask is discarded."""
+"""Largest fraction of the image that an estimated mask may cover. A larger mask is discarded."""
 
 
 def polygon_mask(rows: int, columns: int, polygons: Sequence[Sequence[tuple[float, float]]]) -> BoolArray:
@@ -50,12 +50,13 @@ def polygon_mask(rows: int, columns: int, polygons: Sequence[Sequence[tuple[floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StructureMap:
-    """Blocks of one camera's images that show structure, as configured and as learned from frames.
+    """Blocks of one camera's images that show structure, by configuration or by estimation from frames.
 
     Attributes:
         rows, columns: number of pixels of the images.
         configured: mask of the blocks that contain configured structure (m, n).
-        level: mean brightness of the blocks in the last counted frame (m, n), or (0, 0) before the first one.
+        level: mean brightness of the blocks in the last counted frame (m, n), or an empty array (0, 0) before
+            the first frame.
         quiet: number of counted frames since the last change of each block (m, n).
     """
 
@@ -91,8 +92,9 @@ class StructureMap:
     def mask(self) -> BoolArray | None:
         """The mask (rows, columns) of the structure's pixels, or None without structure.
 
-        Learned blocks are widened by one block, because blocks at the rim of the structure also show the
-        scene. A learned block counts only if an adjacent block is also learned.
+        The estimated structure is widened by one block, because blocks at its border show structure and
+        scene. An unchanged block counts as structure only if at least two of its neighbours are also
+        unchanged.
         """
         learned = self.quiet >= _QUIET_FRAMES
         learned &= _neighbours(learned) >= 2
