@@ -1,5 +1,5 @@
 """Composition of the flight application: opens, flies and closes a configured flight.
 
 Only this package of the flight application knows which hardware is used: the real devices, devices simulated
-in lock-step, or devices simulated in real time in a process of their own.
+in lock-step, or devices simulated in real time in a separate process.
 """

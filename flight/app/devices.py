@@ -84,7 +84,7 @@ _BEFORE_ELEMENTS = 365.0
 
 
 def fault_catalogue() -> tuple[str, str]:
-    """Return the grammar of simulated faults, and a list of all faults."""
+    """Return the syntax of fault specifications, and the list of all simulated faults, as two texts."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.fault_catalogue()
@@ -205,9 +205,9 @@ def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> An
 
 
 def _dated(rig: Rig, config: Config) -> Rig:
-    """Return the rig with the earliest possible date of the flight, from the two-line elements."""
+    """Return the rig with the earliest plausible date of the flight, by the two-line elements' epoch."""
     if isinstance(config, OrbitConfig) and config.elements is not None:
-        with suppress(UsageError):  # wrong elements are reported when the body is built
+        with suppress(UsageError):  # invalid elements are reported when the body is built
             days = TwoLineElements(*config.elements).epoch - UNIX_EPOCH
             return replace(rig, earliest_utc_ns=round((days - _BEFORE_ELEMENTS) * DAY) * SECOND_NS)
     return rig

@@ -1,4 +1,4 @@
-"""A flight from request to result.
+"""The course of a flight, from its request to its result.
 
 The coils are at zero when the function `fly` returns or raises an exception.
 
@@ -213,8 +213,8 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 
     Raises UsageError for a mistake of the user, and DeviceError for a device that fails.
 
-    On a board, the start is retried until it succeeds. Raises StoppedError if a signal ends the attempts to
-    start.
+    On a flight computer, the start is retried until it succeeds. Raises StoppedError if a signal ends the
+    attempts to start.
     """
     with EndingSignals() as signals, ExitStack() as stack:
         opened = _start(request, signals, stack)
@@ -247,8 +247,8 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:
     """Return a flight that is ready to begin. `stack` closes it.
 
-    A board, which has an archive, retries the start until it succeeds, and first waits for the end of the
-    separation inhibit.
+    A flight computer, which has an archive, first waits for the end of the separation inhibit, and then
+    retries the start until it succeeds.
     """
     judge = partial(_judge, request)
     if request.archive is None:

@@ -23,10 +23,10 @@ class RunRequest:
     """A request to fly. If given, `duration` (s) and `seed` replace those of the configuration.
 
     The file `devices` belongs to a running server of simulated devices; without it, a server is started. The
-    folder `archive` contains the runs of a board; its next run folder is then used instead of `out`. If
-    `accepted` is true and the file `config_path` is damaged, the last configuration that flew is flown
-    instead. The simulated `faults` are injected in addition to those of the configuration
-    (`sim_hal.faults.schedule`).
+    folder `archive` contains the runs of a flight computer; if it is given, its next run folder is used
+    instead of `out`. If `accepted` is true and the file `config_path` is damaged, the last flown
+    configuration is used instead. The simulated `faults` are injected in addition to those of the
+    configuration (`sim_hal.faults.schedule`).
     """
 
     config_path: Path

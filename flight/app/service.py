@@ -7,12 +7,12 @@ attempt, everything that was opened is closed, with the coils at zero. The first
 is 0.2 s, and each later pause is twice as long, up to 30 s. An unexpected exception ends the process, and the
 service manager starts a new process.
 
-The configuration to fly is the accepted file or, if it is damaged, the last configuration that flew. The
+A flight uses the accepted configuration file or, if this file is damaged, the last flown configuration. The
 script `deploy/install.sh` writes the SHA-256 checksum of an accepted configuration beside its file. A flight
-reads its file once, verifies the bytes against the checksum, and flies these bytes. A flipped bit on the disk
-can turn 1.05e-3 into 1.05e-7, which validation would not detect. A file without a checksum is flown as it is,
-unless an accepted configuration is stored, which shows that there was a checksum. A service stores the
-accepted configurations that flew in its state folder: the newest one and two older ones. Each stored
+reads its configuration file once, verifies the bytes against the checksum, and uses exactly these bytes. A
+flipped bit on the disk can turn 1.05e-3 into 1.05e-7, which validation would not detect. A file without a
+checksum is used unchecked, unless an accepted configuration is stored, which shows that a checksum has
+existed. A service stores the three newest accepted and flown configurations in its state folder. Each stored
 configuration is one file, created by a single rename, whose name contains a number and the SHA-256 checksum,
 so that there is never a configuration without its checksum.
 
@@ -274,7 +274,7 @@ _KEPT = 4
 
 
 def renewal_note(environment: Mapping[str, str]) -> str:
-    """Return why the board returned to an earlier version, or an empty text (deploy/renewal.py)."""
+    """Return why the flight computer returned to an earlier version, or "" (deploy/renewal.py)."""
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
         status = read_regular(Path(environment[RENEWAL]), LARGEST_FILE) or b""
         return str(json.loads(line_of(status) or b"")["note"])
@@ -282,7 +282,7 @@ def renewal_note(environment: Mapping[str, str]) -> str:
 
 
 class FlownRelease:
-    """The software release that flies; without a name, no release is recorded as proven."""
+    """The software release in use; without a name, no release is recorded as proven."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
         """Read name and note of the release from the environment of the process."""
@@ -502,7 +502,7 @@ _NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.yaml")
 
 @dataclass(frozen=True, slots=True)
 class KeptConfig:
-    """A stored configuration that flew."""
+    """A stored configuration that was flown."""
 
     number: int
     path: Path
@@ -600,7 +600,7 @@ def sum_file(path: Path) -> Path:
 def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
     """Return the configuration to fly, which is read only once.
 
-    Raises UnreadConfigError, with the cure, if `path` is damaged and no configuration that flew is stored.
+    Raises UnreadConfigError, with the remedy, if `path` is damaged and no flown configuration is stored.
     """
     folder = service_folder(environment)
     read = _read_any if folder is None else LinuxFiles().read
@@ -613,7 +613,7 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
     for one in kept:
         try:
             configuration.parse(one.text, str(one.path))
-        except ConfigError:  # the stored configuration flew with another software version
+        except ConfigError:  # the stored configuration was flown with another software version
             continue
         return Chosen(
             one.path, one.text, f"{path}: {problem}: the last configuration that has flown is used; {_CURE}"

@@ -340,7 +340,7 @@ MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
 
 
 _DEGREES = "deg"
-"""Unit of an angle in a command in words."""
+"""Unit of the angles in a command that is written in words."""
 LONGEST = max(layout.length for layout in LAYOUTS.values())
 """Length (bytes) of the longest command packet. Longer packets are refused."""
 

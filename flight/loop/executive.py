@@ -12,8 +12,7 @@ task is reported, and the loop continues.
 The control thread submits a job and later collects its result; it never waits for a job. In a lock-step
 simulation, `LockStepRunner` runs a job at once when it is submitted, and delivers its result after the
 modelled latency in simulated time, so that the result of a flight does not depend on the speed of the
-machine. In a real-time flight, `flight.loop.worker_processes.ProcessRunner` runs jobs in processes of their
-own.
+machine. In a real-time flight, `flight.loop.worker_processes.ProcessRunner` runs jobs in separate processes.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ class Worker:
 
     Attributes:
         name: short name of the worker for telemetry.
-        function: function of one argument, which in real time runs in a process of its own. The argument of
-            the worker's function must be picklable. The result of the worker's function must consist of plain
-            values, arrays of numbers, and dataclasses and enumerations from modules that the control process
-            has imported.
+        function: function of one argument, which runs in a separate process in a real-time flight. The
+            argument of the worker's function must be picklable. The result of the worker's function must
+            consist of plain values, arrays of numbers, and dataclasses and enumerations from modules that the
+            control process has imported.
         latency_ns: time (ns) from a job's submission to its result in a lock-step simulation.
         timeout_ns: longest execution time (ns) of a job in real time, after which the job is killed.
     """
@@ -94,7 +93,7 @@ class JobRunner(Protocol):
 
     @property
     def borrowed_ns(self) -> int:
-        """Time (ns) spent on jobs in the calling thread; zero if jobs run in processes of their own."""
+        """Time (ns) spent on jobs in the calling thread; zero if jobs run in separate processes."""
 
     def close(self) -> None:
         """Stop the workers. Safe to call twice."""

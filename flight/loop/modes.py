@@ -239,7 +239,7 @@ class HoldTimer:
 
 
 class AttitudeWatch:
-    """Finds the triggers between acquisition and pointing, and decides what a body in SAFE does.
+    """Finds the triggers between acquisition and pointing, and controls what a body does in SAFE.
 
     Attributes:
         follows: mode that follows the acquisition, or None if the body stays in ACQUIRE.
@@ -433,7 +433,7 @@ class ModeControl:
 
     @property
     def flies_steps(self) -> bool:
-        """Whether the configured steps are flown, or will be flown after BOOT."""
+        """Whether the configured steps are executed, or will be executed after BOOT."""
         booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
 

@@ -2,8 +2,8 @@
 
 The stored state has typed and bounded values, and is checked when it is read. UTC is stored only as a label,
 and is not used in computations. Crashes are counted over the operating time, which is the monotonic running
-time summed over all boots. A wrong wall clock therefore does not affect the count, and a board that crashes
-repeatedly soon after its start does not forget its earlier crashes.
+time summed over all boots. A wrong wall clock therefore does not affect the count, and a flight computer that
+crashes repeatedly soon after its start still counts its earlier crashes.
 
 The learned parameters are estimated properties of the devices, such as biases; attitude and rate are not
 stored. The next boot starts its filter from the learned parameters. The covariance of the learned parameters

@@ -304,7 +304,7 @@ class Steering:
         now_ns: int,
         needs_rate: bool = False,
     ) -> Steered:
-        """Command the coils by a control law that needs no estimate, but perhaps a rate."""
+        """Command the coils by a control law that needs no state estimate, although it may need a rate."""
         for reading in readings:
             known = None if reading.has_rate else self._body.estimation.rate_without_gyro(now_ns)
             self._has_rate = reading.has_rate or known is not None

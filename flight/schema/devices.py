@@ -2,8 +2,8 @@
 
 A section contains the wiring of a device and the device's assumed properties. Values are in SI units, unless
 their name contains another unit. The key `driver` of a section names the driver's registration, by a built-in
-name (`DRIVERS`) or as `module:object` of a package outside this repository. The functions of our drivers are
-named by text, because the schema imports neither drivers nor simulator.
+name (`DRIVERS`) or as `module:object` of a package outside this repository. The functions of the built-in
+drivers are referenced by texts, because the schema imports neither drivers nor simulator.
 """
 
 from __future__ import annotations
@@ -133,9 +133,10 @@ class Sensor(Section, frozen=True, kw_only=True):
 class SensorsSection(UnitSection, frozen=True, kw_only=True):
     """An inertial unit of separate gyro, magnetometer and accelerometer (driver `sensors`).
 
-    The attitude follows from acceleration and magnetic field. Without an accelerometer the unit gives no
-    attitude, so that a unit with a gyro flies in orbit only. A magnetometer alone is a unit without a gyro:
-    the body then flies by star attitudes, streak rates, the magnetic field and the dynamic model.
+    The attitude follows from acceleration and magnetic field. Without an accelerometer the unit measures no
+    attitude, so that a unit with only a gyro and a magnetometer is suitable for a satellite in orbit only. A
+    magnetometer alone is a unit without a gyro: the state estimate is then based on star attitudes, streak
+    rates, the magnetic field and the dynamic model.
     """
 
     sensors: Annotated[tuple[Sensor, ...], Meta(min_length=1, max_length=4)]
@@ -146,7 +147,7 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
 
 
 class MagnetometerSection(SensorsSection, frozen=True, kw_only=True):
-    """A magnetometer of its own, which is read while the inertial unit is silent.
+    """A separate magnetometer, which is read while the inertial unit is silent.
 
     Without a section `inertial_unit`, it is the only source of readings.
     """
@@ -201,12 +202,12 @@ class Winding(Section, frozen=True, kw_only=True):
 class Coils(Section, frozen=True, kw_only=True):
     """The PWM chip, the H-bridges and the coils. The value `bus` is the number or device file of the I2C bus.
 
-    The driver `drv8830` has a DRV8830 for each coil, of which the first has the address `address`, and each
-    other coil's the next address.
+    The driver `drv8830` uses one DRV8830 chip for each coil; the chips have consecutive I2C addresses, of
+    which `address` is the first.
 
     The list `windings` has one entry per coil. A satellite has two to six coils. If the coils lie in a plane,
-    the flight application treats the axis across the plane like that of a broken coil (`slots`). A dipole
-    moment along the magnetic field, which makes no torque, is added so that the missing coil needs no
+    the flight application treats the axis normal to the plane like the axis of a broken coil (`slots`). A
+    dipole moment along the magnetic field, which makes no torque, is added so that the missing coil needs no
     current. More than three coils share a dipole moment so that their total heat is minimal.
     """
 
@@ -496,9 +497,9 @@ class Camera(Section, frozen=True, kw_only=True):
     `late_after` s after the end of its exposure, and vision counts as slow if a frame takes longer than
     `vision_slow_after` s. The newest `keep_frames` frames are kept in the folder `frames` of the run.
 
-    With `learn_lens`, the star tracker learns lens, line time and point spread from its solved frames, and
-    the next boot continues with the learned values. Nothing is learned about a camera that is exact
-    according to `accuracy`.
+    With `learn_lens`, the star tracker estimates lens parameters, line time and point spread from its solved
+    frames, and the next boot continues with the estimates. These values are not estimated for a camera that
+    is exact according to `accuracy`.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -634,7 +635,7 @@ def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
         from knightcube.vision.camera.images import read_image, read_raw  # noqa: PLC0415 - only with a file
 
         path = Path(camera.structure_file)
-        # A board has no Pillow, but a PGM file needs none.
+        # Pillow is not installed on a flight computer, but a PGM file can be read without it.
         is_pgm = path.suffix == ".pgm"
         pixels = read_raw(path, camera.columns, camera.rows, 8) if is_pgm else read_image(path)
         if pixels.shape != mask.shape:
@@ -681,7 +682,7 @@ def nothing(_: Any) -> tuple[()]:
 def later(named: str) -> Callable[..., Any]:
     """Return a function that imports the function `module:function` at its first call, and calls it.
 
-    An emulator is registered in this way, so that a board does not load the simulator.
+    An emulator is registered in this way, so that a flight computer does not load the simulator.
     """
     module, _, function = named.partition(":")
 
@@ -696,20 +697,21 @@ class Driver:
     """Registration of a device driver.
 
     Attributes:
-        kind: section of the configuration, such as `inertial_unit`; `camera` also serves `wide_cameras`.
+        kind: section of the configuration, such as `inertial_unit`; drivers of the kind `camera` also apply
+            to `wide_cameras`.
         section: type of the section, which adds the driver's own keys to those of the kind's base section.
         open: function that takes the rig and the section, and returns the driver (`hal.interfaces.devices`).
             A driver of coils must be passive until its method `start` is called.
         probe: function that takes a rig and the section, queries the device without changing its state, and
-            returns its answer as text. It raises DeviceError without an answer.
+            returns its answer as text. This function raises DeviceError if the device does not answer.
         emulate: function that takes a `sim_hal.emulation.Emulation` and the section, connects an emulated
-            device to the emulated wires, and returns the device. A camera needs none, because the simulator
-            emulates the cameras of all drivers. A device of another package without an emulator can only be
-            used on hardware.
+            device to the emulated wires, and returns the device. A camera driver needs no such function,
+            because the simulator emulates the cameras of all drivers. A device of another package without an
+            emulator can only be used on hardware.
         files: function that returns the device files that the section names.
         check: function that raises OutOfRange for a section that the driver does not accept.
         off: for coils, function that returns the I2C writes (address, register, value) that switch all coils
-            off in any state of the chips. The guardian executes them if the flight process fails.
+            off in any state of the chips. The guardian executes these writes if the flight process fails.
     """
 
     kind: str
@@ -723,7 +725,7 @@ class Driver:
 
 
 def _ours(kind: str, section: type[Any], name: str, **more: Any) -> Driver:
-    """Return the registration of a driver of ours, with functions in `flight.app.devices`."""
+    """Return the registration of a built-in driver, with functions in `flight.app.devices`."""
     functions = {word: later(f"flight.app.devices:{word}_{name}") for word in ("open", "probe", "files")}
     emulate = None if kind == "camera" else later(f"sim_hal.devices:emulate_{name}")
     return Driver(kind, section, emulate=emulate, **functions, **more)
@@ -779,7 +781,7 @@ SENSOR_PARTS: Mapping[str, str] = {
 
 
 def axis_matrix(names: Sequence[str]) -> FloatArray:
-    """Return the matrix (3, 3) from sensor axes to the axes whose sensor axes are named, such as "-x"."""
+    """Return the matrix (3, 3) from sensor to unit axes; each name is the sensor axis along a unit axis."""
     return np.array([[(1.0, -1.0)[name[0] == "-"] * (name[-1] == axis) for axis in "xyz"] for name in names])
 
 
@@ -794,7 +796,8 @@ def fitted_devices(config: Any) -> list[tuple[str, str, Any]]:
 def driver_of(kind: str, section: Any, key: str = "") -> Driver:
     """Return the registration of the driver that a section names. Raises ConfigError.
 
-    On a board, only built-in drivers and permitted objects are imported (`flight.schema.document.imported`).
+    On a flight computer, only built-in drivers and permitted objects are imported
+    (`flight.schema.document.imported`).
     """
     named = getattr(section, "driver", None) or section.__struct_config__.tag
     return _named(kind, named, key or f"{kind}.driver")

@@ -1,4 +1,4 @@
-"""Converts configuration text into plain values and typed sections; errors name file, line, value and cure.
+"""Converts configuration text to values and typed sections; errors state file, line, value and remedy.
 
 Plain scalars follow the core schema of YAML 1.2: `1e-5` and `0o17` are numbers, `yes` and `12:30` are texts.
 Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected. A file with the key
@@ -76,13 +76,15 @@ class Document:
 
 
 MODULES = "KNIGHTCUBE_MODULES"
-"""Environment variable of a board, which names the file of further permitted objects `module:object`."""
+"""Environment variable of a flight computer: path of the file of further permitted objects
+`module:object`."""
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
     """Return an object that a configuration names as `module:object`, or by a key of `known`.
 
-    On a board, only known objects and those in the file of the variable `KNIGHTCUBE_MODULES` are imported.
+    On a flight computer, only known objects and those in the file of the variable `KNIGHTCUBE_MODULES` are
+    imported.
 
     Raises ConfigError for an object that is not permitted or cannot be imported.
     """
@@ -282,7 +284,7 @@ def _extended(document: Document, above: tuple[str, ...]) -> Document:
 
 
 def _merged(base: Any, own: Any, dotted: str, lines: dict[str, int]) -> Any:
-    """Return `own` merged into `base`, and delete the lines of the values below `dotted` that it replaces."""
+    """Return the values `base` with the replacements `own`; delete the line numbers of replaced values."""
     if isinstance(base, dict) and isinstance(own, dict):
         merged = dict(base)
         for key, value in own.items():
@@ -381,7 +383,7 @@ _NOUNS = {
     "`bool`": "true or false",
     "`null`": "nothing",
 }
-"""Plain nouns for the type names in the messages of msgspec."""
+"""Plain nouns that replace the type names in the messages of msgspec."""
 _LONGEST_VALUE = 200
 """Maximum number of characters of a value in a message."""
 

@@ -42,7 +42,8 @@ The expected pressure is a tenth of the largest pressure (solar maximum, perpend
 _LARGEST_PRESSURE = 10.0
 """Ratio of the largest to the expected pressure."""
 _DIPOLE, _MOMENT = 3.0e-4, 1.047e-3
-"""Dipole (A m^2) with the cost of an attitude error of 1 deg, tuned for a mean moment (kg m^2) of a 1U."""
+"""Dipole (A m^2) that costs as much as an attitude error of 1 deg, and mean moment of inertia (kg m^2) of the
+1U CubeSat for which this dipole was tuned."""
 
 _DIPOLE_PER_MASS = 3.5e-3
 """Residual dipole (A m^2) per kg of a satellite of class II that does not spin (NASA SP-8018)."""
@@ -137,15 +138,15 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     """The attitude filter of a satellite in orbit (`knightcube.gnc.estimation.free_filter`).
 
     The value `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s), and `field_noise` is the
-    noise of a magnetometer sample, T per axis. The value `torque_start` is the expected size (N m) of the
-    disturbance torques at an altitude of 500 km before they are estimated, and `torque_walk` their random
+    noise of a magnetometer sample, T per axis. The value `torque_start` is the expected amplitude (N m) of
+    the disturbance torques at an altitude of 500 km before they are estimated, and `torque_walk` their random
     walk, N m per sqrt(s). By default, `torque_start` and `torque_walk` are computed
     (`OrbitConfig.torque_sizes`). From one boot to the next, the gyro bias may change by 10 deg/h, and the
     residual dipole by the fraction `changed` of its initial standard deviation. The mapping `roles` sets the
     role of blocks of the error state: `estimated`, `considered` (the block is not corrected, but its
     uncertainty is part of every covariance) or `fixed` (the block is known exactly). With `compare: meller`,
     the attitude is also determined as the ION-F satellites do (`knightcube.reference.sensor_fusion`), for
-    comparison in the telemetry; this attitude is not flown.
+    comparison in the telemetry; this attitude is not used for control.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -180,7 +181,7 @@ class PointingSection(Section, frozen=True, kw_only=True):
     of `dipole` A m^2 have equal cost. A roll error of `roll` rad about `axis` has the same cost; without
     `roll`, a roll error costs as much as any other attitude error. The coils act for `act` s between pauses
     for the magnetometer, which last as long as those of detumbling. Plans are renewed every `replan_period`
-    s. A coil that pointing hardly uses is tested by a short current every `coil_test` s; 0 switches the tests
+    s. A coil that pointing rarely uses is tested by a short current every `coil_test` s; 0 switches the tests
     off. A slew to a distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones`
     of the star camera. The `planner` of slews is `collocation` or `vmc` (virtual motion camouflage). Without
     `dipole` or `slew`, the value is computed (`OrbitConfig.dipole_weight`, `OrbitConfig.slew_duration`).
@@ -212,7 +213,7 @@ class TargetStep(Aim, frozen=True, kw_only=True):
 
 
 class Requirements(Section, frozen=True, kw_only=True):
-    """Requirements that `knightcube report` checks for an orbit flight; omitted ones are not checked.
+    """Requirements that `knightcube report` checks for an orbit flight; omitted requirements are not checked.
 
     Detumbling must end within `slow_within` s of the start, and the attitude must be fine within
     `fine_within` s after that. The value `knowledge_deg` limits the rms error of the attitude with star
@@ -283,11 +284,12 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         return usual if given is None else given, 0.3 * usual
 
     def torque_sizes(self) -> tuple[float, float]:
-        """Return size (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.
+        """Return the amplitude (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.
 
-        The default size is that of drag and sunlight on the largest face, with the sum of the described and
-        the unknown offset of the centre of mass as lever arm. The default random walk is the size times 2e-3
-        per sqrt(s), because plans extrapolate an estimated torque along the field for an hour.
+        The default amplitude is the torque of air drag and solar radiation pressure on the largest face, with
+        the sum of the described and the unknown offset of the centre of mass as lever arm. The default random
+        walk is the amplitude times 2e-3 per sqrt(s), because plans extrapolate an estimated torque along the
+        field for an hour.
         """
         craft, section = self.craft, self.estimation
         x, y, z = craft.size
@@ -296,7 +298,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         return start, section.torque_walk or _two_digits(2.0e-3 * start)
 
     def largest_torques(self) -> tuple[float, float]:
-        """Return the largest torques (N m) by air at 500 km altitude and by an unknown residual dipole."""
+        """Return the largest torques (N m) of air drag at 500 km and of an unknown residual dipole."""
         return _LARGEST_PRESSURE * self.torque_sizes()[0], sum(self.dipole_errors()) * _FIELD
 
     def dipole_weight(self) -> float:

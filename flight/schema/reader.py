@@ -1,6 +1,6 @@
 """Reads configurations: from YAML to a validated `flight.schema.sections.Config`.
 
-Each error is one line that names the file, the line, the value and its cure. The module also checks that
+Each error is one line that states the file, the line, the value and the remedy. The module also checks that
 values of a configuration are consistent with each other, and defines the networks that the link accepts.
 """
 
@@ -356,7 +356,7 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
     host = (link.telemetry_to or "localhost:0").rpartition(":")[0]
     try:
         IPv4Address("127.0.0.1" if host == "localhost" else host)
-    except ValueError:  # a query for the address of a name would block the link at each frame
+    except ValueError:  # resolving a host name would block the link at each frame
         refuse("link.telemetry_to", f"{host} is not an IPv4 address")
     try:
         peer_networks(link)

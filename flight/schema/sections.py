@@ -195,9 +195,9 @@ class Link(Section, frozen=True, kw_only=True):
     bytes, and telecommand frames have at most `command_frame_bytes` bytes. Each line carries at most `rate`
     bytes/s of telemetry frames. Idle frames raise the rate to `idle_rate` bytes/s. Telemetry is always
     authenticated, and readable without a key if `encrypt_telemetry` is false. The section `coding` describes
-    the channel coding. After `command_loss` s with power without an authentic frame, a board returns to its
-    previous release, after the same time again to its previous configuration, then to the configuration
-    accepted on the ground; 0 disables these returns.
+    the channel coding. After `command_loss` s with power without an authentic frame, a flight computer
+    returns to its previous release, after the same time again to its previous configuration, then to the
+    configuration accepted on the ground; 0 disables these returns.
     """
 
     keys: Annotated[str, Meta(min_length=1)]

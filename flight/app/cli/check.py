@@ -45,7 +45,7 @@ class Probed:
 
 
 def probe(config: Config) -> list[Probed]:
-    """Return the result of each device, file and folder that the configuration needs."""
+    """Return the check result of each device, file and folder that the configuration needs."""
     sections = fitted_devices(config)
     sections += [("camera", "camera", config.camera)] if config.camera is not None else []
     sections += [(f"wide_cameras[{k}]", "camera", camera) for k, camera in enumerate(config.wide_cameras)]

@@ -153,7 +153,7 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
 
 def _judge(config_path: Path, log: Path) -> _JudgedLink:
     """Read and validate the configuration of the link. Raises UnreadConfigError and ConfigError."""
-    # A service stores the configurations that flew in the folder that also contains its archive.
+    # A service stores the flown configurations in the folder that also contains its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
@@ -253,7 +253,7 @@ class _LoopbackLine:
 
 
 def self_test() -> None:
-    """Run a link until it has executed one command and reported it. Raises FlightError after 20 s.
+    """Run a link until it has executed one command and reported the execution. Raises FlightError after 20 s.
 
     The installation of a release runs this test.
     """

@@ -120,7 +120,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _faults_help() -> str:
-    """Return the grammar of faults, and a list of all faults."""
+    """Return a text with the syntax of fault specifications and a list of all faults."""
     from flight.app.devices import fault_catalogue  # noqa: PLC0415 - only --help needs it
 
     grammar, listing = fault_catalogue()

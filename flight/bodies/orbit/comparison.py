@@ -1,4 +1,4 @@
-"""Attitude determination of Meller et al. beside the filter that is flown, from the same readings."""
+"""Attitude determination by the method of Meller et al., in parallel with the flight filter."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from knightcube.reference.sensor_fusion import GyroBiasFilter, KnownAttitude, Se
 
 
 class ComparedFeed:
-    """Passes readings to the flown filter and to the compared method; implements `ReadingFeed`."""
+    """Passes readings to the flight filter and to the compared method; implements `ReadingFeed`."""
 
     def __init__(
         self, feed: ReadingFeed, filter_: OrbitFilter, config: OrbitConfig, services: Services
@@ -34,7 +34,7 @@ class ComparedFeed:
         return self._feed.accept(reading)
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start the flown filter from a star fix, which the compared method does not use."""
+        """Start the flight filter from a star fix, which the compared method does not use."""
         return self._feed.begin(attitude)
 
     def compare(

@@ -203,7 +203,7 @@ class EstimatedEnvironment:
         self._fixed_ns = 0
         self._near: Ephemeris | None = None
         self._near_sigma = 0.0
-        # Magnetic field, pressures of air and sunlight, and visible fraction of the Sun at the predicted
+        # Magnetic field, air and solar radiation pressures, and visible fraction of the Sun at the predicted
         # times.
         self._near_table: FloatArray = np.zeros((0, 10))
         self.refused = 0

@@ -2,7 +2,8 @@
 
 A path is a table of feedback gains and reference motion for the pointing law. A path is planned when a target
 is set, when the attitude becomes known again, and when the body leaves its path. Paths are also planned
-periodically, because the orbit prediction ages and a free roll angle follows the body.
+periodically, because the orbit prediction loses accuracy and a free roll angle is adapted to the present roll
+of the body.
 
 During a slew, the rest of the slew is planned again every few seconds from the newest estimate, with the
 estimated inertia, residual dipole and torques. The running path is followed until the new path begins. A new
@@ -77,8 +78,8 @@ class PathPoint:
 
 
 REST = 0.3
-"""Fraction of a slew before its end in which the slew is not planned again. The feedback
-gains correct small errors near the end, because the time is too short for a new plan."""
+"""Final fraction of a slew in which the slew is not planned again. The feedback gains correct small errors
+near the end, because the time is too short for a new plan."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

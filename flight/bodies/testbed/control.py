@@ -2,10 +2,11 @@
 
 Paths are planned by one of three strategies. The strategy GOAL plans the whole step when a target is set, and
 every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
-continuation of the step. Near the goal time, the last path is followed to its end. From then on each plan
-holds the target for one replanning period. A body displaced from its path gets a new plan. The strategy
-RECEDING is that of the thesis: each plan reaches the target one whole planning horizon later (Sease, chapter
-5, Optimal Path Planning). The strategy STEP makes no plan, so that the controller tracks the target itself.
+continuation of the step. Near the goal time, the last path is followed to its end. After the end of this
+path, each plan holds the target for one replanning period. If the body is displaced from its path, a new path
+is planned. The strategy RECEDING is that of the thesis: each plan reaches the target one whole planning
+horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan, so that the
+controller tracks the target itself.
 
 The control laws are B-dot detumbling and a controller of the rotation about the thread. In a Helmholtz cage,
 the magnetic field is that of an orbit, which the flight software predicts. The cage produces the field that a
