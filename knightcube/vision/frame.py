@@ -427,23 +427,6 @@ def _box_sum(image: Image) -> Image:
     return total
 
 
-def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
-    """Return the flattened 3 x 3 `sums` of a frame of `shape` after counts are subtracted from some pixels.
-
-    The indices `pixels` (m,) are those of the changed pixels, each given once, and `taken` (m,) are the
-    counts to subtract.
-    """
-    out, (rows, columns) = sums.copy(), shape
-    for down in (-columns, 0, columns):
-        for beside in (-1, 0, 1):
-            # Sums that would cross the edge of the frame belong to border pixels, which are set to zero.
-            out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
-    framed = out.reshape(rows, columns)
-    framed[[0, -1]] = 0
-    framed[:, [0, -1]] = 0
-    return out
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
     """The moments of the brightness of n regions.

@@ -21,10 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.frame import less_boxes
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, paths
 from knightcube.vision.streaks.polar_grid import (
@@ -325,6 +324,38 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
         np.concatenate([pixels, unmodelled]),
         np.concatenate([signal - left, frame.signal[unmodelled]]),
     )
+
+
+def _less_boxes_numpy(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
+    """See `less_boxes`."""
+    out, (rows, columns) = sums.copy(), shape
+    for down in (-columns, 0, columns):
+        for beside in (-1, 0, 1):
+            # Sums that would cross the edge of the frame belong to border pixels, which are set to zero.
+            out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
+    framed = out.reshape(rows, columns)
+    framed[[0, -1]] = 0
+    framed[:, [0, -1]] = 0
+    return out
+
+
+@compiled_form_of(_less_boxes_numpy)
+def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
+    """Return the flattened 3 x 3 `sums` of a frame of `shape` after counts are subtracted from some pixels.
+
+    The indices `pixels` (m,) are those of the changed pixels, each given once, and `taken` (m,) are the
+    counts to subtract. The sums of the border pixels are zero.
+    """
+    out, (rows, columns) = sums.copy(), shape
+    for p in range(len(pixels)):
+        row, column = pixels[p] // columns, pixels[p] % columns
+        for r in range(max(row - 1, 1), min(row + 2, rows - 1)):
+            for c in range(max(column - 1, 1), min(column + 2, columns - 1)):
+                out[r * columns + c] -= taken[p]
+    framed = out.reshape(rows, columns)
+    framed[0], framed[rows - 1] = 0.0, 0.0
+    framed[:, 0], framed[:, columns - 1] = 0.0, 0.0
+    return out
 
 
 def _found_stars(

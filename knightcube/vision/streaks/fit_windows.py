@@ -143,8 +143,7 @@ class FitWindows:
 
         The last element is the sum of the counts on pixels outside the frame.
         """
-        light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
-        return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
+        return _summed(self.slot, on_strips.reshape(-1), on_patches.reshape(-1), len(self.pixels) + 1)
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
         """Return the fit windows reduced to the pixels selected by the masks `on_strips` and `on_patches`."""
@@ -153,6 +152,23 @@ class FitWindows:
             on_strips=replace(self.on_strips, inside=on_strips),
             on_patches=replace(self.on_patches, inside=on_patches),
         )
+
+
+def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
+    """Return the sums (count,) of the counts `first`, then `second`, on pixels that have the same `slot`."""
+    light = np.concatenate([first, second.astype(np.float32)])
+    return np.bincount(slot, light, count).astype(np.float32)
+
+
+@compiled_form_of(_summed_numpy)
+def _summed(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
+    """See `_summed_numpy`."""
+    total, begin = np.zeros(count), len(first)
+    for p in range(begin):
+        total[slot[p]] += first[p]
+    for p in range(len(second)):
+        total[slot[begin + p]] += second[p]
+    return total.astype(np.float32)
 
 
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:

@@ -22,7 +22,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks import coupled_stars, streak_model
 from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows, residuals
 from knightcube.vision.streaks.frame import MEDIAN_ERROR
 from knightcube.vision.streaks.geometry import Shutter, StreakScene, sensitivities
@@ -318,23 +318,40 @@ def _shared_pixels(
     star: IntArray, view: BlockPixels, weight: Float32Array, images: Float32Array, matrix: FloatArray
 ) -> SharedPixels:
     """Return the derivatives of the modelled counts on pixels that several stars share."""
-    block, place = np.divmod(view.crowded, images.shape[2])
+    block, drawn = _at_pixels(images, view.crowded)
     first = np.flatnonzero(np.diff(block, prepend=-1))
     held = block[first]
+    weights = weight.reshape(-1)[view.crowded]
+    return SharedPixels(star[held], matrix[held], first, view.common, weights, drawn)
+
+
+def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
+    """Return the block (e,) of each of e pixels, and the values of the images, without the last, (i, e).
+
+    The flat indices `crowded` (e,) of the pixels are those in b blocks of p pixels with i + 1 `images` each
+    (b, i + 1, p).
+    """
     _, count, size = images.shape
+    block, place = np.divmod(crowded, size)
     place += block * (count * size)
     drawn = np.empty((count - 1, len(place)), dtype=np.float32)
     for image in drawn:
         image[:] = images.reshape(-1).take(place)
         place += size
-    return SharedPixels(
-        star[held],
-        matrix[held],
-        first,
-        view.common,
-        weight.reshape(-1)[view.crowded],
-        drawn,
-    )
+    return block, drawn
+
+
+@compiled_form_of(_at_pixels_numpy)
+def _at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
+    """See `_at_pixels_numpy`."""
+    _, count, size = images.shape
+    block, drawn = np.empty_like(crowded), np.empty((count - 1, len(crowded)), dtype=np.float32)
+    for e in range(len(crowded)):
+        block[e] = crowded[e] // size
+        of_block, place = images[block[e]], crowded[e] - block[e] * size
+        for i in range(count - 1):
+            drawn[i, e] = of_block[i, place]
+    return block, drawn
 
 
 def _spot_images(
@@ -353,124 +370,6 @@ def _spot_images(
     images[:, 9] = spots
     images[:, 10] = 1.0
     return images
-
-
-def apply_information(
-    evaluation: Evaluation, shared: FloatArray, alone: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the product of the information matrix of the whole scene with a vector (`shared`, `alone`).
-
-    `shared` (SHARED,) holds the shared parameters, and `alone` (n, ALONE) the parameters of each star. The
-    product includes the coupling of stars by shared pixels.
-    """
-    n = len(alone)
-    vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
-    out = (evaluation.information @ vector[..., None])[..., 0]
-    change = np.zeros(evaluation.shared)
-    lights = []
-    for crowd in evaluation.crowds:
-        lights.append(np.empty(len(crowd.slot), dtype=np.float32))
-        _light_changes(
-            change, lights[-1], vector, crowd.star, crowd.matrix, crowd.first, crowd.slot, crowd.images
-        )
-    for crowd, light in zip(evaluation.crowds, lights, strict=True):
-        blocks = crowd.star, crowd.matrix, crowd.first, crowd.slot, crowd.images
-        _add_coupling(out, change, light, *blocks, crowd.weight)
-    return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + PRIOR * alone
-
-
-def _light_changes_numpy(
-    change: FloatArray,
-    light: Float32Array,
-    vector: FloatArray,
-    star: IntArray,
-    matrix: FloatArray,
-    first: IntArray,
-    slot: IntArray,
-    images: Float32Array,
-) -> None:
-    """Compute the changes of the modelled counts on e shared pixels for a step `vector` of all parameters.
-
-    The change by each star is `light` (e,), and is added to the `change` by all stars, for each pixel in the
-    list of all shared pixels. The other arguments are those of `SharedPixels`.
-    """
-    mixture = (matrix @ vector[star][..., None])[..., 0].T.astype(np.float32)
-    block = np.repeat(np.arange(len(first)), np.diff(first, append=len(slot)))
-    light[:] = np.einsum("ie,ie->e", mixture.take(block, axis=1), images)
-    change += np.bincount(slot, light, len(change))
-
-
-@compiled_form_of(_light_changes_numpy)
-def _light_changes(
-    change: FloatArray,
-    light: Float32Array,
-    vector: FloatArray,
-    star: IntArray,
-    matrix: FloatArray,
-    first: IntArray,
-    slot: IntArray,
-    images: Float32Array,
-) -> None:
-    """See `_light_changes_numpy`."""
-    for b in range(len(first)):
-        stop = first[b + 1] if b + 1 < len(first) else len(slot)
-        light[first[b] : stop] = 0.0
-        for i in range(len(images)):
-            part = np.float32(0.0)
-            for k in range(vector.shape[1]):
-                part += matrix[b, i, k] * vector[star[b], k]
-            for e in range(first[b], stop):
-                light[e] += np.float32(part) * images[i, e]
-        for e in range(first[b], stop):
-            change[slot[e]] += light[e]
-
-
-def _add_coupling_numpy(
-    out: FloatArray,
-    change: FloatArray,
-    light: Float32Array,
-    star: IntArray,
-    matrix: FloatArray,
-    first: IntArray,
-    slot: IntArray,
-    images: Float32Array,
-    weight: Float32Array,
-) -> None:
-    """Add the effect of other stars on e shared pixels to the product `out` (n, SHARED + ALONE).
-
-    The arguments `change` and `light` are results of `_light_changes`; the others those of `SharedPixels`.
-    """
-    weighted = weight * (change[slot] - light).astype(np.float32)
-    slope = np.add.reduceat(images * weighted, first, axis=1).T.astype(np.float64)
-    np.add.at(out, star, (slope[:, None] @ matrix)[:, 0])
-
-
-@compiled_form_of(_add_coupling_numpy)
-def _add_coupling(
-    out: FloatArray,
-    change: FloatArray,
-    light: Float32Array,
-    star: IntArray,
-    matrix: FloatArray,
-    first: IntArray,
-    slot: IntArray,
-    images: Float32Array,
-    weight: Float32Array,
-) -> None:
-    """See `_add_coupling_numpy`."""
-    weighted = np.empty(len(slot), dtype=np.float32)
-    for e in range(len(slot)):
-        weighted[e] = weight[e] * (change[slot[e]] - light[e])
-    for b in range(len(first)):
-        stop = first[b + 1] if b + 1 < len(first) else len(slot)
-        for i in range(len(images)):
-            slope = _scalar_product(weighted[first[b] : stop], images[i, first[b] : stop])
-            for k in range(out.shape[1]):
-                out[star[b], k] += slope * matrix[b, i, k]
-
-
-# Squared residual norm, relative to the squared norm of the first step, at which conjugate gradients stop.
-_CONVERGED = 1e-2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -525,13 +424,6 @@ class EliminatedEquations:
     own: FloatArray
     gain: FloatArray
     inner: FloatArray
-
-    def solve(self, shared: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the solution of the equations for the right-hand sides `shared` and `alone` (n, ALONE)."""
-        step = self.inner @ (shared[self.kept] - np.einsum("nij,nj->i", self.gain, alone))
-        out = np.zeros(SHARED)
-        out[self.kept] = step
-        return out, np.einsum("nij,nj->ni", self.own, alone) - step @ self.gain
 
 
 def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | None:
@@ -634,8 +526,8 @@ def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: i
     offset = np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
     alone = evaluation.gradient[:, SHARED:] - PRIOR * offset
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
-    step = _conjugate(evaluation, eliminated, free, (shared, alone), rounds)
-    return Solution(*step, eliminated)
+    step = _coupled(evaluation, eliminated, free, np.concatenate([shared, alone.reshape(-1)]), rounds)
+    return Solution(step[:SHARED], step[SHARED:].reshape(alone.shape), eliminated)
 
 
 def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
@@ -643,56 +535,29 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    alone = np.zeros((len(evaluation.chi2), ALONE))
     out = np.empty((3, 3))
     for k in range(3):
         # The equations are scaled so that the solution is of order one and one tolerance suits all frames.
-        unit = np.zeros(SHARED)
+        unit = np.zeros(SHARED + ALONE * len(evaluation.chi2))
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
-        solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
-        out[k] = solved[:3] / unit[k]
+        out[k] = _coupled(evaluation, eliminated, free, unit, rounds)[:3] / unit[k]
     return 0.5 * (out + out.T)
 
 
-def _conjugate(
+def _coupled(
     evaluation: Evaluation,
     eliminated: EliminatedEquations,
     free: BoolArray,
-    right: tuple[FloatArray, FloatArray],
+    right: FloatArray,
     rounds: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the solution of the coupled normal equations for the right-hand side `right`.
-
-    The equations without coupling of stars are the preconditioner of the conjugate gradients, so that few
-    iterations suffice.
-    """
-    x = eliminated.solve(*right)
-    if rounds == 0:
-        return x
-
-    def product(v: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        shared, alone = apply_information(evaluation, *v)
-        return np.where(free, shared, 0.0), alone
-
-    def dot(a: tuple[FloatArray, FloatArray], b: tuple[FloatArray, FloatArray]) -> float:
-        return float(a[0] @ b[0] + np.sum(a[1] * b[1]))
-
-    image = product(x)
-    residual = right[0] - image[0], right[1] - image[1]
-    z = eliminated.solve(*residual)
-    direction, size = z, dot(residual, z)
-    first = abs(dot(right, x))
-    for _ in range(rounds):
-        if size <= _CONVERGED * first:
-            break
-        image = product(direction)
-        length = size / dot(direction, image)
-        x = x[0] + length * direction[0], x[1] + length * direction[1]
-        residual = residual[0] - length * image[0], residual[1] - length * image[1]
-        z = eliminated.solve(*residual)
-        size, before = dot(residual, z), size
-        direction = z[0] + size / before * direction[0], z[1] + size / before * direction[1]
-    return x
+) -> FloatArray:
+    """Return the solution of the coupled normal equations, see `coupled_stars.solution`."""
+    crowds = [(of.star, of.matrix, of.first, of.slot, of.weight, of.images) for of in evaluation.crowds]
+    first, second = (*crowds, coupled_stars.NO_CROWD, coupled_stars.NO_CROWD)[:2]
+    alone = eliminated.kept, eliminated.own, eliminated.gain, eliminated.inner
+    return coupled_stars.solution(
+        evaluation.information, PRIOR, (first, second), evaluation.shared, alone, free, right, rounds
+    )
 
 
 def stepped(

@@ -24,7 +24,6 @@ from knightcube.vision.frame import (
     in_steps,
     interpolation_weights,
     label_pixels,
-    less_boxes,
     line_of,
     moments,
     places_in_blocks,
@@ -32,6 +31,7 @@ from knightcube.vision.frame import (
     saturation_level,
     saturation_of_bright,
 )
+from knightcube.vision.streaks.faint_stars import less_boxes
 from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import rate_at, star_camera, star_frame
 

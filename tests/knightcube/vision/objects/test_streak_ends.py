@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.frame import box_sum, less_boxes, repair_hot_pixels
+from knightcube.vision.frame import box_sum, repair_hot_pixels
 from knightcube.vision.objects.streak_ends import (
     _bounding_boxes,
     _corners_of_regions,
@@ -28,6 +28,7 @@ from knightcube.vision.objects.streak_ends import (
     threshold_local,
     threshold_mean,
 )
+from knightcube.vision.streaks.faint_stars import less_boxes
 from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import rate_at, star_camera, star_frame
 

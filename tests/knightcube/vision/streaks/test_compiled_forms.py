@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from knightcube.vision.streaks import (
+    coupled_stars,
     faint_stars,
     first_guess,
     fit_windows,
@@ -40,8 +41,10 @@ _FUNCTIONS = (
     (normal_equations, "_sum_products", 2e-5),
     (normal_equations, "_eliminated", 1e-6),
     (streak_model, "_mixtures", 1e-9),
-    (normal_equations, "_light_changes", 2e-5),
-    (normal_equations, "_add_coupling", 2e-5),
+    (normal_equations, "_at_pixels", 1e-9),
+    (fit_windows, "_summed", 1e-6),
+    (faint_stars, "less_boxes", 2e-6),
+    (coupled_stars, "solution", 1e-4),
 )
 _SMALL = replace(CAMERA, columns=300, rows=260)
 # Length (px) and relative change of the rate: crossing streaks, a motion from rest, and streaks without ends.
