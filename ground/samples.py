@@ -1,6 +1,6 @@
 """Sample pictures for other commands, which the simulator renders together with their true parameters.
 
-The pictures are rendered on demand, because 12-bit noise does not compress and stored pictures would not
+The pictures are rendered on demand, because 12-bit noise cannot be compressed, and stored pictures would not
 follow changes of the simulator. The same seed gives the same pictures.
 """
 
@@ -37,7 +37,7 @@ EARTH_PIXELS, EARTH_FIELD_DEG, ALTITUDE_KM = 512, 67.0, 515.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SamplePicture:
-    """A sample image, its true parameters, and an example command, with `{}` for the image file."""
+    """A sample image, its true parameters, and an example command; `{}` stands for the image file."""
 
     name: str
     pixels: Image

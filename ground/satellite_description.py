@@ -1,9 +1,9 @@
 """Configuration file of a satellite that is described by mass, size, orbit, coils and cameras.
 
-The file extends the configuration `orbit` (a 1U CubeSat) and states the values that differ. Values that
-follow from the description are computed: the inertia is that of a homogeneous cuboid, and limits are scaled
-between those of the configurations `orbit` and `orbit_3u`. Weights and noises that the flight application
-computes from craft and coils are omitted.
+The file extends the configuration `orbit` (a 1U CubeSat) and contains only differing values. Values that are
+not described are computed: the inertia is that of a homogeneous cuboid, and limits are scaled between those
+of the configurations `orbit` and `orbit_3u`. Weights and noises that the flight application computes from
+craft and coils are omitted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sim_hal.worlds.orbit import elements, log_density, sun_position
 
 Vector = tuple[float, float, float]
 Line = str | tuple[str, str]
-"""A line of the file, or a value and its comment."""
+"""A line of the configuration file, or a pair of a value and its comment."""
 
 TILT_DEG = 22.0
 """Angle of the star camera from the normal of the orbit towards the zenith, deg."""
@@ -30,9 +30,9 @@ _YEAR_RATE = 2.0 * math.pi / (365.2422 * 86_400.0)
 _EQUATOR_FIELD = 2.98e-5
 """Field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]."""
 _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
-"""Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, sunlight pressure (Pa)."""
+"""Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, solar pressure (Pa)."""
 _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
-"""Bound of the simulated current error, and assumed noise, relative to the limit [as in `orbit`]."""
+"""Bound of the simulated current error, and assumed current noise, as fractions of the limit [`orbit`]."""
 _STRAY_FIELD = 7.4e-5
 """Field (T) of a coil at the magnetometer at the current limit [as in `orbit`]."""
 
@@ -66,7 +66,7 @@ class Satellite:
         supply_voltage: voltage across a coil that is fully on, V.
         field_of_view_deg: field of view of the star camera, deg, or None without a star camera.
         wide_cameras: whether the six horizon cameras are fitted.
-        release_deg: rate at the release, deg/s.
+        release_deg: body rate at release, deg/s.
     """
 
     name: str
@@ -83,22 +83,23 @@ class Satellite:
 
 @dataclass(frozen=True, slots=True)
 class Derived:
-    """Values that follow from the description of a satellite.
+    """Values that are computed from the description of a satellite.
 
     Attributes:
         inertia: moments of inertia about the body axes, kg m^2.
         dipole: dipole of the coils in a typical direction, A m^2.
         field: root mean square of the magnetic field along the orbit, T.
-        coil_torque: torque of this dipole in this field, N m.
-        disturbance: torque of air and sunlight on the largest face, with a mass offset of 2 cm, N m.
-        momentum_time: time (s) in which this coil torque removes the rate at the release.
+        coil_torque: product of `dipole` and `field`, N m.
+        disturbance: aerodynamic and solar torque on the largest face for a mass offset of 2 cm, N m.
+        momentum_time: time (s) in which `coil_torque` removes the angular momentum at release.
         period: orbital period, s.
         slow_within: estimate of the longest time of detumbling, s.
         duration: duration of the flight, s.
         detumble_horizon: planning horizon of detumbling, s.
-        roll: roll error whose cost equals that of an error of 1 deg of the pointing axis, rad.
-        sun_side: whether the Sun is on the side of body +y while +z points to nadir and +x along the flight.
-        beta_deg: angle of the Sun from the plane of the orbit, deg.
+        roll: roll error (rad) that has the same cost as an error of 1 deg of the pointing axis.
+        sun_side: whether the Sun is on the side of body +y while +z points to nadir and +x along the
+            velocity.
+        beta_deg: angle between the Sun's direction and the orbital plane, deg.
     """
 
     inertia: Vector
@@ -117,7 +118,7 @@ class Derived:
 
 
 def sun_synchronous_inclination(altitude: float, eccentricity: float) -> float | None:
-    """Return the inclination (deg) at which J2 makes the node follow the mean Sun, or None.
+    """Return the inclination (deg) of a Sun-synchronous orbit, or None if none exists at this altitude.
 
     The argument `altitude` is the semi-major axis minus the Earth's radius, m (Vallado, eq. 11-13).
     """
@@ -129,7 +130,7 @@ def sun_synchronous_inclination(altitude: float, eccentricity: float) -> float |
 
 
 def largest_dipole(coils: tuple[Coil, ...]) -> float:
-    """Return the dipole of coils in a typical direction, A m^2, or 0 if all coils have parallel axes.
+    """Return the dipole of all coils in a typical direction, A m^2, or 0 if all coil axes are parallel.
 
     The result is the geometric mean of the singular values of the matrix of dipoles at the current limits.
     For three equal coils on three axes, the result is the dipole of one coil.
@@ -141,7 +142,7 @@ def largest_dipole(coils: tuple[Coil, ...]) -> float:
 
 
 def derived(satellite: Satellite, julian_date: float) -> Derived:
-    """Return the values that follow from the description; the flight starts at `julian_date`, UTC."""
+    """Return the computed values of a satellite whose flight starts at `julian_date`, UTC."""
     orbit, size = satellite.orbit, satellite.size
     x, y, z = np.diag(box_inertia(satellite.mass, size)).tolist()
     inertia = (x, y, z)
@@ -176,7 +177,7 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
 
 
 def _worst_pressure(perigee: float) -> float:
-    """Return the largest pressure (Pa) of air and sunlight on a face in an orbit.
+    """Return the largest sum of drag and solar pressure (Pa) on a face in an orbit.
 
     The argument `perigee` is the distance of the perigee from the Earth's centre, m. The air is densest at
     the perigee.
@@ -302,7 +303,7 @@ def _coil_lines(satellite: Satellite) -> list[Line]:
 
 
 def _current_lines(satellite: Satellite) -> list[Line]:
-    """Return the simulated errors of the currents, in proportion to those of the configuration `orbit`."""
+    """Return the lines of the simulated current errors, scaled from those of the configuration `orbit`."""
     least = min(coil.current_limit for coil in satellite.coils)
     fields = np.zeros((3, max(3, len(satellite.coils))))
     for index, coil in enumerate(satellite.coils):
@@ -335,7 +336,7 @@ def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:
 
 
 def _cone_lines(satellite: Satellite) -> list[Line]:
-    """Return the exclusion cones of the star camera, outside the corner of its field of view."""
+    """Return the lines of the star camera's exclusion cones, which are wider than its field of view."""
     if satellite.field_of_view_deg is None:
         return []
     corner = math.degrees(
@@ -356,7 +357,7 @@ def _text(value: float) -> str:
 
 
 def _laid_out(*lines: Line) -> str:
-    """Return the text of lines; a pair becomes a line with a comment."""
+    """Return lines as text; a pair of value and comment becomes a line with an aligned comment."""
     texts = []
     for line in lines:
         if isinstance(line, str):

@@ -1,9 +1,9 @@
 """Contents of a solved picture: coordinates of centre and axis, Sun, Moon and planets, and a FITS header.
 
 The positions of Sun, Moon and planets are geocentric and come from ERFA's series plan94, moon98 and epv00.
-From 1800 to 2050, plan94 (Simon et al. 1994) errs by a few arcseconds, or by 80" for Jupiter and Saturn. The
-error of moon98 (Meeus 1998) is 10". The series need no ephemeris file. For an observer on the ground the
-Moon's direction differs by up to 1 deg.
+From 1800 to 2050, plan94 (Simon et al. 1994) has errors of a few arcseconds, or of up to 80" for Jupiter and
+Saturn. The error of moon98 (Meeus 1998) is 10". The series need no ephemeris file. For an observer on the
+ground the Moon's direction differs by up to 1 deg from the geocentric direction.
 
 The FITS header describes a tangent plane with distortion polynomials (TAN-SIP: Calabretta & Greisen 2002,
 section 5.1.3, and Shupe et al. 2005). FITS counts pixels from 1.
@@ -24,7 +24,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun
 from knightcube.vision.startracker.sky_map import SkyMap
 
 _ORDER = 5
-"""Order of the distortion polynomials, odd because a radial distortion has no even terms."""
+"""Order of the distortion polynomials; it is odd because a radial distortion has no even terms."""
 _GRID = 25
 """Number of points per axis at which the distortion is fitted."""
 _CARD, _BLOCK = 80, 2880
@@ -99,7 +99,7 @@ def world_coordinates(sky: SkyMap, reversed_rows: bool = False) -> dict[str, str
 
 
 def _in_file(points: FloatArray, rows: int) -> FloatArray:
-    """Return pixels (n, 2) of an image as pixels of a file with the opposite order of rows."""
+    """Return image points (n, 2), px, in the coordinates of a file with the opposite order of rows."""
     return np.asarray(points * np.array([1.0, -1.0]) + np.array([0.0, rows - 1.0]))
 
 
@@ -123,7 +123,7 @@ def _polynomials(
 
 
 def header_text(sky: SkyMap, reversed_rows: bool = False) -> str:
-    """Return the text of a FITS file that consists of a header only, as for `world_coordinates`."""
+    """Return the text of a FITS file that consists only of the header from `world_coordinates`."""
     values = world_coordinates(sky, reversed_rows)
     cards: list[Card] = [("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 0), *values.items()]
     text = "".join(_card(key, value) for key, value in cards) + "END".ljust(_CARD)
@@ -146,7 +146,7 @@ _LIGHT_DAY_PER_UNIT = ASTRONOMICAL_UNIT / 299_792_458.0 / DAY
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkyBody:
-    """A body in a picture, with its direction (3,), ICRS without aberration, and its position (2,), px."""
+    """Sun, Moon or planet in a picture: direction (3,), ICRS without aberration, and position (2,), px."""
 
     name: str
     direction: FloatArray
@@ -184,7 +184,7 @@ _SAME_PX = 0.1
 def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody], reversed_rows: bool = False) -> dict[str, Any]:
     """Return image centre, optical axis, bodies and world coordinates as JSON data.
 
-    The argument `reversed_rows` is that of `world_coordinates`.
+    If `reversed_rows` is true, the first row of the file is the bottom row of the image.
     """
     if sky is None:
         return {}
@@ -212,12 +212,12 @@ def _coordinates(direction: FloatArray) -> dict[str, float]:
 
 
 def sky_text(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> str:
-    """Return lines of text about the axis, the image centre and the bodies, empty without a solution."""
+    """Return lines of text about the axis, the image centre and the bodies; empty without a solution."""
     if sky is None:
         return ""
     values, lines = sky_facts(sky, bodies), []
     if math.dist(values["axis"]["point_px"], values["image_centre"]["point_px"]) > _SAME_PX:
-        # The right ascension and declination of the axis are in the text of the solution, printed before.
+        # The text of the solution, which is printed first, already contains the axis's coordinates.
         centre, (x, y) = values["image_centre"], values["axis"]["point_px"]
         lines.append(f"axis:             at pixel {x:.1f}, {y:.1f}")
         place = f"{centre['right_ascension_deg']:.4f} {centre['declination_deg']:+.4f} deg"

@@ -1,4 +1,4 @@
-"""Reader of recorded packets, from bytes or from the folder of a run, which accounts for every byte."""
+"""Reader of recorded packets from bytes or from the folder of a run; every byte is accounted for."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from knightcube.errors import UsageError, shown
 
 
 def text_of(value: bytes) -> str:
-    """Return the text of a string field, in which control characters cannot control a terminal."""
+    """Return the text of a string field with control characters replaced, which could affect a terminal."""
     return shown(to_text(value))
 
 
@@ -34,11 +34,11 @@ class ScanResult:
     Attributes:
         packets: structured array of each packet type in order of arrival, which may be empty.
         total_bytes: number of bytes scanned.
-        skipped_bytes: number of bytes that belong to no valid packet, without a truncated last packet.
+        skipped_bytes: number of bytes that belong to no valid packet, excluding a truncated last packet.
         truncated_bytes: number of bytes at the end that look like the beginning of a packet.
         missing: number of missing packets of each type according to the sequence counts. A gap is counted
-            modulo 16,384.
-        other_versions: number of valid packets of another version than that of the table, which are not
+            modulo 16,384, the range of the sequence count.
+        other_versions: number of valid packets whose definition has a different version, which are not
             decoded.
     """
 
@@ -51,7 +51,7 @@ class ScanResult:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of packets by name, without packet types that were not found."""
+        """Number of packets by name of the packet types that were found."""
         return {name: len(array) for name, array in self.packets.items() if len(array)}
 
     @property
@@ -86,7 +86,7 @@ def scan(data: bytes) -> ScanResult:
 
 def _missing(layout: Layout, packets: bytes) -> int:
     """Return the number of packets missing between the found packets, according to their sequence counts."""
-    if len(packets) <= layout.length:  # a single packet has no gaps
+    if len(packets) <= layout.length:  # gaps need at least two packets
         return 0
     steps = np.diff(layout.sequence_counts(packets))
     return int(np.sum((steps - 1) % SEQUENCE_MODULUS))
@@ -119,7 +119,7 @@ class Run:
 
     @property
     def logs(self) -> dict[str, ScanResult]:
-        """The three logs by the stems of their file names."""
+        """The flight log, the truth log and the performance log, by the stems of their file names."""
         return {"flight": self.flight, "truth": self.truth, "performance": self.performance}
 
     def dropped_segments(self, stem: str) -> int:

@@ -28,7 +28,7 @@ from knightcube.errors import FlightError, UsageError
 STREAMS = ("imu", "field", "coils", "power", "camera")
 _KEPT_EVENTS = 200
 _MAX_TIME = 1e15
-"""Mission time (s) above which a packet is assumed to come from a damaged log."""
+"""Mission time (s) above which a packet is assumed to be damaged."""
 _TIMEOUT_S = 2.0
 """Longest time (s) to wait for the answer to a ping."""
 
@@ -45,7 +45,7 @@ class PacketSource(Protocol):
 
 
 class LogTail:
-    """Reader of a flight log that may still grow and end in an incomplete packet."""
+    """Reader of a flight log that may be growing and may end in an incomplete packet."""
 
     def __init__(self, folder: Path) -> None:
         """Start at the oldest segment of the log. Raises UsageError for a folder without a flight log."""
@@ -73,7 +73,7 @@ class LogTail:
         """Return the packets that were written since the last call, by name. Raises UsageError."""
         data = self._rest + self._read()
         while (following := self._following()) is not None:
-            # The segment is complete, but its last packets may have been written after it was read.
+            # The old segment is complete now, but its last packets may have been written after the last read.
             data += self._read()
             self._path, self._offset = following, 0
             data += self._read()
@@ -110,7 +110,7 @@ class PingAnswer:
     """Answer of a flight to a ping.
 
     Attributes:
-        packets: packets by name, with only the events that no earlier answer contained.
+        packets: packets by name; events that an earlier answer contained are omitted.
         count: number of commands that the flight has received since its start.
         delay: time from the ping to the answer, s.
     """
@@ -204,7 +204,7 @@ class FlightState:
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        """Names of the conditions that the monitors of the flight find at present."""
+        """Names of the conditions that are active in the newest packet `health`."""
         held = int(self.value("health", "facts") or 0)
         return tuple(name for bit, name in FACTS if held >> bit & 1)
 
@@ -231,10 +231,10 @@ def printable(text: str) -> str:
 
 
 class PlainLines:
-    """Writer of events as lines, and of the state once per period of mission time."""
+    """Writer of text lines: events, and the state once per period of mission time."""
 
     def __init__(self, state: FlightState, every: float, write: Callable[[str], object]) -> None:
-        """Create a writer of the events and, about every `every` s of mission time, of `state`."""
+        """Create a writer of all events, and of `state` about every `every` s of mission time."""
         self._state = state
         self._every = every
         self._write = write

@@ -16,14 +16,14 @@ from ground.watch import STREAMS, FlightState, attitude_text, named, printable
 
 LISTED_EVENTS = 12
 _BAR = 20
-"""Length (characters) of the bar that shows a coil current."""
+"""Width (characters) of the bar that shows a coil current."""
 _MODE_COLOURS = {
     "safe": "bold white on red",
     "boot": "bold black on yellow",
     "detumble": "bold black on yellow",
 }
 _STREAM_COLOURS = {"good": "green", "no-reading-yet": "dim"}
-"""Colours of the states of a stream that raise no alarm."""
+"""Colours of the stream states that are not alarms."""
 _SEVERITY_COLOURS = ("dim", "yellow", "bold red")
 
 

@@ -2,11 +2,12 @@
 
 `python -m ground.xtce [--epoch UTC] [--verified] > knightcube.xml`
 
-The document uses only features that the known clients read. The document has one flat space system, one
-parameter per array element (`rate_1`) and per bit of a bit field (`health_facts_gyro_lost`), names without
-`. / : [ ]`, zero-terminated texts, and a header of fixed values in each telecommand. A parameter is named
-`<packet>_<field>`. The command `point` has one form for each pointing goal, such as `point-ground`. Its
-arguments have names, and its angles are in degrees. Yamcs counts mission time from the epoch in the document.
+The document uses only features that the tested ground station programs can read. The document has one flat
+space system, one parameter per array element (`rate_1`) and per bit of a bit field
+(`health_facts_gyro_lost`), names without `. / : [ ]`, zero-terminated texts, and a header of fixed values in
+each telecommand. A parameter is named `<packet>_<field>`. The command `point` has one form for each pointing
+goal, such as `point-ground`. The arguments of `point` are named after the goal's parameters, with angles in
+degrees. Yamcs counts mission time from the epoch in the document.
 """
 
 from __future__ import annotations
@@ -40,16 +41,16 @@ TELECOMMANDS = {
     **COMMANDS,
     **{name: layout for name, layout in DIRECTIVES.items() if name not in _OF_THE_LINK},
 }
-"""Commands that a third-party ground station may send; only `flight` can send new keys."""
+"""Telecommands that a third-party ground station may send, which excludes changes of keys."""
 _XTCE = "http://www.omg.org/spec/XTCE/20180204"
 EPOCH = "2000-01-01T00:00:00"
 _BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
 UNUSED = "_spare"
-"""End of the name of a parameter for the unused bits of a bit field."""
+"""Suffix of the name of a parameter for the unused bits of a bit field."""
 _DEGREES = "deg"
-"""Unit of an argument that is encoded in rad."""
+"""Unit of an angle argument, which is encoded in rad."""
 _NAN = struct.pack(">d", math.nan).hex()
-"""Code of an unused number of the command `point`."""
+"""Encoding (NaN, hexadecimal) of an unused number of the command `point`."""
 _PRIMARY = (
     ("VERSION", 3),
     ("TYPE", 1),
@@ -77,10 +78,10 @@ def document(
     epoch: str = EPOCH,
     verified: bool = False,
 ) -> str:
-    """Return the tables as one XTCE document. The text `epoch` is the UTC of mission time zero, in ISO 8601.
+    """Return the packet tables in XTCE. The text `epoch` is the UTC of mission time zero, in ISO 8601.
 
-    `verified` adds to each command the verification by Yamcs, with a parameter name that other clients do not
-    know.
+    If `verified` is true, each command contains its verification by Yamcs, with a parameter name that only
+    Yamcs knows.
     """
     root = Element("SpaceSystem", {"xmlns": _XTCE, "name": SPACE})
     meta = SubElement(root, "TelemetryMetaData")
@@ -128,7 +129,7 @@ def _bits_of(field: Field) -> Iterator[Field]:
 
 
 def _size(kind: str) -> int:
-    """Return the number of bits of a number; the kind `b3` has three bits."""
+    """Return the number of bits of a number from its kind; for example, `b3` has three bits."""
     return int(kind[1:]) if kind.startswith("b") else _BITS_OF[kind]
 
 
@@ -267,7 +268,7 @@ _Entry = Field | str
 
 
 def _forms(layout: Layout) -> Iterator[tuple[str, list[_Entry]]]:
-    """Yield the name and the entries of each form of a command.
+    """Yield the name and the entries of each XTCE form of a command.
 
     The command `point` has one form for each goal, in which unused numbers are NaN. Each other command has
     one form.
@@ -299,7 +300,7 @@ def _add_command(name: str, layout: Layout, form: list[_Entry], types: Element, 
     command = SubElement(listed, "MetaCommand", {"name": name})
     _describe(command, packet.meaning)
     arguments = Element("ArgumentList")
-    if packet.fields:  # XTCE has no empty argument list
+    if packet.fields:  # XTCE does not allow an empty argument list
         command.append(arguments)
     container = SubElement(command, "CommandContainer", {"name": f"{name}_packet"})
     entries = SubElement(container, "EntryList")
@@ -337,7 +338,7 @@ def _add_verifiers(command: Element, layout: Layout) -> None:
             _add_condition(either, "verification_stage", dict(STAGES)[stage])
         window_of = {"timeToStopChecking": window, "timeWindowIsRelativeTo": "commandRelease"}
         SubElement(verifier, "CheckWindow", window_of)
-        if kind in {"Complete", "Failed"}:  # only these verifiers may have a parameter
+        if kind in {"Complete", "Failed"}:  # only these verifiers may return a parameter
             SubElement(verifier, "ReturnParmRef", {"parameterRef": "verification_text"})
 
 
@@ -353,7 +354,7 @@ def _add_condition(parent: Element, name: str, value: int | str) -> None:
 
 
 def _add_fixed(entries: Element, name: str, value: str) -> None:
-    """Add fixed bytes, which the sending link overwrites with sequence count, time and CRC."""
+    """Add fixed bytes, which the gateway overwrites with sequence count, time and CRC."""
     size = {"sizeInBits": str(4 * len(value)), "binaryValue": value}
     SubElement(entries, "FixedValueEntry", {"name": name, **size})
 

@@ -1,10 +1,10 @@
 """Writer of a Yamcs 5.12 configuration, started by `python -m ground.yamcs FOLDER [--epoch UTC]`.
 
 Yamcs connects to `knightcube gateway`, which holds the keys and exchanges unprotected packets with Yamcs
-(`ground.link.gateway`). Yamcs and the gateway listen on the loopback interface only. None of Yamcs's own data
-links can send the gateway's token when connecting. The folder therefore contains `GatewayLink.java`, the
-source of a data link that sends the token, which must be compiled once. Packets are archived by mission time
-and sequence count. A command is verified by `verification` packets that contain the packet identifier and the
+(`ground.link.gateway`). Yamcs and the gateway listen on the loopback interface only. Yamcs's own data links
+cannot send the gateway's token when they connect. The folder therefore contains `GatewayLink.java`, the
+source of a data link that sends the token. It must be compiled once. Packets are archived by mission time and
+sequence count. A command is verified by `verification` packets that contain the packet identifier and the
 sequence count of the command. Files are transferred by Yamcs's own CFDP service.
 
 Yamcs requires a password, because otherwise any web page in a browser on the same machine could send requests
@@ -42,10 +42,10 @@ INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
 KEYS = Path("keys/ground")
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
-"""Yamcs's file transfer service, and the buckets (folders) of received files and of files to send."""
+"""Names of Yamcs's file transfer service, and of the buckets of received files and of files to send."""
 _BUCKETS = (DOWN_BUCKET, UP_BUCKET, STACKS, DISPLAYS)
 RECORDED = "recorded"
-"""Data link, and the folder from which it reads files of packets, which it deletes afterwards."""
+"""Name of the data link that reads and deletes packet files, and of the folder of these files."""
 _LOOPBACK = "127.0.0.1"
 _SECRET_BYTES = 16
 
@@ -65,7 +65,7 @@ enabled: true
 authModules: [{class: org.yamcs.security.YamlAuthModule}]
 """
 USERS, USER = "etc/users.yaml", "admin"
-"""Password file and user name. Without the file, Yamcs uses a publicly known default password."""
+"""Password file, and user name. Without the file, Yamcs accepts a publicly known default password."""
 
 _INSTANCE = """\
 services:
@@ -213,9 +213,9 @@ def files(
     command_frame_bytes: int = DEFAULTS.command_frame_bytes,
     body: Body | None = None,
 ) -> Mapping[str, str]:
-    """Return the content of each file by its name below `folder`, with the command stacks for the body.
+    """Return the content of each configuration file by its name below `folder`.
 
-    Without a gateway, whose keys are in the folder `keys`, Yamcs reads recorded packets only.
+    If `gateway` is None, Yamcs reads only recorded packets. The folder `keys` contains the gateway's keys.
     """
     host, port = host_port(gateway or ADDRESS)
     server = _SERVER.format(
@@ -293,11 +293,11 @@ def password_in(folder: Path) -> str:
 
 _BUNDLE = "fprime_yamcs_bundle"
 _FRUGAL = ("-XX:TieredStopAtLevel=1", "-XX:+UseSerialGC")
-"""Options of Java for a process of one user: the fast compiler, and garbage collection in one thread."""
+"""Java options for a small server: only the fast compiler, and garbage collection in one thread."""
 
 
 def missing() -> str:
-    """Return what this machine lacks to run Yamcs, or an empty text."""
+    """Return a text about missing software that Yamcs needs, or an empty text."""
     if shutil.which("java") is None:
         return "Java is missing: apt-get install default-jre-headless"
     if importlib.util.find_spec(_BUNDLE) is None:
@@ -306,7 +306,7 @@ def missing() -> str:
 
 
 def class_path() -> str:
-    """Return the class path of the archives in the bundle."""
+    """Return the Java class path of the archives in the Yamcs bundle."""
     found = importlib.util.find_spec(_BUNDLE)
     assert found is not None
     assert found.submodule_search_locations

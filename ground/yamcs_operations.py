@@ -1,7 +1,7 @@
 """Content of Yamcs for operations: command stacks, a display, and passes on the timeline.
 
-A command stack is a file of Yamcs that lists commands and conditions. Yamcs executes the
-steps in order, and stops at the first condition that is not met in time.
+A command stack is a file of Yamcs that lists commands and conditions. Yamcs executes the steps in order, and
+stops at the first condition that is not satisfied in time.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 STACKS, DISPLAYS = "stacks", "displays"
 """Names of the buckets in which Yamcs's page looks for command stacks and displays."""
 PASS = "pass"
-"""Tag of a timeline item that is a pass."""
+"""Tag that marks a timeline item as a pass."""
 _VERIFY_MS = 10_000
-"""Longest time (ms) to wait until a condition is met; the packet `health` comes every second."""
+"""Longest time (ms) to wait until a condition is satisfied; the packet `health` arrives every second."""
 _SCHEMA = "https://yamcs.org/schema"
 _REQUEST_S = 300.0
 _PAGE = 500
-"""Number of timeline items in one answer."""
+"""Maximum number of timeline items in one answer."""
 
 
 def _command(name: str, **arguments: object) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def _command(name: str, **arguments: object) -> dict[str, Any]:
 
 
 def _mode(operator: str, mode: str) -> dict[str, Any]:
-    """Return the condition that the satellite's mode is, or is not, `mode`."""
+    """Return the condition that the satellite's mode equals ("eq") or differs from ("neq") `mode`."""
     condition = {"parameter": f"/{SPACE}/health_mode", "operator": operator, "value": mode}
     return {"type": "verify", "condition": [condition], "delay": 0, "timeout": _VERIFY_MS}
 
@@ -60,11 +60,11 @@ _PROCEDURES: Mapping[str, Sequence[dict[str, Any]]] = {
     "detumble": (_mode("neq", "safe"), _command("mode", mode="detumble"), _mode("neq", "safe")),
     "list-files": (_command("list-files", entity="another-ground-station", under=""),),
 }
-"""Steps of each procedure by its name. After the command `point` the mode can be `acquire` first."""
+"""Steps of each procedure by its name. After the command for mode `point` the mode can first be `acquire`."""
 
 
 def procedures_of(body: Body | None) -> Mapping[str, Sequence[dict[str, Any]]]:
-    """Return the steps of each procedure that a kind of body can obey; all if the body is not known."""
+    """Return the steps of each procedure for a kind of body; all procedures if the body is not known."""
     known = {f"/{SPACE}/{name}" for name in layouts_for(body, TELECOMMANDS)}
     foreign = {mode.label for mode in foreign_modes(body)}
 
@@ -149,7 +149,7 @@ def _shown(session: Session, timeline: str, prediction: OrbitPrediction) -> Iter
 
 
 def _item(one: Pass) -> dict[str, Any]:
-    """Return a pass as an item of the timeline, with its light and the arguments of `schedule` for it."""
+    """Return a pass as a timeline item, with sunlight or shadow, and arguments for the command `schedule`."""
     from ground.passes import scheduled_targets  # noqa: PLC0415 - Skyfield is large
 
     begin = one.rise.replace(microsecond=0)

@@ -1,1 +1,1 @@
-"""Hardware abstraction layer: buses on Linux, device drivers, and the interfaces that the flight uses."""
+"""Hardware abstraction layer: buses on Linux, device drivers, and the interfaces for the flight software."""

@@ -1,4 +1,4 @@
-"""Availability of the star camera in orbit: the fraction of unobstructed instants that gave a measurement."""
+"""Availability of the star camera in orbit: the fraction of unobstructed instants with a measurement."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 
 Object = dict[str, Any]
 FINE = 2
-"""Level of attitude knowledge in the navigation packet from which frames are taken every `fine_period`."""
+"""Level of attitude knowledge (navigation packet) at which frames are taken every `fine_period`."""
 
 
 def star_camera(run: Run, config: OrbitConfig) -> Object | None:
-    """Return how often the unobstructed star camera gave an attitude or a rate.
+    """Return the numbers of the star camera's instants: scheduled, unobstructed, and with a measurement.
 
     The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
     while the attitude is fine and the body rotates slowly. An instant is unobstructed if the true body rate
     is below `camera.max_rate` and the true boresight is outside `pointing.cones` of Sun and Earth. An instant
-    gave a measurement if the frame that was exposed before the next instant shows an attitude or a rate. The
-    longest gap is the longest time of consecutive unobstructed instants without a measurement. Returns None
-    without a star camera or a truth log.
+    has a measurement if a frame exposed before the next instant gives an attitude or a rate. The longest gap
+    is the longest total time of consecutive unobstructed instants without a measurement. Returns None without
+    a star camera or a truth log.
     """
     camera = config.camera
     if camera is None or not len(run["truth"]) or not len(run["orbit_truth"]):
@@ -55,8 +55,8 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the start and end times (n,), s, of the camera's intervals, and whether the body is slow (n,).
 
-    The body is slow if its rate is below `camera.max_rate`. As in flight, an instant at which the
-    body is too fast does not delay the next instant.
+    The body is slow if its rate is below `camera.max_rate`. As in flight, an instant at which the body is too
+    fast for a frame does not delay the next instant.
     """
     last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
     ticks = np.arange(0.0, last + camera.period, camera.period)
@@ -111,7 +111,7 @@ def _measured_at(run: Run) -> FloatArray:
 
 
 def _longest_gap(instants: FloatArray, ends: FloatArray, free: BoolArray, gave: BoolArray) -> float:
-    """Return the longest time, s, of consecutive unobstructed instants without a measurement."""
+    """Return the longest total time, s, of consecutive unobstructed instants without a measurement."""
     longest = gap = 0.0
     for at, end, wanted in zip(instants, ends, free & ~gave, strict=True):
         gap = gap + float(end - at) if wanted else 0.0

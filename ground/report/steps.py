@@ -1,11 +1,11 @@
-"""Figures of merit of each attitude step of the testbed (Sease 2013, Table 5.3).
+"""Performance measures of each attitude step of the testbed (Sease 2013, Table 5.3).
 
 Time zero is the time of the step's command. A step begins at the previous target if the body held that
 target, otherwise at the attitude of the body. Rise time is from 10 to 90 % of the step. Overshoot is the
 excursion beyond the target, in % of the step. Settling time is the time of the last entry into +-5 % of the
 step around the target. Steady-state error is the largest error over the last 30 s, in degrees of theta = 2
 asin q2, for targets held for a minute or more. Crossings are interpolated between samples. A step that ends
-within 30 s without settling is interrupted and is not judged.
+within 30 s without settling counts as interrupted and is not evaluated.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class StepCommand:
         target: commanded q2.
         duration: time until the step ends, s.
         from_target: whether the step begins at a target that the body held.
-        again: whether an earlier step has the same index.
+        again: whether the step repeats an earlier step with the same index.
     """
 
     index: int
@@ -72,7 +72,7 @@ class StepCommand:
 class StepResponse:
     """Figures of one step.
 
-    Figures of merit of a step, with NaN for not applicable, and infinity for never reached.
+    Performance measures of a step: NaN if not applicable, and infinity if never reached.
     """
 
     steady_state_deg: float = math.nan
@@ -131,12 +131,12 @@ def flown_steps(
 
 
 def is_interrupted(command: StepCommand, found: StepResponse) -> bool:
-    """Return whether a step ended before it could be judged."""
+    """Return whether a step ended before it could be evaluated."""
     return command.duration < SETTLING_LIMIT_S and math.isinf(found.settling_s)
 
 
 def response(time: FloatArray, q2: FloatArray, command: StepCommand) -> StepResponse:
-    """Return the figures of one step from samples of q2 (n,) at `time` (n,), s, that cover the step."""
+    """Return the measures of a step from samples of q2 (n,) at `time` (n,), s, that cover the step."""
     inside = (time > command.time) & (time < command.time + command.duration)
     t = np.concatenate([[0.0], time[inside] - command.time])
     y = np.concatenate([[np.interp(command.time, time, q2)], q2[inside]])
@@ -186,9 +186,9 @@ def _interpolate(t: FloatArray, y: FloatArray, i: int, level: float) -> float:
 def judged_steps(
     run: Run, attitude: ThreadMotion, planned_end: float, notes: list[str]
 ) -> list[tuple[StepCommand, StepResponse | None]]:
-    """Return each commanded step with its response, or None for an interrupted or unrecorded step.
+    """Return each commanded step with its response, which is None for an interrupted or unrecorded step.
 
-    The reasons for missing numbers are appended to `notes`.
+    The reasons for missing values are appended to `notes`.
     """
     targets = run["target"]
     if not len(targets):
@@ -201,7 +201,7 @@ def judged_steps(
     log_end = float(attitude.time[-1])
     if math.isfinite(planned_end):
         end = max(planned_end, float(times[-1]))
-    else:  # an unknown duration of the last step is assumed equal to the longest one
+    else:  # if the end is unknown, the last step is assumed to last as long as the longest step
         end = float(times[-1] + np.max(np.diff(times))) if len(times) > 1 else max(log_end, float(times[-1]))
     release = float(np.interp(times[0], attitude.time, attitude.q2))
     listed = commanded_steps(targets["index"].tolist(), times, targets["q2"].astype(float), release, end)
@@ -223,14 +223,14 @@ def judged_steps(
 
 
 def _step_ends(packets: PacketArray) -> FloatArray:
-    """Return the times (n,), s, at which a commanded mode or a mode without steering began."""
+    """Return the times (n,), s, at which a commanded mode, or a mode without attitude control, began."""
     by_command = np.array([text_of(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
     steering = np.isin(packets["mode"], [int(mode) for mode in STEERING])
     return seconds(packets)[by_command | ~steering]
 
 
 def _remarks(found: StepResponse | None) -> list[str]:
-    """Return the reasons for missing numbers of a step."""
+    """Return the reasons for missing values of a step."""
     if found is None:
         return ["the log does not cover the whole step, not judged"]
     if math.isnan(found.settling_s):
@@ -270,9 +270,9 @@ def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Ob
 
 
 def against_thesis(steps: list[tuple[StepCommand, StepResponse | None]], power: Object) -> list[Object]:
-    """Return the worst value of each figure with the thesis's limit.
+    """Return the worst value of each performance measure, compared with the thesis's limit.
 
-    The section of the report about power is `power`.
+    The argument `power` is the report's section about power.
     """
     judged = [(command, found) for command, found in steps if found is not None]
     rise = [found.rise_s for command, found in judged if command.rise_is_judged]

@@ -1,7 +1,7 @@
 """Report of a run as one object, printed by `report --json` and written as text by `ground.report.text`.
 
 `None` means that a value is unknown, not applicable or was never reached. The section `notes` gives the
-reasons.
+reasons for values that are `None`.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ from knightcube.astro.arrays import FloatArray
 Object = dict[str, Any]
 
 
-@np.errstate(all="ignore")  # a packet may contain any number, so results that are not finite become None
+@np.errstate(all="ignore")  # packets may contain any numbers; results that are not finite become None
 def summarise(run: Run) -> Object:
-    """Return all values of the report, made of None, bool, int, float, str, list and dict only."""
+    """Return all values of the report, which contains only None, bool, int, float, str, list and dict."""
     attitude = true_attitude(run) or estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
@@ -146,7 +146,7 @@ def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
 
 
 def _power(run: Run, power: PowerHistory | None, notes: list[str]) -> Object:
-    """Return the power that the coils draw, R I^2 of their mean currents, and the largest currents."""
+    """Return the coils' supply power, the heat R I^2 of their mean currents, and the largest currents."""
     written, actual = np.abs(run["control"]["current_written"]), np.abs(run["truth"]["current"])
     measured = bus_power(run)[1]
     sums = ("supply_average_w", "supply_peak_w", "supply_j", "heat_average_w", "heat_j")
@@ -182,9 +182,9 @@ def _rate_groups(packets: PacketArray) -> list[Object]:
 
 
 def _cycles(timing: PacketArray, control: PacketArray) -> Object:
-    """Return the counts and the lateness of the control cycles.
+    """Return the numbers of control cycles by outcome, and statistics of their lateness.
 
-    Slots without a control packet count as `skipped`.
+    Scheduled cycles without a control packet count as `skipped`.
     """
     slots = control["cycle"].astype(np.int64)
     return {
@@ -216,7 +216,7 @@ def _jobs(packets: PacketArray) -> list[Object]:
 
 
 def _planner(packets: PacketArray) -> Object:
-    """Return the numbers of accepted, stretched and refused plans, and the reasons of the refusals."""
+    """Return the numbers of accepted, stretched and refused plans, and the reasons for the refusals."""
     accepted = packets["accepted"] == 1
     status = np.array([text_of(value) for value in packets["status"]], dtype=object)
     flown = packets[accepted]
@@ -245,7 +245,7 @@ def _modes(packets: PacketArray) -> list[Object]:
 
 
 def _health(packets: PacketArray) -> Object | None:
-    """Return availability of the streams, active facts and resources, or None without health packets."""
+    """Return stream availability, active conditions and resources, or None without health packets."""
     if not len(packets):
         return None
     streams = {
@@ -286,7 +286,7 @@ def _events(packets: PacketArray) -> list[Object]:
 
 
 def _battery(run: Run) -> Object:
-    """Return state of charge, energies and shed loads of the battery; true values are None without truth."""
+    """Return state of charge, energies and load shedding; true values are NaN without a truth log."""
     packets, true, times = run["power"], run["true_power"], seconds(run["power"])
     charge = packets["charge"].astype(float)
     known = charge[np.isfinite(charge)]
@@ -305,7 +305,7 @@ def _battery(run: Run) -> Object:
         at = np.interp(times, seconds(true), true["charge"].astype(float))
         errors = (charge - at)[np.isfinite(charge)]
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
-        # The true powers are recorded once a second, so their sum is the energy.
+        # The true powers (W) are recorded once a second, so their sum is the energy (J).
         sums = [float(true[f"{name}_power"].sum()) for name in ("solar", "load", "coil")]
         values = [rms, float(true["charge"].min()), float(true["charge"][-1]), *sums]
         found |= dict(zip(names, values, strict=True))

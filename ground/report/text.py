@@ -1,4 +1,4 @@
-"""Report as text, made from the object that `ground.report.summary.summarise` returns."""
+"""Text form of the report, made from the object that `ground.report.summary.summarise` returns."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
 
 
 def provenance(run: Object) -> str:
-    """Return a line on how a run was flown: configuration, devices and software; empty if unknown."""
+    """Return a line on the origin of a run: configuration, devices and software; empty if unknown."""
     if "software" not in run:
         return ""
     devices = f"simulated devices, seed {run['seed']}" if run["simulated"] else "real devices"
@@ -265,7 +265,7 @@ def _battery(found: Object | None) -> list[str]:
 
 
 def _power(power: Object, thesis: bool) -> list[str]:
-    """Return the lines of the coil power, and if `thesis` is true the consumption stated in the thesis."""
+    """Return the lines of the coil power and, if `thesis` is true, the power consumption in the thesis."""
     if power["source"] is None:
         return []
     currents = (
@@ -375,7 +375,7 @@ def _sensing(summary: Object) -> list[str]:
 
 
 def _failed_frames(frames: list[Object]) -> list[str]:
-    """Return a table of the frames without a measurement, with a line for successive frames of one cause."""
+    """Return a table of frames without a measurement; successive frames with the same cause share a line."""
     if not frames:
         return []
     causes = [(frame["streaks"], frame["stars"] or "-") for frame in frames]

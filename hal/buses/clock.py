@@ -55,8 +55,8 @@ class SystemClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Sleep until an absolute deadline, ns.
 
-        CPython resumes an interrupted sleep after a signal. The conversion to seconds (float) can end the
-        sleep a few ns early, so the sleep is repeated until the deadline has passed.
+        CPython resumes a sleep that was interrupted by a signal. The conversion to seconds (float) can end
+        the sleep a few ns early, so the sleep is repeated until the deadline has passed.
         """
         while (left := deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left * 1e-9)
@@ -73,7 +73,7 @@ class SystemClock:
 
 
 class ThreadTicker(ContainedJob):
-    """Daemon thread that runs a job once per period and at each call of `kick`, even after a failure."""
+    """Daemon thread that runs a job once per period and at each call of `kick`, also after failed runs."""
 
     def __init__(self, clock: SystemClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
         super().__init__(name, job, clock.now_ns)
@@ -102,7 +102,7 @@ class ThreadTicker(ContainedJob):
         while not self._stopped:
             kicked = self._wake.wait(max(0, due_ns - self._clock.now_ns()) * 1e-9)
             self._wake.clear()
-            # Periods count from the start of a run, so that the job's duration does not lower the rate.
+            # Periods are counted from the start of a run, so that the job's duration does not lower the rate.
             now_ns = self._clock.now_ns()
             due_ns = now_ns + self.period_ns if kicked else max(now_ns, due_ns + self.period_ns)
             if not self._stopped:

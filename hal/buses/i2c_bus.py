@@ -1,8 +1,8 @@
 """Linux I2C bus through smbus2, with a lock for several threads and bounded waiting times.
 
-A call waits until the previous transaction has ended, and then at most for the timeout of the I2C adapter,
-which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES 0), so that the
-drivers count each failure.
+A call waits until the previous transaction has ended. Its own transaction takes at most the timeout of the
+I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES 0), so
+that the drivers count each failure.
 
 An advisory lock on the device file reserves the bus for one flight process. The kernel releases the lock when
 the process ends. The guardian and `deploy/coils-off` ignore the lock, because they may switch the coils off
@@ -50,7 +50,7 @@ _MEANING = {
     errno.EBADF: "the bus has been closed",
     errno.EUSERS: "another flight drives the coils on this bus",
 }
-# Errors after which the bus still works, so that the device file stays open.
+# Errors that do not indicate a failure of the bus, so that the device file stays open.
 _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
 
 

@@ -1,14 +1,14 @@
 """Services of Linux and systemd for the flight process: real-time priority, locked memory, notifications.
 
 Real-time priority and locked memory are privileges (RLIMIT_RTPRIO, RLIMIT_MEMLOCK, capabilities) that the
-operating system may refuse. A flight without these privileges continues, with more jitter under load. The
-functions `prioritise` and `lock_memory` never raise; they return the reason of a refusal, or an empty text on
-success.
+operating system may refuse. Without these privileges the flight process continues with more jitter under
+load. The functions `prioritise` and `lock_memory` never raise; they return the reason for a refusal, or an
+empty text on success.
 
 `ServiceManager` sends notifications to systemd over a socket (sd_notify(3)). Notifications are dropped if the
 environment variable NOTIFY_SOCKET is missing or the delivery fails, because a notification must never delay
-or end a flight. Only the notification READY is repeated until it is delivered, because systemd ends a process
-that does not report READY.
+or end the flight process. Only the notification READY is repeated until it is delivered, because systemd ends
+a process that does not report READY.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MCL_ONFAULT = 4
 def prioritise(thread_id: int, priority: int) -> str:
     """Give a thread real-time priority (SCHED_FIFO), which its child threads and processes do not inherit.
 
-    The thread identifier 0 stands for the calling thread. Returns the reason of a refusal, or an empty text
+    The thread identifier 0 stands for the calling thread. Returns the reason for a refusal, or an empty text
     on success.
     """
     policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
@@ -57,7 +57,7 @@ def worker_cores() -> frozenset[int]:
 def lock_memory() -> str:
     """Lock the memory pages of this process in RAM.
 
-    Returns the reason of a refusal, or an empty text on success. A page is locked when it is first accessed
+    Returns the reason for a refusal, or an empty text on success. A page is locked when it is first accessed
     (MCL_ONFAULT), because otherwise whole thread stacks and the shared memory of the workers would become
     resident. If RLIMIT_MEMLOCK is limited, only existing mappings are locked, because later mappings would
     count against the limit and might fail.
@@ -74,7 +74,7 @@ def lock_memory() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Obtained:
-    """Result of requesting privileges: real-time priority, locked memory, and reasons of refusals."""
+    """Result of requesting privileges: real-time priority, locked memory, and reasons for refusals."""
 
     priority: int
     locked: bool
@@ -94,7 +94,7 @@ def obtain(thread_ids: list[int], priority: int) -> Obtained:
 
 
 class ServiceManager:
-    """Connection to the service manager (systemd) that started this process, if any."""
+    """Connection to the service manager (systemd), if it started this process."""
 
     def __init__(self, environment: Mapping[str, str], process_id: int) -> None:
         """Read the socket and the watchdog timeout from environment variables.
@@ -111,7 +111,7 @@ class ServiceManager:
         meant = environment.get("WATCHDOG_PID", str(process_id)) == str(process_id)
         period = environment.get("WATCHDOG_USEC", "")
         self.watchdog_ns = int(period) * 1000 if meant and period.isdecimal() else 0
-        """Timeout of the watchdog (ns), 0 if there is no watchdog."""
+        """Timeout of the watchdog (ns), or 0 if systemd does not monitor this process."""
 
     def ready(self, status: str) -> None:
         """Report that the start is complete. The method `feed_watchdog` repeats the report until delivery."""

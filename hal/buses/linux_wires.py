@@ -19,7 +19,7 @@ SPI_MODE, SPI_SPEED, SPI_MESSAGE = 0x40016B01, 0x40046B04, 0x40006B00
 SPI_TRANSFER = Struct("=QQIIHBBBBBB")
 """Layout of struct spi_ioc_transfer: buffers, length, speed, delay (us), bits, chip select change."""
 FRAME_GAP_US = 20
-"""Pause between two frames; an ADIS16470 needs 16 us."""
+"""Pause (us) between two frames; an ADIS16470 needs 16 us."""
 
 
 class LinuxSpiDevice:
@@ -47,7 +47,8 @@ class LinuxSpiDevice:
                 self._speed_hz,
                 FRAME_GAP_US,
                 8,
-                index < len(frames) - 1,  # after the last frame, a change would keep the device selected
+                # A chip select change after the last frame would keep the device selected.
+                index < len(frames) - 1,
                 *(0,) * 4,
             )
             for index, pair in enumerate(buffers)
@@ -88,7 +89,10 @@ class LinuxWires:
         return self._ports[device]
 
     def i2c(self, bus: int | str | None = None) -> LinuxI2cBus:
-        """Return an I2C bus, by number or file; None means the bus of the coils. Raises DeviceError."""
+        """Return the I2C bus with a number or device file; None means the bus of the coils.
+
+        Raises DeviceError.
+        """
         name, coils = device_file(self._coil_bus if bus is None else bus), device_file(self._coil_bus)
         if name not in self._buses:
             exclusive = self._exclusive and name == coils

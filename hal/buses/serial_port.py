@@ -1,7 +1,7 @@
 """Linux serial port through pyserial, with a thread that receives data and records their arrival times.
 
-The receiving thread also reopens a lost port. An adapter that was unplugged and plugged in again gets the
-same device name by a udev rule.
+The receiving thread also reopens a lost port. A udev rule keeps the device name when an adapter is unplugged
+and plugged in again.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import serial
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS, Clock
 
-_READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port closes
-_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; the kernel's buffer takes a command at once
+_READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port is to be closed
+_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; usually the kernel's buffer accepts a command at once
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 
@@ -60,7 +60,7 @@ class PySerialPort:
         self._pending: deque[tuple[int, bytes]] = deque()
         self._pending_bytes = 0
         self._lock = threading.Lock()
-        # Held while the port is used or replaced: the number of a closed file may belong to another file.
+        # The lock is held while the port is used or replaced, because a closed descriptor may be reused.
         self._port_lock = threading.Lock()
         self._failure = ""
         self._closing = threading.Event()
@@ -117,7 +117,7 @@ class PySerialPort:
             return
         self._closing.set()
         with self._port_lock:
-            self._serial.cancel_read()  # no effect on a closed port
+            self._serial.cancel_read()  # this has no effect on a closed port
         self._thread.join(timeout=2.0)
         self._serial.close()
         self._failure = self._failure or "the port was closed"
@@ -125,8 +125,8 @@ class PySerialPort:
     def _write(self, data: bytes) -> None:
         """Write bytes, and wait while the output queue is full. Raises TimeoutError.
 
-        The method `write` of pyserial raises an error also if all bytes were written but the thread was
-        interrupted meanwhile.
+        The method `write` of pyserial also raises an error if all bytes were written but the thread was
+        suspended in between.
         """
         file, until_ns = self._serial.fileno(), self._clock.now_ns() + round(self._write_timeout * SECOND_NS)
         while data:

@@ -1,4 +1,4 @@
-"""Writing one byte to an I2C register on Linux, with the standard library only, as module and as command.
+"""Writes one byte to an I2C register on Linux; usable as module and as command, without other packages.
 
 The guardian switches the coils off through this module. If the program i2cset is not installed, the script
 `deploy/coils-off` runs this file as a command:
@@ -58,7 +58,10 @@ def open_bus(where: str) -> ByteBus:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the byte given by the arguments. Return exit status 0 (done), 1 (failed) or 2 (wrong use)."""
+    """Write the byte given by the arguments.
+
+    Return exit status 0 (done), 1 (failed) or 2 (wrong arguments).
+    """
     try:
         device, *numbers = arguments
         address, register, value = (int(number, 0) for number in numbers)

@@ -1,8 +1,8 @@
 """Driver of the ADIS16470, an inertial sensor of Analog Devices on an SPI bus (data sheet, revision C).
 
-A frame has 16 bits, and the answer to a read request comes in the next frame. Each axis has 32 bits in two
-registers. All axes are read between two equal values of the sample counter, so that they belong to one
-sample. The properties have the names and units of CircuitPython drivers.
+An SPI frame has 16 bits, and the answer to a read request comes in the next frame. The value of each axis has
+32 bits in two registers. The sample counter is read before and after all axes; equal values show that the
+axes belong to one sample. The properties of the driver have the names and units of CircuitPython drivers.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Adis16470:
 
     @property
     def decimation(self) -> int:
-        """Number d of samples that are averaged minus 1, so that the data rate is 2000 Hz / (d + 1)."""
+        """Decimation d: d + 1 samples are averaged, so that the data rate is 2000 Hz / (d + 1)."""
         return self._read([DEC_RATE])[0]
 
     @decimation.setter

@@ -1,6 +1,6 @@
 """Measurement of solar cell string currents by ADS1115 A/D converters (TI SBAS444) with four inputs each.
 
-The current of a string flows through a shunt with an amplifier, whose output voltage per current is
+The current of a string flows through a shunt, whose voltage is amplified; the output voltage per current is
 `volt_per_ampere`. A periodic job reads the completed conversion of one channel and starts the conversion of
 the next channel, on all converters at once. No call waits for a conversion, because a conversion takes 7.8 ms
 and the job runs at intervals of at least 10 ms.
@@ -20,7 +20,7 @@ from hal.interfaces.wires import Clock, I2cBus
 
 CONVERSION, CONFIG = 0x00, 0x01
 START = 0x8000
-"""Bit of the Config register that starts a conversion if written, and reads 1 if no conversion runs."""
+"""Bit of the Config register: writing 1 starts a conversion, and reading 1 means that none is running."""
 _SINGLE_ENDED, _MUX_BIT = 0b100, 12
 _RANGE_2_048 = 0b010 << 9
 _SINGLE_SHOT = 1 << 8
@@ -89,7 +89,7 @@ class AdsSolarStrings:
         self._ticker = clock.ticker("solar strings", step_ns, self._serve)
 
     def latest(self) -> StringReading | None:
-        """Return the newest reading, None before the first reading."""
+        """Return the newest reading, or None before the first reading."""
         with self._lock:
             return self._latest
 
@@ -115,7 +115,8 @@ class AdsSolarStrings:
                 with answering(_name(address)):
                     self._bus.write_i2c_block_data(address, CONFIG, [word >> 8, word & 0xFF])
         except DeviceError as error:
-            # A reading contains all strings, so a failed measurement begins again at the first channel.
+            # A reading contains all strings, so after a failure the measurement begins again at the first
+            # channel.
             self._step = -1
             with self._lock:
                 self._error = str(error)

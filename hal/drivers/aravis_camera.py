@@ -53,7 +53,7 @@ class AravisSettings:
         columns, rows: size of the image region at the centre of the sensor, pixels.
         pixel_format: name of a pixel format in PIXEL_KINDS.
         exposure_ns: usual exposure time, ns.
-        gain: gain in the camera's own unit (usually dB), None to leave the gain unchanged.
+        gain: gain in the camera's own unit (usually dB), or None to leave the gain unchanged.
         buffers: number of frame buffers that Aravis uses.
     """
 
@@ -129,7 +129,7 @@ class AravisCamera:
             self._start_ns = (before_ns + self._clock.now_ns()) // 2
 
     def collect(self) -> Frame | None:
-        """Return the triggered frame once, None until the frame arrives. Raises NotResponding."""
+        """Return the triggered frame once, or None until the frame arrives. Raises NotResponding."""
         _, stream = self._opened()
         if self._lost:
             raise NotResponding(self.name, "gone: was it unplugged?")
@@ -145,7 +145,7 @@ class AravisCamera:
         """Stop and close the camera. The call has no effect if the camera is not open."""
         camera, self._camera, self._stream, self._start_ns = self._camera, None, None, None
         if camera is not None:
-            with contextlib.suppress(_glib_error()):  # a lost camera has already stopped
+            with contextlib.suppress(_glib_error()):  # stopping a lost camera raises an error
                 camera.stop_acquisition()
 
     def _opened(self) -> tuple[Any, Any]:

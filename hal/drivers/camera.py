@@ -2,7 +2,7 @@
 
 Triggering, reading, configuring and reopening a camera can each take milliseconds to seconds. An unanswered
 USB control transfer takes five seconds. A periodic job executes all slow camera operations. The methods
-`trigger` and `poll`, which the control loop calls, only exchange requests and frames with the job.
+`trigger` and `poll`, which the control loop calls, only pass requests to the job and take frames from it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ class CameraCounts:
         spoiled: number of frames that the device flagged as damaged.
         short: number of incomplete frames.
         absurd: number of frames with an impossible time stamp.
-        contradictory: number of frames that followed the previous frame sooner than the exposure time allows.
-        missed: number of frames that never arrived, from gaps in the frame numbers.
+        contradictory: number of frames that arrived sooner after the previous frame than the exposure time
+            allows.
+        missed: number of frames that never arrived, counted from gaps in the frame numbers.
         openings: number of times the camera was opened.
     """
 
@@ -63,7 +64,7 @@ class CameraDevice(Protocol):
         """Start an exposure, or select the first exposure after the trigger time. Raises DeviceError."""
 
     def collect(self) -> Frame | None:
-        """Return the frame of the started exposure once, None until the frame arrives.
+        """Return the frame of the started exposure once, or None until the frame arrives.
 
         Never blocks. Raises DeviceError.
         """
@@ -89,8 +90,8 @@ class ServedCamera:
         instead and is opened later.
 
         The camera is reopened if no frame arrives within `PATIENCE_NS` plus six exposure times after the
-        first trigger without an answer. A free-running camera may need several exposures until a new exposure
-        time is effective.
+        first unanswered trigger. A free-running camera may need several exposures until a new exposure time
+        is effective.
         """
         self.name = device.name
         self.counts = device.counts
@@ -124,7 +125,7 @@ class ServedCamera:
         self._ticker.kick()
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, None if there is no new frame. Never blocks.
+        """Return the newest finished frame once, or None without a new frame. Never blocks.
 
         Raises DeviceError while the camera is lost.
         """
@@ -146,11 +147,11 @@ class ServedCamera:
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
-            # A new exception is created, because the traceback grows each time an exception is raised again.
+            # A new exception is created, because raising the same exception again would extend its traceback.
             raise type(self._failure)(self._failure.device, self._failure.message)
 
     def _serve(self) -> None:
-        """Exchange requests and frames with the device. This is the periodic job."""
+        """Pass requests to the device and take frames from it. This is the periodic job."""
         if not self._open and not self._reopened():
             return
         try:
@@ -161,7 +162,7 @@ class ServedCamera:
         if frame is not None:
             self._deadline_ns = None
             with self._lock:
-                if self._asked is None:  # a newer request makes the frame obsolete
+                if self._asked is None:  # if there is a newer request, the frame is obsolete
                     self._frame = frame
                     self.counts.delivered += 1
 
@@ -218,7 +219,7 @@ class ServedCamera:
 
 
 class FrameNumbers:
-    """Converter of a camera's frame numbers to numbers that continue after a wrap-around or restart.
+    """Converter of a camera's frame numbers to numbers that keep increasing after a wrap-around or restart.
 
     Repeated numbers and small backward steps are preserved, so that a frozen camera can be detected.
     """

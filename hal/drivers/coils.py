@@ -2,7 +2,7 @@
 
 Each coil is driven by an H-bridge with two inputs A and B (Sease 2013, Table 5.2, eq. 5.33). A signed count n
 from -4096 to 4096 gives the direction and the duty. For n > 0, input A is high for n/4096 of the PWM period
-and input B is low. For n < 0, the roles of the inputs A and B are exchanged. For n = 0, both inputs are low.
+and input B is low. For n < 0, the roles of the inputs A and B are swapped. For n = 0, both inputs are low.
 The time constant L/R of a coil (0.1 ms) is far shorter than the PWM period (20 ms), so that the mean current
 is n/4096 V/R.
 
@@ -12,9 +12,9 @@ zero. While zero is requested, the job writes zero in each period. Twice a secon
 and outputs back, and after a brown-out it configures the chip again. After any failure the job tries to write
 zero.
 
-Zero current is written as low level at both inputs of all bridges, because only this message works without a
-configured chip. If a bridge leg is stuck high, low inputs would drive current through the coil, so such a
-bridge is braked (both inputs high) immediately afterwards.
+Zero current is commanded by low levels at both inputs of all bridges, because the chip executes this message
+even without a configuration. If a leg of a bridge is stuck high, low inputs would drive current through the
+coil, so this bridge is braked (both inputs high) immediately afterwards.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class CoilWiring:
         channel_b: PWM channel of bridge input B.
         resistance: resistance of the coil, ohm.
         sign: +1, or -1 for a coil whose leads are swapped.
-        current_limit: maximum current of this coil, if smaller than that of all coils, A.
+        current_limit: maximum current of this coil, A, if it is less than the common limit.
     """
 
     channel_a: int
@@ -122,7 +122,7 @@ class CoilSettings:
             ("tries", self.tries, 1, 5, ""),
             ("retry_wait", self.retry_wait, 0.0, 0.01, "s"),
         ):
-            # The condition is written so that it also rejects NaN.
+            # This form of the condition also rejects NaN.
             if not low <= value <= high:
                 raise OutOfRange(DEVICE, quantity, value, low, high, unit)
         used = [channel for coil in self.coils for channel in coil.channels]
@@ -159,7 +159,7 @@ def largest_counts(step: float, current_limit: float) -> int:
         step: mean current of one count, A.
         current_limit: current limit, A.
     """
-    # Rounding must not reduce a limit that is an exact multiple of the step.
+    # The factor prevents that rounding reduces a limit that is an exact multiple of the step.
     return min(COUNTS, math.floor(current_limit / step * (1.0 + 1e-12)))
 
 
@@ -182,7 +182,7 @@ def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
 
 
 def mean_current(counts: int, step: float) -> float:
-    """Return the mean current (A) of a signed PWM count from the current `step` (A) of one count."""
+    """Return the mean current (A) of a signed PWM count, given the current `step` (A) of one count."""
     return counts * step
 
 
@@ -213,7 +213,7 @@ Counts = tuple[int, ...]
 
 
 class CommandMailbox:
-    """Mailbox with the newest command and brake request, which replaces a stale command by zero.
+    """Mailbox that holds the newest command and brake request, and replaces a stale command by zero.
 
     Attributes:
         lock: lock of all attributes; re-entrant, because a signal handler may request zero while its own
@@ -284,7 +284,7 @@ _Answer = TypeVar("_Answer")
 
 
 class PwmOutputs(Protocol):
-    """PWM chip of the bridges, or bridges that act like one; each method raises DeviceError on failure."""
+    """Interface of a PWM chip, or of bridges that imitate one; each method raises DeviceError on failure."""
 
     name: str
 
@@ -295,7 +295,7 @@ class PwmOutputs(Protocol):
         """Return whether the chip still has its configuration."""
 
     def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
-        """Return whether consecutive channels have the given counts."""
+        """Return whether consecutive channels from `first` on have the given counts."""
 
     def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
         """Write the counts of consecutive channels."""
@@ -305,15 +305,15 @@ class PwmOutputs(Protocol):
 
 
 class CoilOutputs:
-    """Writer of signed counts to the PWM chip, which records the last acknowledged outputs.
+    """Writer of signed counts to the PWM chip, with a record of the last acknowledged outputs.
 
     Attributes:
         written: signed PWM counts of the coils that the chip acknowledged last.
         braked: indices of the braked bridges.
-        written_ns: host time since which these counts are written, ns; -1 before the first write.
+        written_ns: host time at which these counts were first written, ns; -1 before the first write.
         failing: whether the last transaction failed, so that the state of the chip is unknown.
         faults: number of failed transactions since start.
-        error: text of the current failure, empty if there is none.
+        error: text of the present failure, or an empty text.
     """
 
     def __init__(self, pca: PwmOutputs, clock: Clock, settings: CoilSettings, lock: RLock) -> None:
@@ -451,7 +451,7 @@ class PwmTorqueCoils:
             for coil, step in zip(settings.coils, self._steps, strict=True)
         )
         self._signs = tuple(coil.sign for coil in settings.coils)
-        # mean current (A) of one count, with the sign of the coil
+        # Mean current (A) of one count of each coil, multiplied by the sign of the coil.
         self._signed = tuple(sign * step for sign, step in zip(self._signs, self._steps, strict=True))
         self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9), len(settings.coils))
         self._outputs = CoilOutputs(pca, clock, settings, self._mailbox.lock)
@@ -486,8 +486,8 @@ class PwmTorqueCoils:
     def command(self, currents: FloatArray) -> None:
         """Request the current of each coil (n,), A. Never waits for the bus.
 
-        Currents above the limit are limited. For a wrong shape or a value that is not finite, the coils are
-        set to zero and OutOfRange is raised. Raises Refused before `start` and after `close`.
+        Larger currents are reduced to the limit. For an array of a wrong shape or a value that is not finite,
+        the coils are set to zero and OutOfRange is raised. Raises Refused before `start` and after `close`.
         """
         values = np.asarray(currents, dtype=np.float64)
         problem = self._problem(values)
@@ -590,7 +590,7 @@ class PwmTorqueCoils:
     def _serve(self) -> None:
         """Write the newest request to the chip. The clock calls this method periodically."""
         with self._wire:
-            # The job can be re-entered while it waits, by a signal handler or by simulated time.
+            # The job may be called again while it waits, by a signal handler or by the simulated clock.
             if self._serving or not self._running:
                 return
             self._serving = True
@@ -624,7 +624,7 @@ class PwmTorqueCoils:
             outputs.error = str(error)
         else:
             outputs.failing = False
-            # A failure that was repaired at once remains reported until the next period.
+            # A failure that was repaired at once is still reported until the next period.
             outputs.error = repaired
 
     def _write_newest(self) -> None:
@@ -659,7 +659,7 @@ def _state_of(
 ) -> CoilState:
     """Return a cached driver state, so that several calls in a control cycle share one object.
 
-    The values `signed` are the mean currents of one count, with the sign of the coil, A.
+    The values `signed` (A) are the mean currents of one count, multiplied by the signs of the coils.
     """
     return CoilState(
         command=np.array(command),

@@ -1,9 +1,8 @@
 """H-bridges DRV8830 with an I2C interface and a regulated output voltage (TI SLVSAB2), one for each coil.
 
 The output voltage has 58 steps of 0.08 V, and no values between zero and 0.48 V. A periodic job therefore
-modulates the voltage: it writes the step nearest to the wanted voltage plus the accumulated error. The chips
-replace the outputs of a PWM chip, so that the coil driver (`hal.drivers.coils`) retries, checks and brakes as
-with a PWM chip.
+modulates the voltage: it writes the step nearest to the wanted voltage plus the accumulated error. To the
+coil driver (`hal.drivers.coils`), which retries, checks and brakes, the chips look like a PWM chip.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ PERIOD_NS = 10_000_000
 
 
 def control_of(volts: float) -> int:
-    """Return the value of the register CONTROL whose output voltage (V) is nearest, with its direction."""
+    """Return the value of the register CONTROL whose signed output voltage is nearest to `volts` (V)."""
     steps = round(abs(volts) / STEP_V)
     if steps < FIRST_STEP:
         steps = FIRST_STEP if 2.0 * abs(volts) > FIRST_STEP * STEP_V else 0
@@ -52,7 +51,7 @@ class Drv8830Bridges:
         self._error = [0.0] * len(self._pins)
         self._written = [OFF] * len(self._pins)
         self._ticker: Ticker | None = None
-        # The coil driver's thread writes duties while the modulation runs.
+        # The lock is needed because the coil driver's thread sets duties while the modulation runs.
         self._lock = threading.RLock()
 
     def configure(self) -> None:
@@ -64,17 +63,20 @@ class Drv8830Bridges:
             self._ticker = self._clock.ticker("drv8830", PERIOD_NS, self._modulate)
 
     def is_configured(self) -> bool:
-        """Return whether no chip reports a fault, and each has kept its output. Raises NotResponding."""
+        """Return whether every chip has kept its output and reports no fault. Raises NotResponding."""
         with self._lock:
             return all([self._is_intact(index) for index in range(len(self._pins))])
 
     def holds(self, first: int, channels: Sequence[PwmCounts]) -> bool:
-        """Return whether the outputs from `first` on were written last. Raises NotResponding."""
+        """Return whether the outputs from channel `first` on were written last and are intact.
+
+        Raises NotResponding.
+        """
         written = [self._duty.get(first + offset, FULL_OFF) for offset in range(len(channels))]
         return written == list(channels) and self.is_configured()
 
     def write_channels(self, first: int, channels: Sequence[PwmCounts]) -> None:
-        """Set the duty of bridge inputs from channel `first` on. Raises NotResponding."""
+        """Set the duties of the bridge inputs from channel `first` on. Raises NotResponding."""
         with self._lock:
             self._duty |= {first + offset: counts for offset, counts in enumerate(channels)}
             self._modulate()
@@ -104,7 +106,7 @@ class Drv8830Bridges:
         return control == self._written[index] and not fault & 1
 
     def _modulate(self) -> None:
-        """Write the next step of every coil. The clock calls this method periodically."""
+        """Write the next voltage step of every coil. The clock calls this method periodically."""
         with self._lock:
             for index, pins in enumerate(self._pins):
                 a, b = (_high(self._duty.get(pin, FULL_OFF)) for pin in pins)
@@ -137,6 +139,6 @@ class Drv8830Coils(PwmTorqueCoils):
 
 
 def _high(counts: PwmCounts) -> int:
-    """Return the number of counts of a PWM period in which an output is high."""
+    """Return the number of counts per PWM period during which an output is high."""
     on, off = counts
     return 0 if off >= COUNTS else COUNTS if on >= COUNTS else off - on

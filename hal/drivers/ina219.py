@@ -3,8 +3,8 @@
 The current is computed as shunt voltage divided by shunt resistance. The Calibration register of the chip is
 not used, because a brown-out clears the register. Each conversion averages 128 samples within 68 ms. Because
 68 ms is not a multiple of the PWM period of 20 ms, a single conversion has an error of up to 18 %, and the
-mean of five conversions has an error of up to 7 %. A test computes these errors. A current outside the
-measuring range is reported as the limit of the range and marked as clipped.
+mean of five conversions has an error of up to 7 %. The test of this driver computes these errors. A current
+outside the measuring range is reported as the limit of the range and marked as clipped.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BUS_STEP_V = 4e-3
 CONVERSION_READY = 0b10
 OVERFLOW = 0b01
 
-_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # full-scale shunt voltages by the value of the PG bits
+_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # full-scale shunt voltage for each value of the PG bits
 _SILENCE_NS = 1_000_000_000
 _SURE_STUCK = 3
 """Number of consecutive reads with a set ready flag after which the flag is considered stuck."""
@@ -56,7 +56,10 @@ def config_for(range_bits: int) -> int:
 
 
 class Ina219:
-    """Current monitor that a periodic job reads, and configures at the start and after a brown-out."""
+    """Current monitor that a periodic job reads.
+
+    The job also configures it at the start and after a brown-out.
+    """
 
     def __init__(
         self,
@@ -103,7 +106,7 @@ class Ina219:
         self._ticker = clock.ticker("ina219", period_ns, self._serve)
 
     def latest(self) -> PowerReading | None:
-        """Return the newest reading, None before the first reading."""
+        """Return the newest reading, or None before the first reading."""
         with self._lock:
             return self._latest
 
@@ -137,12 +140,12 @@ class Ina219:
             self._latest = PowerReading(
                 now_ns, voltage, current, voltage * current, newest, since_ns, any(clipped)
             )
-            # A failure is reported until the mean is complete, because some callers ask only once a second.
+            # A failure is reported until a mean is complete, because some callers check only once a second.
             if count == self._conversions.maxlen:
                 self._error = ""
 
     def _convert(self) -> tuple[float, float, bool] | None:
-        """Return voltage (V), current (A) and clipping flag of a new conversion, None if there is none."""
+        """Return voltage (V), current (A) and clipping flag of a new conversion, or None if none is new."""
         if self._read(CONFIG) != self._config:
             self._set_up()
             return None
@@ -154,7 +157,7 @@ class Ina219:
                 raise NotResponding(self.name, f"no conversion for {silence * 1e-9:.1f} s; check its supply")
             return None
         shunt = self._read(SHUNT)
-        self._read(POWER)  # clears the ready flag, so that no conversion is counted twice
+        self._read(POWER)  # this read clears the ready flag, so that no conversion is counted twice
         self._flag_stays = self._flag_stays + 1 if self._read(BUS) & CONVERSION_READY else 0
         if self._flag_stays >= _SURE_STUCK:
             raise NotResponding(self.name, "its registers are stuck: the ready flag stays set after reading")

@@ -1,9 +1,9 @@
 """Driver of a GPS receiver that sends NMEA 0183 sentences by itself, about once a second.
 
 The sentence RMC contains date, time, ground speed and course, and GGA the position with altitude, quality and
-number of satellites. Both sentences of one time make a reading. NMEA has no vertical velocity; the driver
-computes it from the altitudes of two fixes. NMEA has no accuracy either; the driver reports the horizontal
-dilution of precision times an assumed range error.
+number of satellites. Two sentences RMC and GGA with the same time make a reading. NMEA does not provide a
+vertical velocity; the driver computes it from the altitudes of two fixes. NMEA does not provide an accuracy
+either; the driver reports the horizontal dilution of precision times an assumed range error.
 """
 
 from __future__ import annotations
@@ -40,11 +40,14 @@ class NmeaReceiver:
     """Driver of an NMEA receiver, which implements `hal.interfaces.devices.GpsReceiver`."""
 
     def __init__(self, port: SerialPort, clock: Clock, earliest_ns: int = EARLIEST_NS) -> None:
-        """Read the open `port`. Dates before `earliest_ns` (ns since 1970) are moved by 1024 weeks."""
+        """Read sentences from the open `port`.
+
+        Dates before `earliest_ns` (ns since 1970) are moved by 1024 weeks.
+        """
         self._port, self._clock, self._earliest_ns = port, clock, earliest_ns
         self._buffer = b""
         self._halves: dict[str, list[str]] = {}
-        self._height: tuple[float, float] | None = None  # seconds of the day and altitude (m)
+        self._height: tuple[float, float] | None = None  # seconds of the day and altitude (m) of the last fix
         self._bytes = self._sentences = self._bad = self._discarded = 0
         self._out_of_range = self._unresolved = self._no_fix = self._rolled_over = 0
         self._last_byte_ns = -1
@@ -121,7 +124,10 @@ class NmeaReceiver:
         return reading
 
     def _pvt(self, rmc: list[str], gga: list[str]) -> Pvt:
-        """Return the content of two sentences in the units of a NAV-PVT message. Raises ValueError."""
+        """Return the content of the sentences RMC and GGA in the units of a NAV-PVT message.
+
+        Raises ValueError.
+        """
         clock, date = rmc[1], rmc[9]
         fix = gga[6] not in {"", "0"} and rmc[2] == "A"
         known = len(date) == 6 and len(clock) >= 6
@@ -152,7 +158,7 @@ class NmeaReceiver:
         )
 
     def _down(self, seconds: float, height: float) -> float:
-        """Return the vertical velocity (m/s, downwards) from the change of the altitude, or zero."""
+        """Return the downward velocity (m/s) from the change of the altitude, or zero if it is unknown."""
         before, self._height = self._height, (seconds, height)
         if before is None or not 0.0 < seconds - before[0] < _VERTICAL_SPEED_S:
             return 0.0

@@ -21,10 +21,10 @@ PRE_SCALE = 0xFE
 
 RESTART = 0x80
 AUTO_INCREMENT = 0x20
-EXTERNAL_CLOCK = 0x40  # external clock bit, which only a reset clears
+EXTERNAL_CLOCK = 0x40  # bit for an external clock, which only a reset clears
 SLEEP = 0x10
 TOTEM_POLE = 0x04
-FULL = 0x10  # bit 4 of an ON_H or OFF_H register: on or off for the whole period
+FULL = 0x10  # bit 4 of an ON_H or OFF_H register: output on or off for the whole period
 
 GENERAL_CALL = 0x00
 """General call address, to which all chips on a bus respond."""
@@ -92,9 +92,9 @@ class Pca9685:
     def configure(self) -> None:
         """Configure the chip with all outputs off, and read the configuration back.
 
-        All outputs are switched off first, in case a dead process left the chip running. If a bit flip has
-        switched the chip to an external clock, the chip is reset by a general call. The general call also
-        resets other chips on the bus, for example an ADS1115, which loses its conversion. Raises
+        All outputs are switched off first, in case a dead process left the chip running. If the chip has
+        switched to an external clock because of a bit flip, it is reset by a general call. The general call
+        also resets other chips on the bus, for example an ADS1115, which loses its conversion. Raises
         NotResponding if the chip does not answer, and Refused if a register does not keep its value.
         """
         self.all_off()
@@ -125,7 +125,7 @@ class Pca9685:
         return all(found == wanted for _, wanted, found in self._set_up())
 
     def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
-        """Return whether consecutive channels, at most 8, have the given counts. Raises NotResponding."""
+        """Return whether at most 8 consecutive channels have the given counts. Raises NotResponding."""
         wanted = _values(counts)
         with answering(self.name):
             return self._bus.read_i2c_block_data(self._address, LED0_ON_L + 4 * first, len(wanted)) == wanted

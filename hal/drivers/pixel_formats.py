@@ -1,13 +1,13 @@
-"""Pixel formats of V4L2 cameras, as kernel drivers and libcamera name them, converted to grey images.
+"""Conversion of the pixel formats of V4L2 cameras, named as in kernel drivers and libcamera, to grey images.
 
 The layouts are those of the kernel's documentation (Linux Media userspace API, chapter "Image Formats"). The
 MIPI formats pack four pixels of 10 bits into five bytes, or two pixels of 12 bits into three bytes. The last
-byte holds the low bits of all these pixels, those of the first pixel in the lowest bits.
+byte of such a group holds the low bits of all its pixels, with the first pixel in the lowest bits.
 
-A Bayer mosaic is converted by the kernel (1, 2, 1) / 4 along rows and columns. Red, green and blue then
-contribute a quarter, a half and a quarter to each pixel, wherever the pixel lies in the mosaic, so that all
-four orders of the colours give the same image and the centroid of a star is not displaced. Motion JPEG is
-decoded by Pillow, and its luma is used.
+A Bayer mosaic is convolved with the kernel (1, 2, 1) / 4 along rows and columns. Red, green and blue then
+contribute a quarter, a half and a quarter to each pixel, at every position in the mosaic. All four colour
+orders therefore give the same image, and the centroid of a star is not displaced. Motion JPEG is decoded by
+Pillow, and its luma is used.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ BIG_ENDIAN = 1 << 31
 
 Packing = Literal["u1", "<u2", ">u2", "mipi10", "mipi12", "bits10", "luma first", "luma second", "jpeg"]
 _GROUPS: dict[str, tuple[int, int]] = {"mipi10": (4, 5), "mipi12": (2, 3), "bits10": (4, 5)}
-"""Numbers of pixels and of bytes in the smallest group of whole bytes, for each packing."""
+"""Numbers of pixels and bytes in the smallest group that fills whole bytes, for each packing."""
 
 Pixels = npt.NDArray[Any]
 
@@ -53,7 +53,7 @@ class PixelCoding:
         return self.packing == "jpeg"
 
     def row_bytes(self, columns: int) -> int:
-        """Return the number of bytes of a row without padding, 0 for a compressed format."""
+        """Return the number of bytes of a row without padding, or 0 for a compressed format."""
         if self.is_compressed:
             return 0
         if self.packing in _GROUPS:
@@ -142,7 +142,7 @@ _BAYER: dict[tuple[Packing, int], tuple[str, str, str, str]] = {
     ("mipi10", 10): ("pBAA", "pGAA", "pgAA", "pRAA"),
     ("mipi12", 12): ("pBCC", "pGCC", "pgCC", "pRCC"),
 }
-"""Names of the Bayer formats with the orders BGGR, GBRG, GRBG and RGGB of the first two rows."""
+"""Names of the Bayer formats with the colour orders BGGR, GBRG, GRBG and RGGB, by packing and bits."""
 
 PIXEL_FORMATS: dict[str, PixelCoding] = {
     "GREY": PixelCoding("u1", 8),

@@ -4,8 +4,8 @@ A unit without a gyro gives readings without a rate.
 
 CircuitPython drivers of motion sensors have the properties `gyro` (rad/s), `magnetic` (microtesla) and
 `acceleration` (m/s^2), take an I2C bus with the methods of `busio.I2C`, and sleep while they start. All
-sensors are started before the flight, and read by a periodic job of their own, never by the control loop.
-After a failure the job starts all sensors again, because a brown-out clears their settings.
+sensors are started before the control loop, and are read by a separate periodic job, never by the control
+loop. After a failure the job starts all sensors again, because a brown-out clears their settings.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ TESLA_PER_UNIT = 1e-6
 _FAILURES = 3
 """Number of consecutive failures after which the sensors are started again."""
 _ALIKE = 10
-"""Number of consecutive equal samples that are accepted; working sensors have noise."""
+"""Largest accepted number of consecutive equal samples; a working sensor has noise."""
 _NO_RATE = np.full(3, math.nan)
 _FREE_FALL = 1.0
-"""Specific force (m/s^2) below which the vertical is unknown."""
+"""Specific force (m/s^2) below which the vertical direction counts as unknown."""
 
 
 class CircuitPythonI2c:
-    """An I2C bus as CircuitPython drivers expect it (`busio.I2C`), on a bus of the flight."""
+    """An I2C bus with the interface that CircuitPython drivers expect (`busio.I2C`)."""
 
     def __init__(self, bus: RawI2cBus) -> None:
         self._bus = bus
         self._lock = threading.Lock()
 
     def try_lock(self) -> bool:
-        """Reserve the bus for one driver, and return whether it was free."""
+        """Reserve the bus for one driver, and return whether the bus was free."""
         return self._lock.acquire(blocking=False)
 
     def unlock(self) -> None:
@@ -139,7 +139,7 @@ class SensorUnit:
 
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call. Raises NotResponding while a sensor does not answer."""
-        # The list is replaced instead of locked, because a sensor that starts holds the lock.
+        # The list is replaced without the lock, which is held for seconds while a sensor starts.
         readings, self._readings = self._readings, []
         if not readings and self._failures >= _FAILURES:
             raise NotResponding(self.name, self._error)
@@ -189,7 +189,7 @@ class SensorUnit:
         }
 
     def _accepts(self, values: dict[str, FloatArray]) -> bool:
-        """Return whether a sample is finite, within the ranges and not stuck; otherwise count it."""
+        """Return whether a sample is finite, within the ranges and not stuck; count rejected samples."""
         settings, before = self._settings, self._before
         alike = bool(before) and all(np.array_equal(values[name], before[name]) for name in values)
         self._alike, self._before = self._alike + 1 if alike else 0, values

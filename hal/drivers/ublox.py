@@ -7,14 +7,13 @@ time, position, velocity and accuracies of one epoch. The NMEA protocol is not u
 these values over several sentences, usually rounds the position to 2 m, and lacks the vertical velocity.
 
 The receiver loses its configuration at a power loss. The driver therefore requests NAV-PVT messages at the
-start, and again whenever none has arrived for three seconds. Receivers with protocol version 27 or later (M9,
-M10, F9) are configured by CFG-VALSET (u-blox F9 interface description, UBX-22008968). Older receivers (u-blox
-7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version in MON-VER. If the
-receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa. No call blocks. If
-bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud rates, and sets a
-receiver that it finds to the configured baud rate.
-Consumer receivers stop working above 18 km or 515 m/s, so that a satellite needs a firmware without this
-limit.
+start, and again whenever no NAV-PVT has arrived for three seconds. Receivers with protocol version 27 or
+later (M9, M10, F9) are configured by CFG-VALSET (u-blox F9 interface description, UBX-22008968). Older
+receivers (u-blox 7 and 8) are configured by CFG-PRT, CFG-RATE and CFG-MSG. The receiver reports its version
+in MON-VER. If the receiver refuses CFG-VALSET (ACK-NAK), the driver uses the older commands, and vice versa.
+No call blocks. If bytes arrive but nothing can be decoded for ten seconds, the driver listens at other baud
+rates, and switches a receiver that it finds to the configured baud rate. Consumer receivers stop working
+above 18 km or 515 m/s, so that a satellite needs a receiver with firmware without this limit.
 """
 
 from __future__ import annotations
@@ -45,17 +44,17 @@ VALSET_PROTOCOL = 27.0
 NAMES = {CFG_PRT: "CFG-PRT", CFG_MSG: "CFG-MSG", CFG_RATE: "CFG-RATE", CFG_VALSET: "CFG-VALSET"}
 UART1_BAUDRATE, UART1_IN_UBX, UART1_OUT_UBX, UART1_OUT_NMEA = 0x40520001, 0x10730001, 0x10740001, 0x10740002
 RATE_MEASUREMENT, RATE_SOLUTION, RATE_TIME, PVT_ON_UART1 = 0x30210001, 0x30210002, 0x20210003, 0x20910007
-"""Keys of CFG-VALSET; the second hexadecimal digit of a key determines the size of its value."""
+"""Configuration keys of CFG-VALSET; the first hexadecimal digit of a key determines the size of its value."""
 OVERHEAD = 8
 PVT_LENGTH, OLD_PVT_LENGTH = 92, 84
-"""Payload lengths (bytes) of NAV-PVT: from protocol version 15 on, and of the older u-blox 7."""
+"""Payload lengths (bytes) of NAV-PVT: 92 from protocol version 15 on, 84 from the older u-blox 7."""
 _PVT = struct.Struct("<IHBBBBBBIiBBBBiiiiIIiiiiiIIHHIihH")
 THREE_DIMENSIONS = 3
 """Value of the NAV-PVT field `fixType` for a three-dimensional fix."""
 DATE_AND_TIME = 0b111
 """Bits of the NAV-PVT field `valid` for a valid date and time with known leap seconds (fullyResolved)."""
 FIX_OK, INVALID_POSITION = 0b1, 0b1
-"""Bit of the NAV-PVT field `flags` for a valid fix, and bit of `flags3` for an invalid position."""
+"""Bit of the NAV-PVT field `flags` for a valid fix, and bit of the field `flags3` for an invalid position."""
 UNKNOWN_ACCURACY = 0xFFFF_FFFF
 """Value of an accuracy that the receiver does not know; the value 0 also means unknown."""
 
@@ -178,8 +177,8 @@ _NMEA_TAIL = 100
 class UbxParser:
     """Decoder that extracts UBX frames from received bytes, and counts NMEA sentences between them.
 
-    If a candidate frame is invalid, the search continues two bytes after the candidate's start. An
-    incomplete long candidate is discarded if it contains a valid frame.
+    If a candidate frame is invalid, the search continues two bytes after the candidate's start. An incomplete
+    candidate with a long payload is discarded if a valid frame begins within it.
 
     Attributes:
         bytes_received: number of received bytes.
@@ -191,7 +190,7 @@ class UbxParser:
     """
 
     def __init__(self, longest: int = 256) -> None:
-        """Wait for the end of an incomplete frame with a payload of at most `longest` bytes.
+        """Create a decoder that waits for the end of frames with payloads of at most `longest` bytes.
 
         While a longer frame is incomplete, valid frames are searched for within its bytes.
         """
@@ -243,7 +242,7 @@ class UbxParser:
         return found
 
     def _inner_frame(self, buffer: bytes, start: int) -> int:
-        """Return the offset of the first valid frame after `start`, or -1."""
+        """Return the offset of the first valid frame after `start`, or -1 if none follows."""
         inner = buffer.find(SYNC, start + len(SYNC))
         while inner >= 0:
             end = inner + OVERHEAD + int.from_bytes(buffer[inner + 4 : inner + 6], "little")
@@ -270,7 +269,7 @@ SILENCE_NS = 3 * SECOND_NS
 BAUD_RATES = 9600, 38400, 115200, 57600, 230400, 460800
 """Baud rates at which the driver listens; the first two are factory settings."""
 UNDECODED_NS = 10 * SECOND_NS
-"""Time (ns) for which bytes arrive without a frame or sentence until other baud rates are tried."""
+"""Time (ns) after which other baud rates are tried if bytes without a valid frame or sentence arrive."""
 _RETURN_NS = SECOND_NS // 2
 """Time (ns) from the command of a new baud rate until the port changes to this rate."""
 _BITS = 10
@@ -432,7 +431,7 @@ class UbloxReceiver:
         return reading
 
     def _take_refusal(self, command: Kind) -> None:
-        """Count a refused command, and configure the receiver by the commands of the other generation."""
+        """Count a refused command, and switch between CFG-VALSET and the older configuration commands."""
         self._refused += 1
         name = NAMES.get(command, f"command {command[0]:02X} {command[1]:02X}")
         if not self._protocol and command in NAMES:
@@ -473,7 +472,7 @@ class UbloxReceiver:
     def _set_up(self) -> None:
         """Configure the receiver to send only NAV-PVT.
 
-        The configuration is repeated while no NAV-PVT arrives.
+        The configuration is repeated as long as no NAV-PVT arrives.
         """
         now_ns = self._clock.now_ns()
         requested_ns = self._requested_ns
