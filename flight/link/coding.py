@@ -10,8 +10,8 @@ marker precedes each coded frame. Satellite and ground need the same settings, w
 `link.coding` of the configuration. The radio must deliver whole bytes, because coded frames are not searched
 for at other bit offsets.
 
-The library reedsolo computes in the Galois field and corrects erroneous codewords. Encoding, and the check
-that a received codeword has no errors, use a table of parity symbols, because both are done for every frame.
+The library reedsolo computes in the Galois field and corrects erroneous codewords. Encoding and the error
+check of received codewords are done for every frame, and therefore use a table of parity symbols.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class ReedSolomon:
         return frame + self._parity(np.frombuffer(frame, np.uint8)).tobytes()
 
     def decode(self, block: bytes) -> bytes:
-        """Return the corrected frame of a codeblock. Data of an uncorrectable codeword remain as received."""
+        """Return the corrected frame of a codeblock, in which uncorrectable codewords remain as received."""
         symbols = np.frombuffer(block, np.uint8).reshape(-1, self._depth).copy()
         data, parity = symbols[:-_PARITY], symbols[-_PARITY:]
         wrong = (self._parity(data.ravel()) != parity).any(axis=0)
@@ -113,7 +113,7 @@ class ReedSolomon:
         return data.tobytes()
 
     def _parity(self, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the parity symbols (32, depth) of data, which virtual fill of zeros precedes."""
+        """Return the parity symbols (32, depth) of data that are preceded by a virtual fill of zeros."""
         columns = data.reshape(-1, self._depth)
         places = np.arange(DATA_SYMBOLS - len(columns), DATA_SYMBOLS)[:, None]
         parity: NDArray[np.uint8] = np.bitwise_xor.reduce(self._parity_of[places, columns], axis=0).T
@@ -179,9 +179,9 @@ class Code(Protocol):
 
 
 _WRONG_MARKER_BITS = 3
-"""Maximum number of wrong bits in a sync marker directly after a valid codeblock.
+"""Maximum number of wrong bits in a sync marker that is accepted directly after a valid codeblock.
 
-One of 8,000 markers has more wrong bits at a bit error rate of 0.8 %, where the Reed-Solomon code fails.
+At a bit error rate of 0.8 %, at which the Reed-Solomon code fails, one of 8,000 markers has more wrong bits.
 """
 
 
@@ -257,7 +257,7 @@ def _bch_parity(data: bytes) -> int:
 
 @cache
 def _wrong_bits() -> dict[int, int]:
-    """Return a mask of the wrong bit among the 64 bits of a codeblock, by the syndrome of this bit error."""
+    """Return masks of single bit errors among the 64 bits of a codeblock, by the syndrome of each error."""
     valid = int.from_bytes(bytes(_BLOCK_DATA) + bytes([_INVERTED]), "big")
     masks = (1 << bit for bit in range(1, 8 * _BLOCK))  # without bit 0, the fill bit
     return {_syndrome((valid ^ mask).to_bytes(_BLOCK, "big")): mask for mask in masks}

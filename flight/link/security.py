@@ -2,9 +2,9 @@
 
 Frames in both directions are protected by AES-256-GCM. A protected frame contains the SPI (2 bytes), the IV
 (12 bytes), the ciphertext and the MAC (16 bytes). Telemetry may also be authenticated without encryption. The
-IV is the nonce, which must never repeat under the same key. It consists of a salt of 32 random bits, which
-each sender draws at its start, and of a counter of 64 bits. The counter increases from frame to frame, and
-the receiver ignores the salt. If a folder of keys is restored from a backup, counters are used again, but
+IV is the nonce, which must never repeat under the same key. The IV consists of a salt of 32 random bits,
+which each sender draws at its start, and of a counter of 64 bits. The counter increases from frame to frame,
+and the receiver ignores the salt. If a folder of keys is restored from a backup, counters are used again, but
 with another salt. The MAC covers the virtual channel, the SPI and the data, as in Yamcs.
 
 The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
@@ -229,7 +229,7 @@ class Vault:
         """Return the newest valid copy of an association, None if both copies are missing or damaged.
 
         If the copy is older than its record in the second folder (the witness), the record is returned. For
-        the primary command SPI, the result is then None, because its counters could be repeated.
+        an outdated primary command SPI, the result is None, because its counters could be repeated.
         """
         newest = max(self._copies(name), default=None)
         if newest is None or self._witness is None or not self._witness.outdates(newest):

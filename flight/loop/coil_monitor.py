@@ -419,7 +419,7 @@ class CoilMonitor:
         self._suspected_ns: int | None = None
         self._judge_ns = 0  # time (ns) after which a verdict may leave the fault uncertain
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
-        self._unmixed_ns = 0  # time (ns) of the last change of the circuit
+        self._unmixed_ns = 0  # time (ns) from which readings show one circuit state
         self._evidence = Evidence(self._bounds)
         coils = len(settings.full_current)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns, coils)

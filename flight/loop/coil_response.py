@@ -744,7 +744,7 @@ class CoilCorrection:
 
 
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
-"""Sign of the continuous current through a coil whose leg is stuck high."""
+"""Sign of the continuous current through the coil, for each kind of fault with a leg stuck high."""
 _LITTLE_RESPONSE = 0.4
 _DOUBTED_FOR_NS = 60_000_000_000
 """Time (ns) after a refuted verdict for which further verdicts are rejected if the motion is inconclusive."""

@@ -49,7 +49,7 @@ _GAP_NS = 400_000_000
 _CALM_NS = 10_000_000_000
 """Time (ns) for which the commands must be small before a test."""
 _QUIET = 0.25
-"""Largest current that is commanded around a test, as a fraction of the largest current of the test."""
+"""Largest commanded current at which a test is made, as a fraction of the largest current of the test."""
 _REPORT_NS = 5_000_000_000
 """Time (ns) between the last test and the report, during which the motion is evaluated."""
 _NEAR_FIELD_NS = 60_000_000_000

@@ -297,7 +297,7 @@ RATE = math.radians(1.0)
 """Rate error (rad/s) that has unit cost, chosen because a fast roll blurs the stars at the edge of the
 image."""
 FORESIGHT = 30.0
-"""Time (s) over which a track is predicted to report that its object will leave the field of view."""
+"""Prediction time (s) of a track, by which its exit from the field of view is reported in advance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ SEGMENT_BYTES = 900
 MOST_REQUESTS = 100
 """Maximum number of gaps in one NAK PDU, chosen so that the PDU fits into a telecommand frame."""
 FILE_DATA_OVERHEAD, NAK_OVERHEAD, REQUEST_BYTES = 16, 21, 8
-"""Number of bytes of a file data PDU besides the data, of a NAK PDU besides its gaps, and of each gap."""
+"""Overhead (bytes) of a file data PDU and of a NAK PDU, and length (bytes) of each gap in a NAK PDU."""
 LONGEST_UNIT = FILE_DATA_OVERHEAD + SEGMENT_BYTES
 HIGHEST_NUMBER = 2**32 - 1
 _ENTITY_BYTES, _NUMBER_BYTES = 2, 4
@@ -267,7 +267,7 @@ UP = 0x1A28
 PACKET_VERSION = 1
 
 UNIT_OVERHEAD_BYTES = HEADER_BYTES + SECONDARY_BYTES + CRC_BYTES
-"""Number of bytes in a packet besides the PDU."""
+"""Overhead (bytes) of a packet that carries a PDU."""
 
 _PACKET_HEADERS = struct.Struct(">HHHBq")
 _MODULUS = 1 << 14

@@ -122,7 +122,8 @@ class Verification:
     """Tracker of the stages of commands that were sent to the control process."""
 
     def __init__(self) -> None:
-        # The open command, its final mode, and the mission time of its answer (ns).
+        # The command whose completion is awaited, the mode that completes it, and the mission time (ns) of
+        # its answer.
         self._open: tuple[Sent, Mode, int] | None = None
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:

@@ -418,7 +418,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
-    """Yield the portions of a packet, each as a packet with a time of its own from `utc_ns` on.
+    """Yield the portions of a packet, each as a packet with a unique time (UTC, ns) from `utc_ns` on.
 
     Raises CommandError for a packet that is longer than eight portions.
     """

@@ -76,7 +76,7 @@ class LogFollower:
         """The newest packet `run` of the present run as bytes; empty until a run is found."""
         self._is_read = False
         self.is_live = False
-        """Whether the newest packets were written after the end of the log was reached once."""
+        """Whether the newest packets are live: whether the reader has reached the end of the log before."""
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:

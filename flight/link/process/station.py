@@ -92,7 +92,7 @@ _CONNECTIONS = 4
 _STRANGERS = 256
 """Maximum number of TCP connections that have not sent an authentic frame.
 
-If 200 strangers connect per second, a new connection has 1.3 s for its first frame.
+If 200 unauthenticated clients connect per second, a new connection has 1.3 s for its first frame.
 """
 _UNSENT = 1 << 18
 _SO_ATTACH_FILTER = 26  # Linux, asm-generic/socket.h; not in Python's module socket
@@ -155,7 +155,7 @@ class UdpLine:
             self._socket.close()
             raise UsageError(f"link.udp: {address} cannot be listened to: {error}") from error
         if peers is not None:
-            with contextlib.suppress(OSError):  # without a socket filter, `receive` does it
+            with contextlib.suppress(OSError):  # without a socket filter, `receive` checks the senders
                 _accept_only(self._socket, peers)
 
     @property
@@ -237,8 +237,8 @@ class TcpLine:
     """TCP server on which each frame follows a sync marker, or has the configured code.
 
     Connections that have sent an authentic frame are limited to four, other connections to 256. A further
-    connection replaces the oldest connection of the same kind, so that strangers displace only strangers.
-    Telemetry is sent to connections that have sent an authentic frame.
+    connection replaces the oldest connection of the same kind, so that unauthenticated clients displace only
+    each other. Telemetry is sent to connections that have sent an authentic frame.
     """
 
     def __init__(
@@ -290,7 +290,7 @@ class TcpLine:
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Keep the connection `sender` when strangers connect, and send the telemetry to it."""
+        """Mark the connection `sender` as authenticated: keep it when others connect, and send telemetry."""
         state = self._connections.get(sender)
         if state is not None and not state.trusted:
             self._make_room(trusted=True, most=_CONNECTIONS)
@@ -449,7 +449,7 @@ def host_port(address: str) -> tuple[str, int]:
 
 
 def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
-    """Change a key by a command of an SPI. Return the problem, or an empty text on success."""
+    """Change a key as a command of an SPI requests. Return the problem, or an empty text on success."""
     if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
         return f"there is no SPI {change.spi}"
     if not may_change(spi, change.spi):

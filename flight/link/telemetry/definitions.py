@@ -71,7 +71,7 @@ STAGES: States = tuple(enumerate(("accepted", "refused", "started", "completed",
 """Stages of a command (`flight.link.process.commanding.Stage`)."""
 
 SHED: States = tuple(enumerate(("nothing", "coils-limited", "camera-slower", "safe")))
-"""Loads that a low battery sheds, each state with those of the states before it (`flight.loop.power`)."""
+"""Load shedding at a low battery; each state includes the preceding states (`flight.loop.power`)."""
 
 SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)
 SEVERITY_ALARMS: Alarms = ((int(Severity.WARNING), "warning"), (int(Severity.FAULT), "fault"))
