@@ -2,13 +2,13 @@
 
 The line-of-sight filter uses measured directions only, without ranges. The filter state consists of the
 relative position y (a unit vector) and the relative velocity z, both divided by the present range. Without
-forces the velocity z is constant and the position y moves on a straight line. The model of the motion is
-therefore linear at any angular rate, and only the measurement model is nonlinear. After each step the filter
-state is divided by the length of the position y, so that y is a unit vector again. The filter state is the
-vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE Transactions on Automatic
-Control 28). The component of the velocity z across the line of sight is the angular rate v. The component of
-the velocity z along the line of sight is s = (range rate) / range. Without forces the angular acceleration of
-the line of sight is -2 (range rate) / range times the angular rate.
+forces the velocity z is constant and the position y moves on a straight line. The motion model of the
+line-of-sight filter is therefore linear at any angular rate, and only the measurement model is nonlinear.
+After each step the filter state is divided by the length of the position y, so that y is a unit vector again.
+The filter state is the vector form of the modified polar coordinates of Aidala and Hammel (1983, IEEE
+Transactions on Automatic Control 28). The component of the velocity z across the line of sight is the angular
+rate v. The component of the velocity z along the line of sight is s = (range rate) / range. Without forces
+the angular acceleration of the line of sight is -2 (range rate) / range times the angular rate.
 
 Observer and object are in free fall about the Earth. If the observer's position is known, the gravity
 gradient gives the relative acceleration of object and observer, to first order in the distance divided by the
@@ -16,16 +16,16 @@ orbit radius.
 
 The process noise models tidal accelerations as white noise of density `wander`, or `residual_wander` if the
 gravity gradient is known. More process noise along the line of sight lets the filter follow motions that are
-not straight lines. For example, (range rate) / range changes by rate^2 per second for an object that moves
-along a great circle at a constant angular rate. The additional noise density is (`bend` rate^2)^2 / rate,
-with the angular rate of the object.
+not straight lines. For example, the ratio (range rate) / range changes by the squared angular rate per second
+for an object that moves along a great circle at a constant angular rate. The additional noise density is
+(`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
 
 Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. The
 assignment in order of chi-square is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and
 Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A track is
 confirmed after m sightings in n frames if its angular rate differs from the rate of a star. Two unconfirmed
 tracks may share a sighting. A confirmed track is propagated without measurements while the object is not
-visible.
+detected.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from knightcube.gnc.estimation.error_state import updated
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSightings:
-    """The n objects detected in a frame, including false detections.
+    """The n detections in a frame, including false detections.
 
     Attributes:
         time_ns: time of mid-exposure.
@@ -73,9 +73,9 @@ class MotionModel:
         rate: standard deviation of each component of the angular rate before the second sighting, rad/s.
         closing: standard deviation of the ratio (range rate) / range before the second sighting, 1/s.
         wander: noise density of the tidal acceleration divided by the range, 1/s^3. In a low orbit with the
-            orbital rate n, the scaled acceleration reaches 1.5 n^2 = 1.8e-6 1/s^2. With the default density,
-            the errors of direction and rate agree with the covariance in passes at 0.05 to 0.6 deg/s and up
-            to 5,000 km.
+            orbital rate n, the tidal acceleration divided by the range reaches 1.5 n^2 = 1.8e-6 1/s^2. With
+            the default density, the errors of direction and rate agree with the covariance in passes with
+            angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
         residual_wander: noise density of the residual acceleration divided by the range if the gravity
             gradient is known, 1/s^3.
         bend: standard deviation of the unmodelled change per second of (range rate) / range on curved paths,
@@ -119,7 +119,7 @@ class LineOfSightState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionInnovation:
-    """Residual (2,), rad, of a measured from a predicted direction, with covariance and chi-square."""
+    """Residual (2,), rad, of a measured and a predicted direction, with covariance and chi-square."""
 
     residual: FloatArray
     covariance: FloatArray
@@ -130,7 +130,7 @@ class DirectionInnovation:
 def begin(
     time_ns: int, direction: FloatArray, covariance: FloatArray, motion: MotionModel
 ) -> LineOfSightState:
-    """Return the line of sight, with unknown rate, after one sighting of covariance (3, 3), rad^2."""
+    """Return the line of sight, with unknown rate, after one sighting with covariance (3, 3), rad^2."""
     along = np.outer(direction, direction)
     across = np.eye(3) - along
     start = np.zeros((6, 6))
@@ -153,7 +153,7 @@ def tides(observer: FloatArray) -> FloatArray:
 def predict(
     state: LineOfSightState, time_ns: int, motion: MotionModel, tide: FloatArray | None = None
 ) -> LineOfSightState:
-    """Return the line of sight propagated to `time_ns`. Raises ValueError for a time in its past.
+    """Return the line of sight propagated to `time_ns`. Raises ValueError for an earlier time.
 
     The gravity gradient is `tide` (3, 3), 1/s^2, or None if unknown.
     """
@@ -184,7 +184,7 @@ def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArr
 
 
 def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> LineOfSightState:
-    """Return the line of sight updated with a direction (3,) of covariance (3, 3), rad^2."""
+    """Return the line of sight updated with a measured direction (3,) of covariance (3, 3), rad^2."""
     seen = compare(state, direction, covariance)
     cross = state.covariance @ seen.observation.T
     gain = np.asarray(np.linalg.solve(seen.covariance, cross.T).T)
@@ -209,7 +209,7 @@ def _at_unit_range(
 
 
 def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: bool) -> FloatArray:
-    """Return the covariance (6, 6) that white accelerations add to the state within `step` seconds.
+    """Return the covariance (6, 6) that white acceleration noise adds to the state in `step` seconds.
 
     The flag `known` states whether the gravity gradient is known.
     """
@@ -224,8 +224,9 @@ def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: boo
 
 _UNSEEN = np.full(3, np.nan)
 _ALIKE = 2.0
-"""Largest brightness difference of a sighting from a tentative track, in standard deviations. The brightness
-of a confirmed track is not limited, because the position is known well and an object may flash."""
+"""Largest brightness difference between a sighting and a tentative track, in standard deviations. For a
+confirmed track the brightness difference is not limited, because the position is known well and an object may
+flash."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,14 +235,14 @@ class TrackSettings:
 
     Attributes:
         motion: prior and process noise of the objects' motion.
-        needed: number of sightings, within `within` frames, that confirm a track.
+        needed: number of sightings within `within` frames that confirm a track.
         within: number of frames in which `needed` sightings confirm a track.
         missed: probability that the gate rejects a true sighting of the object.
-        moving: minimum difference between the angular rate and the rate of the stars, in standard deviations,
-            to confirm a track.
+        moving: minimum difference between the angular rates of object and stars for a confirmed track, in
+            standard deviations.
         minimum_rate: angular rate below which an object cannot be distinguished from an uncatalogued star,
             rad/s.
-        coast: time that a confirmed track lasts without a sighting, s.
+        coast: time after which a confirmed track without a sighting ends, s.
         maximum_tracks: largest number of tracks, including tentative tracks.
         brightness: standard deviation of the brightness between sightings of one object, magnitudes.
     """
@@ -271,7 +272,8 @@ class Track:
         magnitude_sigma: standard deviation of the mean magnitude, computed from the scatter, or NaN before
             the second sighting. The common error of all magnitudes due to the colours of the stars is not
             included.
-        history: one bit per frame, set if the frame has a sighting; the newest frame is the lowest bit.
+        history: one bit per frame, which is set if the frame contains a sighting; the lowest bit is for the
+            newest frame.
         measured: direction (3,) of the sighting in the newest frame; NaN without a sighting.
         measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.
         chi_square: chi-square of the sightings relative to the predictions, with two degrees of freedom per
@@ -337,7 +339,7 @@ class ObjectTracker:
             replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
-        # After this line, the covariances of the sighted directions include the attitude error.
+        # From here on, the covariances of the sighted directions include the attitude error.
         crosses = cross_matrices(frame.directions)
         spread = np.asarray(
             frame.covariance + crosses @ frame.attitude @ crosses.transpose(0, 2, 1), dtype=float
@@ -377,7 +379,8 @@ class ObjectTracker:
                     continue
                 seen = compare(track.line, frame.directions[number], spread[number])
                 if seen.chi_square + unlike <= self._gate:
-                    # Likelihoods are compared, because chi-square alone prefers large covariances.
+                    # Likelihoods are compared, because chi-square alone would favour tracks with large
+                    # covariances.
                     cost = seen.chi_square + unlike + math.log(float(np.linalg.det(seen.covariance)))
                     pairs.append((not track.confirmed, cost, index, number))
         taken: dict[int, int] = {}

@@ -1,1 +1,1 @@
-"""Published methods that the flight does not use, for comparison with the methods in use."""
+"""Published methods that the flight software does not use, for comparison with the methods in use."""

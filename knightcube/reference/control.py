@@ -1,13 +1,13 @@
 """PID and adaptive controllers of the testbed's rotation angle, for comparison (Sease 2013, chapter 5).
 
-The PID controller, which needs 0.15 W on the testbed, has free gains, or gains that place all three
-closed-loop poles of a double integrator at -w, with a bandwidth w. The gains for three poles at -w are 3 w on
-the rate, 3 w^2 on the angle and w^3 on the integral of the angle. The reference angle enters the proportional
-part with a weight b (set-point weighting, Astrom and Hagglund 1995, section 3.4). If the reference angle has
-no weight (b = 0), a step of the target causes no step of the current and no overshoot. The integration stops
-while the current is saturated and the error would increase the saturation (conditional integration). The only
-plant parameter that the PID controller uses is the ratio of inertia to torque constant, which scales the
-gains.
+The PID controller, which needs 0.15 W on the testbed, has either freely chosen gains, or gains that place all
+three closed-loop poles of a double integrator at -w, with a bandwidth w. The gains for three poles at -w are
+3 w on the rate, 3 w^2 on the angle and w^3 on the integral of the angle. The reference angle enters the
+proportional part with a weight b (set-point weighting, Astrom and Hagglund 1995, section 3.4). If the
+reference angle has no weight (b = 0), a step of the target causes no step of the current and no overshoot.
+The integration stops while the current is saturated and the error would increase the saturation (conditional
+integration). The only plant parameter that the PID controller uses is the ratio of inertia to torque
+constant, which scales the gains.
 
 The adaptive controller, which needs 0.66 W on the testbed, follows Slotine and Li 1991, section 8.5. With the
 composite error s = e' + l e and the reference acceleration a_r = theta_m'' + l e', the current I is defined
@@ -16,10 +16,11 @@ by
     I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
 
 The adapted parameters p are inertia, stiffness, damping and constant torque, each divided by the torque
-constant. The adaptive controller converges for any values of the parameters p. The reference angle theta_m
-follows the target through a critically damped second-order model, so that the body can follow a step of the
-target. The parameters p are adapted only while the coil is not saturated and the composite error exceeds the
-noise level. The parameters p are also bounded, because noise alone would make the parameters drift.
+constant. The adaptive controller converges for any true values of the parameters p. The reference angle
+theta_m follows the target through a critically damped second-order model, so that the body can follow a step
+of the target. The parameters p are adapted only while the coil is not saturated and the composite error
+exceeds the noise level. The parameters p are also bounded, because noise alone would make the parameters
+drift.
 """
 
 from __future__ import annotations
@@ -98,12 +99,13 @@ class PidController:
             wanted: reference angle, rate and acceleration.
             angle: measured angle, rad.
             rate: measured rate, rad/s.
-            disturbance: estimated disturbance, which must be finite.
+            disturbance: estimated disturbance, which is checked to be finite but not used.
 
         Raises UsageError if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
-        # The initial integral of the error cancels the proportional part: the first command at rest is zero.
+        # The initial integral of the error cancels the proportional part, so that the first command of a body
+        # at rest is zero.
         unweighted = (1.0 - self._weight) * wanted.angle
         if self._sum is None:
             self._sum = self._gains.proportional / self._gains.integral * ((1.0 - self._weight) * angle)
@@ -133,7 +135,7 @@ class AdaptiveSettings:
 
     Attributes:
         bandwidth: factor l in the composite error s = e' + l e, rad/s; also the gain on s, 1/s.
-        adaptation: adaptation gain relative to the square of each parameter's range, s/rad^2.
+        adaptation: adaptation gain, divided by the square of each parameter's range, s/rad^2.
         reference_bandwidth: bandwidth of the reference model, rad/s, or None to follow the commanded motion
             directly.
         dead_zone: minimum absolute composite error s for adaptation of the parameters, rad/s.
@@ -153,14 +155,14 @@ class AdaptiveSettings:
 
 
 class AdaptiveController:
-    """Adaptive controller, whose state is the adapted parameters and the state of the reference model.
+    """Adaptive controller; its state consists of adapted parameters and the reference model's state.
 
     The parameters (4,) are inertia (A s^2), stiffness (A), damping (A s) and constant torque (A), each
     divided by the torque constant.
     """
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: AdaptiveSettings) -> None:
-        """Begin with the inertia, stiffness and damping of the plant model as parameters.
+        """Start with the inertia, stiffness and damping of the plant model as initial parameters.
 
         Args:
             plant: testbed parameters.
@@ -177,7 +179,8 @@ class AdaptiveController:
         inertia = plant.inertia / plant.torque_constant
         self._gain = inertia * settings.bandwidth
         begin = np.array([plant.inertia, plant.stiffness, plant.damping, 0.0]) / plant.torque_constant
-        # The stiffness may need half the current limit at 1 rad, and the damping half the limit at 0.2 rad/s.
+        # At the upper bounds, the stiffness needs half the current limit at 1 rad, and the damping half the
+        # current limit at 0.2 rad/s.
         self._range = np.array([0.5 * inertia, 0.5 * self._limit, 2.5 * self._limit, 0.5 * self._limit])
         self._low = np.maximum(begin - self._range, [0.5 * inertia, 0.0, 0.0, -np.inf])
         self._high = begin + self._range
@@ -193,7 +196,7 @@ class AdaptiveController:
             wanted: reference angle, rate and acceleration.
             angle: measured angle, rad.
             rate: measured rate, rad/s.
-            disturbance: estimated disturbance, which must be finite.
+            disturbance: estimated disturbance, which is checked to be finite but not used.
 
         Raises UsageError if an input is not finite.
         """

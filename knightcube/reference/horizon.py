@@ -1,17 +1,17 @@
 """Nadir determination as in Meller et al., chapter 3, for comparison with `knightcube.vision.horizon`.
 
-Edge detection (Meller et al., section 3.1): A scan line is divided by the average of its high intensities and
-rounded to 0 or 1. Short fluctuations along the scan line are filtered out. The first change from 0 to 1 is
-the edge of the horizon.
+Edge detection (Meller et al., section 3.1): The intensities of a scan line are divided by the average of its
+high intensities and rounded to 0 or 1. Short fluctuations along the scan line are filtered out. The first
+change from 0 to 1 is the edge of the horizon.
 
 Circle fit (Meller et al., section 3.2.1): The centre and radius of the horizon circle are computed by a
 pseudo-inverse. The method assumes that the image has no distortion and that the horizon is a circle on the
 flat detector, which is valid near the optical axis only. Meller et al. do not state from which side the image
 is scanned; this implementation scans from the darkest border. Meller et al. do not state how to compute nadir
 from the circle in the image of one camera. This implementation assumes that the point of the circle closest
-to the optical axis lies on the limb. Nadir is on the line from this point to the centre of the circle, at the
-Earth's angular radius from the point. The lens distortion is removed before the circle fit. The circle fit
-does not distinguish between limb and terminator.
+to the optical axis lies on the limb. Nadir is on the line from the closest point of the circle to its centre,
+at the Earth's angular radius from the point. The lens distortion is removed before the circle fit. The circle
+fit does not distinguish between limb and terminator.
 
 Graphic Method (Meller et al., section 3.2.2 and Fig. 10): The limb is a circle in the horizon plane, whose
 distance below the satellite follows from the altitude. The plane through the centre column of a camera image
@@ -19,12 +19,12 @@ contains the body's z axis and intersects the horizon plane in a line. The lines
 point Z on the body's z axis. The vector from the intersection point Z to the centre of the horizon circle
 gives the angle between the z axis and nadir. Meller et al. do not state the image scale (px/km) of the
 Graphic Method. This implementation uses an image scale equal to the distance of the circle's centre below the
-optical axis (px), divided by the distance of the horizon plane below the satellite (km). This image scale is
-exact for tilts about an optical axis, and exact to first order for other tilts of level cameras.
+optical axis (px), divided by the distance of the horizon plane below the satellite (km). The chosen image
+scale is exact for tilts about an optical axis, and exact to first order for other tilts of level cameras.
 
-Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from Q to P, the
-shortest rotation from Q to P rotates the old nadir to the new nadir. A rotation of the body about the
-direction P of the horizon point is not observable.
+Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from direction Q to
+direction P, the shortest rotation from Q to P rotates the old nadir direction to the new nadir direction. A
+rotation of the body about the direction P of the horizon point is not observable.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def high_average(lines: Image) -> FloatArray:
 
 
 def binarised(lines: Image, high: FloatArray) -> BoolArray:
-    """Return scan lines (n, m), each divided by the average of the high intensities and rounded to 0 or 1.
+    """Return scan lines (n, m), each divided by its average high intensity `high` and rounded to 0 or 1.
 
     Source: Meller et al., section 3.1, step 1.
     """
@@ -63,18 +63,18 @@ def binarised(lines: Image, high: FloatArray) -> BoolArray:
 
 
 def first_edges(binary: BoolArray) -> IntArray:
-    """Return the index (n,) of the first change from 0 to 1 in each binary line (n, m), -1 for no change."""
+    """Return the index (n,) of the first change from 0 to 1 in each binary line (n, m), or -1 without one."""
     rises = binary[:, 1:] & ~binary[:, :-1]
     return np.where(np.any(rises, axis=1), np.argmax(rises, axis=1) + 1, -1)
 
 
 def horizon_points(lines: Image) -> IntArray:
-    """Return the edge positions (n,) in scan lines (n, m), -1 for a line without an edge."""
+    """Return the edge positions (n,) in scan lines (n, m), or -1 for a line without an edge."""
     return first_edges(run_filtered(binarised(lines, high_average(lines)), RUN))
 
 
 class NoCircleError(FlightError):
-    """Raised for points that define no circle: fewer than three points, or collinear points."""
+    """Raised if the points do not define a circle: fewer than three points, or collinear points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +92,7 @@ class HorizonCircle:
 def fit_circle(points: FloatArray) -> HorizonCircle:
     """Return the least-squares circle through points (n, 2), by equations (2) to (5) of Meller et al.
 
-    Each row of the linear system contains a point and the next point; the last row contains the last and the
+    Each row of the linear system combines a point and the next point; the last row combines the last and the
     first point. A circle through three points fits exactly. For more points the radius of the circle is the
     RMS distance of the points from the centre. Raises NoCircleError for fewer than three points and for
     collinear points.
@@ -113,7 +113,8 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
 LINES = 3
 """Default number of scan lines, as in the example of Meller et al."""
 _ON_AXIS = 1e-6
-"""Distance (px) between optical axis and circle centre below which nadir is assumed on the optical axis."""
+"""Distance (px) between optical axis and circle centre below which nadir is assumed to be on the optical
+axis."""
 
 
 class NoHorizonError(FlightError):
@@ -192,10 +193,10 @@ class GraphicMethodError(FlightError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelCamera:
-    """Camera whose boresight is perpendicular and whose y axis is parallel to the z axis of the body.
+    """Camera whose boresight is perpendicular to the body z axis, and whose y axis is parallel to it.
 
     Attributes:
-        right: (2,) body x and y components of the camera's x axis, which is a unit vector.
+        right: (2,) components along body x and y of the camera's x axis, as a unit vector.
         axis: position (x, y) of the optical axis in the image, px.
     """
 

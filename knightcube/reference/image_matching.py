@@ -1,14 +1,14 @@
-"""Attitude of a star camera by matching of two images, after Delabie's AIM (named in Michalski, section 3.4).
+"""Attitude of a star camera by Delabie's image matching (AIM), mentioned in Michalski, section 3.4.
 
 Attitude estimation using image matching (AIM; Delabie, De Schutter & Vandenbussche, Journal of Guidance,
 Control, and Dynamics 36, 2013) projects the catalogue's stars into an image with a prior attitude. The
 rotation and translation that move this image onto the observed image with the least squared distances have a
-closed form. The rotation in the image is a rotation about the boresight, and the translation is a tilt of
-the boresight. The source thesis only names the method; the formulas here were derived again.
+closed form. The rotation in the image is a rotation about the boresight, and the translation is a tilt of the
+boresight. The source thesis only names the method; the formulas of this module were derived independently.
 
-A tilt of the camera moves stars far from the boresight by more than stars at the boresight, so that the
-closed form leaves an error in proportion to the error of the prior attitude and to the squared field angle.
-Each further step projects the catalogue's stars again and removes most of this error.
+A tilt of the camera moves stars far from the boresight by more than stars at the boresight. The error of the
+closed form is therefore proportional to the error of the prior attitude and to the squared field angle. Each
+further step projects the catalogue's stars with the newest attitude and removes most of the remaining error.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from knightcube.astro.attitude.wahba import (
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 
 STEPS = 4
-"""Default number of steps, which leaves less than 0.01 arcsec of a prior error of 1 deg in a 20 deg field."""
+"""Default number of steps, which reduces a prior error of 1 deg in a 20 deg field to less than 0.01"."""
 
 
 def solve(
@@ -46,7 +46,8 @@ def solve(
         observed: (n, 3) observed unit vectors in camera axes, boresight +z.
         reference: (n, 3) reference unit vectors.
         sigma: (n,) standard deviations of the observed directions, rad.
-        prior: (4,) prior attitude, reference frame to camera; by default TRIAD's attitude of the best pair.
+        prior: (4,) prior attitude, reference frame to camera; by default the TRIAD attitude of the best pair
+            of stars.
         steps: number of projections with the newest attitude.
     """
     seen = sightings(observed, reference, sigma)
@@ -75,5 +76,5 @@ def _match(observed: FloatArray, predicted: FloatArray, weight: FloatArray) -> F
     x, y = image_centre - np.array([[cosine, -sine], [sine, cosine]]) @ catalogue_centre
     shift = float(np.hypot(x, y))
     tilt = (np.arctan(shift) / shift if shift > 0.0 else 1.0) * np.array([y, -x, 0.0])
-    # The camera turns against the motion of the stars in the image.
+    # The rotation of the camera is opposite to the motion of the stars in the image.
     return multiply(from_rotation_vector(tilt), from_rotation_vector(np.array([0.0, 0.0, -turn])))

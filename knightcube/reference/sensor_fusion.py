@@ -1,13 +1,14 @@
 """Attitude determination of the ION-F satellites (Meller et al., section 2 and Fig. 3), for comparison.
 
-The directions of Sun and nadir from the cameras give one attitude matrix R^ib (Meller et al. name Triad and
-QUEST). The magnetometer gives a second one: "When these measurements are compared with theoretical magnetic
-field models, a three-dimensional satellite attitude can be determined." One field vector gives only two
-angles. This implementation therefore collects the fields of some minutes, in which the direction of the field
-changes along the orbit, and rotates them to the present with the gyros. Meller et al. leave the fusion of the
-two matrices open; here each matrix is weighted by the inverse of its covariance. The fused matrix and the
-gyros are the measurements of an extended Kalman filter for attitude and gyro bias. As in the paper, no
-measurement is checked against the estimate.
+The directions of Sun and nadir from the cameras give one attitude matrix R^ib (Meller et al. mention the
+methods TRIAD and QUEST). The magnetometer gives a second attitude matrix: "When these measurements are
+compared with theoretical magnetic field models, a three-dimensional satellite attitude can be determined." A
+single field vector, however, determines only two of the three angles. This implementation therefore collects
+magnetic field measurements for some minutes, during which the field direction changes along the orbit, and
+rotates the measurements into the present body axes with the gyros. Meller et al. do not state how the two
+matrices are fused; this implementation weights each matrix by the inverse of its covariance. The fused matrix
+and the gyros are the measurements of an extended Kalman filter for attitude and gyro bias. As in the paper,
+measurements are not checked for outliers by comparison with the estimate.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from knightcube.astro.quaternion import (
 )
 
 FIELD_EVERY = 60.0
-"""Interval (s) between the magnetic fields that are collected."""
+"""Interval (s) between collected magnetic field measurements."""
 FIELDS = 10
-"""Number of collected fields, which span ten minutes or a tenth of a revolution."""
+"""Number of collected field measurements, which span ten minutes or a tenth of an orbit."""
 WORST_SIGMA = math.radians(20.0)
-"""Standard deviation (rad) about the worst axis above which an attitude is not used."""
+"""Standard deviation (rad) about the least certain axis above which an attitude is not used."""
 _NANOSECOND = 1e-9
 
 
@@ -59,11 +60,12 @@ class KnownAttitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeparateAttitudes:
-    """The attitudes of one update: of the cameras, of the magnetometer, fused, and filtered with the gyros.
+    """The attitudes of one update: from cameras, from magnetometer, fused, and filtered with the gyros.
 
     Attributes:
-        cameras, magnetometer, fused, filtered: the four attitudes.
-        bias: gyro bias (3,), rad/s, that the filter estimates.
+        cameras, magnetometer, fused, filtered: attitudes from the cameras, from the magnetometer, from both,
+            and from the filter.
+        bias: estimated gyro bias (3,), rad/s.
     """
 
     cameras: KnownAttitude
@@ -74,7 +76,7 @@ class SeparateAttitudes:
 
 
 def attitude_of(directions: list[VectorObservation]) -> KnownAttitude:
-    """Return the attitude from at least two directions, which is unknown if they do not determine it."""
+    """Return the attitude determined by directions, which is unknown if the directions are not sufficient."""
     if len(directions) < 2:
         return KnownAttitude()
     try:
@@ -101,7 +103,7 @@ class GyroBiasFilter:
 
     Args:
         noise: noise density of the gyros, rad/s per sqrt(Hz).
-        bias: standard deviation of the gyro bias at the start, rad/s.
+        bias: initial standard deviation of the gyro bias, rad/s.
         walk: random walk of the gyro bias, rad/s per sqrt(s).
     """
 
@@ -134,7 +136,7 @@ class GyroBiasFilter:
         self._covariance = step @ self._covariance @ step.T + np.diag(noise)
 
     def update(self, measured: KnownAttitude) -> None:
-        """Start from a measured attitude, or correct attitude and bias with it."""
+        """Correct attitude and bias by a measured attitude, or start from the first measured attitude."""
         if not measured.known:
             return
         if not self.attitude.known:
@@ -155,7 +157,7 @@ class GyroBiasFilter:
 
 
 class SeparateDetermination:
-    """Determines the attitude by cameras and by magnetometer, and passes the fused attitude to the filter."""
+    """Attitude determination by cameras and magnetometer, which passes the fused attitude to the filter."""
 
     def __init__(self, filter_: GyroBiasFilter) -> None:
         self._filter = filter_
@@ -184,7 +186,8 @@ class SeparateDetermination:
         cameras = attitude_of([one for one in (sun, nadir) if one is not None])
         fields = [*self._fields, *now]
         magnetometer = attitude_of(fields)
-        # The errors of bias and field model are common to all fields, so that a mean is not more accurate.
+        # The errors of magnetometer bias and field model are common to all collected fields, so that their
+        # mean is not more accurate.
         spread = len(fields) * magnetometer.covariance
         magnetometer = replace(magnetometer, covariance=spread)
         fused = fuse(cameras, magnetometer)
@@ -208,7 +211,8 @@ class SeparateDetermination:
         seconds = (time_ns - since_ns) * _NANOSECOND
         matrix, drift = attitude_matrix(turn), self._filter.bias_sigma
         for number, one in enumerate(self._fields):
-            # The error of the bias acts in one direction, so that standard deviations are added.
+            # The error of the gyro bias is the same for all intervals, so that standard deviations are added
+            # instead of variances.
             drifted = (len(self._fields) - number) * FIELD_EVERY * drift
             cross = cross_matrices(one.observed[None])[0]
             added = cross @ cross.T * 2.0 * drifted * drift * seconds

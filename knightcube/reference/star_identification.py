@@ -1,10 +1,11 @@
 """Classical methods of star identification (Michalski, section 3.2), for comparison with the default method.
 
 Each method proposes candidates, which assign guide stars to some observed stars and thereby define an
-attitude. With this attitude the brightest observed stars are transformed to the sky, and the stars close to
-guide stars are counted. The candidates with the highest counts are verified with all observed stars by
-`knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is uncertain,
-the identification is tried at several scales (`ScaledField`).
+attitude. With the attitude of a candidate, the directions of the brightest observed stars are transformed to
+the reference frame, and the observed stars close to guide stars are counted. The candidates with the most
+such stars are verified with all observed stars by `knightcube.vision.startracker.verification`, which rejects
+false candidates. If the image scale is uncertain, the identification is tried at several scales
+(`ScaledField`).
 
 The methods are:
 
@@ -16,28 +17,28 @@ The methods are:
 - Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
   define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
   & Crassidis 2004 and 2006). Triangles in the range of areas are candidates if their polar moments and side
-  lengths match too. If several triangles match, the published methods pivot to a neighbouring triangle, while
-  this implementation tests all matching triangles.
+  lengths also match. If several triangles match, the published methods pivot to a neighbouring triangle,
+  while this implementation tests all matching triangles.
 
 - Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
   limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
-  Navigation 51, 2004). A matched triangle becomes a pyramid if the angles between a fourth observed star and
-  all three corners match as well. Only pyramids are candidates, because a matching fourth star makes chance
-  matches rare.
+  Navigation 51, 2004). A matching triangle is extended to a pyramid if the angles between a fourth observed
+  star and all three corners match as well. Only pyramids are candidates, because a matching fourth star makes
+  chance matches rare.
 
 - Rate matching: Two frames, or the ends of streaks, give the velocity of each observed point (Michalski,
   section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification algorithms, IEEE TAES 41,
-  2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars. Satellites, hot
-  pixels and planes move differently and are excluded. A previous attitude, propagated by the body rate,
-  predicts the position of each star. Without a previous attitude, the pyramid method identifies the remaining
-  points.
+  2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars. The images of
+  satellites, aircraft and hot pixels move differently and are excluded. The position of each star is
+  predicted from a previous attitude, which is propagated by the body rate. Without a previous attitude, the
+  pyramid method identifies the remaining points.
 
 - Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
   one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
-  Lindenbaum, IEEE TAES 44, 2008). The number of partners of a guide star is ignored, because otherwise
-  crowded regions of the sky would win the vote if the noise exceeds 0.3 px. In a second vote, the assignments
-  with the most votes support each other if the angles between their stars agree. The largest group of
-  consistent assignments is the candidate.
+  Lindenbaum, IEEE TAES 44, 2008). The number of matching partners of a guide star is ignored, because
+  otherwise guide stars in dense regions of the sky would get the most votes if the noise exceeds 0.3 px. In a
+  second vote, two of the assignments with the most votes vote for each other if the angle between their stars
+  agrees. The largest group of consistent assignments is the candidate.
 
 - Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting
   the cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33,
@@ -96,15 +97,16 @@ class ClassicalSettings:
     """Settings of the classical methods. Each method uses some of these settings.
 
     Attributes:
-        brightest: number of the brightest observed stars from which patterns are formed.
+        brightest: number of brightest observed stars from which patterns are formed.
         tolerance: tolerance of angles, areas and moments, in standard deviations.
         patterns: maximum number of triangles or grid patterns that are looked up in a table.
-        joins: maximum number of triangles formed from star pairs, over all scales; a triangle takes 0.5 ms.
-        candidates: maximum number of candidates per scale that are compared with the field.
-        screened: number of the brightest observed stars with which a candidate is compared first.
+        joins: maximum total number, for all image scales, of triangles formed from star pairs; a triangle
+            takes 0.5 ms.
+        candidates: maximum number of candidates per image scale that are compared with the observed stars.
+        screened: number of brightest observed stars with which a candidate is first compared.
         verified: maximum number of candidates of a pattern that are verified with all observed stars.
         scale_step: relative half width of the interval of image scales that one search covers.
-        scales: maximum number of searched image scales; a field that needs more is rejected.
+        scales: maximum number of image scales to search; a field that needs more scales is rejected.
         cosine_limits: whether the limits of an angle are those of its cosine, whose variance is given by
             Michalski, eq. 31, instead of the limits of the angle itself.
         verification: conditions for the acceptance of a candidate.
@@ -129,7 +131,7 @@ DEFAULT = ClassicalSettings()
 class FieldUnknown(FlightError):
     """Raised if the image scale is too uncertain for the classical methods.
 
-    The default method can solve a field of uncertain scale.
+    The default method can identify a field of uncertain image scale.
     """
 
 
@@ -143,7 +145,7 @@ class ScaledField:
         direction: (n, 3) unit vectors to the observed stars at this scale.
         sigma: (n,) standard deviations of the directions, rad.
         slack: relative error of angles that the uncertainty of the scale causes.
-        stars: number of the brightest observed stars from which patterns are formed.
+        stars: number of brightest observed stars from which patterns are formed.
         cosine_limits: whether the limits of angles are computed from their cosines.
     """
 
@@ -179,7 +181,7 @@ class ScaledField:
 
 
 def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField]:
-    """Yield the field at image scales that cover the uncertainty of its scale, most likely scale first.
+    """Yield the field at image scales that cover the uncertainty of its scale, the most likely scale first.
 
     Raises FieldUnknown if more scales are needed than the settings allow.
     """
@@ -224,7 +226,7 @@ class Candidates:
 
 
 _LEAST_BASE = 10.0
-"""Minimum distance between the first two stars of a candidate, in standard deviations of a direction."""
+"""Minimum angle between the first two stars of a candidate, in standard deviations of a direction."""
 _LEAST_JOINS = 4
 Propose = Callable[[ScaledField, KnownSky, ClassicalSettings], Iterator[Candidates]]
 
@@ -310,14 +312,15 @@ def _frames(pairs: FloatArray) -> FloatArray:
 def _support(
     view: ScaledField, sky: KnownSky, matrices: FloatArray, observed: IntArray, settings: ClassicalSettings
 ) -> IntArray:
-    """Return for each attitude (k, 3, 3) the number of bright observed stars close to a guide star."""
+    """Return, for each attitude (k, 3, 3), the number of bright observed stars close to a guide star."""
     seen = view.direction[: settings.screened]
     pair = view.direction[observed[:, :2]]
     base = np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1)
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # The error of an attitude from two stars adds a position error proportional to the distance from both.
+    # The error of an attitude from two stars causes a position error that is proportional to the distance
+    # from the middle of both stars.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -338,7 +341,7 @@ def matching_triangles(
     """Return guide star triangles (k, 3) that match an observed triangle in angles and orientation.
 
     Pairs of guide stars that match the first and the second side are joined at their common star. The third
-    side of each joined triangle is then compared by the cosine of the angle.
+    side of each joined triangle is then compared by the cosine of its angle.
     """
     pivot, second, third = corners
     one, other = np.array([pivot, pivot, second]), np.array([second, third, third])
@@ -366,7 +369,7 @@ def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return for each pair of guide stars (k,) whether the angle lies between `low` and `high` (rad)."""
+    """Return, for each pair of guide stars (k,), whether its angle lies between `low` and `high`, rad."""
     direction = sky.stars.direction
     cosine = np.einsum("kx,kx->k", direction[one], direction[other])
     minimum, maximum = np.cos(np.minimum(high, np.pi)), np.cos(np.maximum(low, 0.0))
@@ -374,7 +377,7 @@ def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high:
 
 
 def _turns_left(corners: FloatArray) -> BoolArray:
-    """Return for triangles (k, 3, 3) whether their corners a, b, c are right-handed: a . (b x c) > 0."""
+    """Return, for each triangle (k, 3, 3), whether its corners a, b, c are right-handed: a . (b x c) > 0."""
     a, b, c = np.moveaxis(corners, -2, 0)
     return np.asarray(np.einsum("kx,kx->k", a, np.cross(b, c)) > 0.0)
 
@@ -401,7 +404,7 @@ def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
 def _pyramids(
     view: ScaledField, sky: KnownSky, corners: tuple[int, int, int], found: IntArray, tolerance: float
 ) -> Candidates:
-    """Return those matched triangles `found` (k, 3) that a fourth star confirms, extended by this star."""
+    """Return the matching triangles of `found` (k, 3) that a fourth star confirms, extended by this star."""
     rest = np.setdiff1d(np.arange(view.stars), corners)
     pivot = np.full(len(rest), corners[0])
     _, low, high = view.angles(pivot, rest, tolerance)
@@ -515,7 +518,7 @@ def propose_families(view: ScaledField, sky: KnownSky, settings: ClassicalSettin
 def _ballot(
     voters: int, one: IntArray, other: IntArray, low: FloatArray, high: FloatArray, sky: KnownSky
 ) -> FloatArray:
-    """Return the number of votes (voters, stars) for each assignment of a guide star to an observed star."""
+    """Return the votes (voters, stars) for each assignment of a guide star to an observed star."""
     first, _, owner = sky.pairs.between(low, high)
     in_favour = np.zeros((len(one), len(sky.stars)), dtype=np.float32)
     in_favour[owner, first] = 1.0
@@ -611,7 +614,7 @@ class SharedRate:
     Attributes:
         rate: (3,) body rate in camera axes, rad/s.
         covariance: (3, 3) covariance of the rate, rad^2/s^2.
-        shares: (n,) whether the motion of each point agrees with the rate.
+        shares: (n,) flags of the points whose motion agrees with the rate.
     """
 
     rate: FloatArray
@@ -620,7 +623,7 @@ class SharedRate:
 
 
 _CHI_SQUARE = 13.8
-"""Threshold of chi-square with two degrees of freedom, which one star in 1000 exceeds by chance."""
+"""Threshold of chi-square with two degrees of freedom, which is exceeded by chance for one star in 1000."""
 _SEEDS = 10
 
 
@@ -640,7 +643,7 @@ def identify_by_rate(
         field: observed stars.
         sky: guide stars and tables of their patterns.
         settings: settings of the method.
-        motion: motion of the observed points, or None to treat all points as stars and the attitude as
+        motion: motion of the observed points; if None, all points are treated as stars and the attitude as
             constant.
         previous: previous attitude, None if unknown.
     """
@@ -685,7 +688,8 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
         agrees = _agrees(direction, motion, rate, covariance)
         if agrees.sum() <= shares.sum():
             continue
-        # The rate is refined, because many points agree with an inaccurate rate from two close points.
+        # The rate is refined, because a rate from two close points is inaccurate and many points agree with
+        # it.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():
@@ -707,7 +711,7 @@ def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tup
 
 
 def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Return for each point (n,) whether the motion of the point agrees with `rate` within the errors."""
+    """Return, for each point (n,), whether its motion agrees with `rate` within the errors."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
     # The largest eigenvalues of the rate's covariances give an upper bound of the velocity error.
@@ -724,8 +728,8 @@ class Method:
     """Method of star identification.
 
     Attributes:
-        identify: function that returns the identification of a field from the tables of the sky. All methods
-            except the default method raise FieldUnknown if the image scale is too uncertain.
+        identify: function that returns the identification of a field with the guide star tables of the sky.
+            The methods other than the default method raise FieldUnknown if the image scale is too uncertain.
         source: publication of the method.
     """
 

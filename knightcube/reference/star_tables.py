@@ -3,14 +3,15 @@
 Pair table (Michalski, sections 3.3.1 and 3.3.4, eq. 49-61): A pair consists of two star indices and the angle
 between the stars. The angle of a pair is stored as float32, with a rounding error of at most 0.003" below 0.5
 rad. Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary
-search (Mortari & Neta, K-vector range searching techniques, 2000). A straight line approximates the sorted
-keys. The k-vector contains, for evenly spaced values on the line, the number of keys below the value. The
-inverse of the line gives the interval (cell) of the k-vector that contains a value, so that two look-ups give
-the beginning and end of a range of keys. Ranges of keys are half-open (low <= key < high). Equation 61 of
-Michalski also returns some keys just outside the range. This implementation returns exactly the keys of the
-range, because it compares the keys in the two boundary cells. Equation 54 of Michalski is corrected to 2
-delta-epsilon, as in the original paper, so that the straight line ends above the largest key. The margin
-2.22e-16 in equation 56 of Michalski is replaced by a margin proportional to the size of the keys.
+search (Mortari & Neta, K-vector range searching techniques, 2000). A k-vector approximates the sorted keys by
+a straight line. The k-vector contains, for evenly spaced values on the straight line, the number of keys
+below each value. The cell (interval) of the k-vector that contains a value follows from the inverse of the
+straight line, so that two look-ups give the beginning and end of a range of keys. Ranges of keys are
+half-open (low <= key < high). Equation 61 of Michalski also returns some keys just outside the range. This
+implementation returns exactly the keys of the range, because it compares the keys in the two boundary cells.
+Equation 54 of Michalski is corrected to 2 delta-epsilon, as in the original paper, so that the straight line
+ends above the largest key. The margin 2.22e-16 in equation 56 of Michalski is replaced by a margin
+proportional to the magnitude of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -25,7 +26,8 @@ opposite side, so that matching triangles also have matching corners.
 
 Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells that the
 neighbouring stars occupy. The star is the origin of a tangent plane, and the nearest neighbour outside a
-buffer radius defines the +x axis. Each further star within the pattern radius occupies one cell of the grid.
+buffer radius defines the +x axis. Each further neighbouring star within the pattern radius occupies one cell
+of the grid.
 
 Each table is built at its first use, so that only the tables of the methods in use need memory.
 """
@@ -69,7 +71,7 @@ class KVector:
         return len(self.key)
 
     def ranges(self, low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[IntArray, IntArray]:
-        """Return the start and stop indices (m,) of the keys with low <= key < high, for m ranges at once.
+        """Return, for m ranges at once, the start and stop indices (m,) of the keys with low <= key < high.
 
         An empty range has equal start and stop indices. Raises ValueError if a limit is NaN.
         """
@@ -187,7 +189,7 @@ def build_pairs(stars: GuideStars, widest: float) -> PairTable:
 
 
 def faintest_for(stars: GuideStars, solid_angle: float, wanted: float) -> float:
-    """Return the limiting magnitude for which a field of view contains `wanted` guide stars on average.
+    """Return the limiting magnitude at which a field of view contains `wanted` guide stars on average.
 
     Args:
         stars: guide stars in order of brightness.
@@ -214,8 +216,8 @@ def cosine_sigma(cosine: FloatArray, one: FloatArray, other: FloatArray) -> Floa
     """Return the standard deviations (k,) of the measured cosines of angles (Michalski, eq. 26 to 31).
 
     With the covariance R = sigma^2 (I - b b^T) of a direction b (eq. 25b), the variance of eq. 31 becomes
-    (sigma_1^2 + sigma_2^2) sin^2 + sigma_1^2 sigma_2^2 (1 + cos^2). The second term is the trace of R1 R2; it
-    matters only for stars that are about as close as their errors.
+    (sigma_1^2 + sigma_2^2) sin^2 + sigma_1^2 sigma_2^2 (1 + cos^2). The second term is the trace of R1 R2,
+    which matters only if the angle between two stars is of the order of the direction errors.
 
     Args:
         cosine: (k,) cosines of the angles between two stars.
@@ -354,7 +356,7 @@ def measured_spherical_shape(corners: FloatArray, sigma: FloatArray) -> Triangle
         at = corners[:, corner]
         along = corners[:, (corner + 1) % 3] - at
         along = along - np.sum(along * at, axis=-1, keepdims=True) * at
-        # For two coincident corners any direction is used, because their side has no direction.
+        # For two coincident corners an arbitrary direction is used, because their side has no direction.
         length = np.linalg.norm(along, axis=-1, keepdims=True)
         along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), _across(at))
         for direction in (along, np.cross(at, along)):
@@ -377,9 +379,9 @@ def _across(direction: FloatArray) -> FloatArray:
 
 
 Shape = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Function that returns the areas and polar moments of triangles from their corners."""
+"""Function that returns the areas and polar moments of triangles with given corners."""
 MeasuredShape = Callable[[FloatArray, FloatArray], TriangleShape]
-"""Function that returns triangle shapes from the corners and their standard deviations (rad)."""
+"""Function that returns the shapes of triangles with given corners and standard deviations (rad)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -421,7 +423,7 @@ def build_triangles(
 
 
 def locally_bright(pairs: PairTable, radius: float, rank: int) -> BoolArray:
-    """Return for each guide star (n,) whether fewer than `rank` brighter stars lie within `radius`, rad.
+    """Return, for each guide star (n,), whether fewer than `rank` brighter stars lie within `radius`, rad.
 
     The selected stars have about the same density in sparse and in dense regions of the sky.
     """
@@ -472,8 +474,8 @@ class GridTable:
 
     Attributes:
         radius: radius of the patterns, rad.
-        aligning: (n,) index of the neighbour that defines the orientation of each guide star's pattern; -1 if
-            none.
+        aligning: (n,) index of the neighbour that defines the orientation of each guide star's pattern, or -1
+            for a star without such a neighbour.
         begin: (cells + 1,) index of the first entry of each cell in `star`.
         star: (m,) indices of guide stars, ordered by cell.
     """
@@ -484,7 +486,7 @@ class GridTable:
     star: npt.NDArray[np.int32]
 
     def votes(self, cells: IntArray) -> IntArray:
-        """Return for each guide star (n,) how many of the given cells (k,) its grid pattern occupies."""
+        """Return, for each guide star (n,), how many of the given cells (k,) its grid pattern occupies."""
         place, _ = members(self.begin[cells], self.begin[cells + 1])
         return np.bincount(self.star[place], minlength=len(self.aligning))
 
@@ -557,7 +559,7 @@ class KnownSky:
     """Guide stars for a given field of view, with the tables of their pairs, triangles and grid patterns.
 
     Attributes:
-        index: search index of all guide stars, to whose indices identifications refer.
+        index: search index of all guide stars; the indices of stars in identifications refer to it.
         half_width: (2,) tangents of half the angles of the field of view.
         stars: guide stars brighter than the magnitude at which a field contains 24 guide stars on average.
     """

@@ -3,13 +3,14 @@
 The Harris response and the structure tensor are computed by `knightcube.vision.objects.streak_ends`.
 
 The detector of Trajkovic and Hedley (Fast corner detection, Image and Vision Computing 16, 1998) uses the
-diameters of a small circle around a pixel. At a corner the intensity changes along every diameter of the
-circle. The cornerness is therefore the minimum, over all directions, of the sum of the squared intensity
-changes from the centre to both ends of a diameter. Between two neighbouring diameters the intensity is
-interpolated linearly with a parameter t from 0 to 1. With the squared changes r and r' along two neighbouring
-diameters, the squared change between the diameters is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The
-coefficient B is a sum over the two pairs of neighbouring ends of the two diameters. The coefficient B1
-printed in Sease, eq. 3.12, is corrected, because it combines the wrong pairs of ends.
+diameters of a small circle around a pixel. At a corner of an image region, the intensity changes along every
+diameter of the circle. The cornerness is therefore the minimum, over all directions, of the sum of the
+squared intensity changes from the centre to both ends of a diameter. Between the ends of two neighbouring
+diameters, the intensity is interpolated linearly with a parameter t from 0 to 1. With the squared changes r
+and r' along two neighbouring diameters, the squared change between the diameters is A t^2 + 2 B t + C with C
+= r and A = r' - r - 2B. The coefficient B is a sum over the two pairs of neighbouring ends of the two
+diameters. The coefficient B1 printed in Sease, eq. 3.12, is corrected, because it combines the wrong pairs of
+ends.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from knightcube.reference.corner_streaks.settings import StreakSettings
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.streak_ends import StructureTensor, harris_cornerness, smoothed, tensor_of
 
-# Offsets (x, y) from the centre pixel to one end of each diameter, by number of neighbours.
+# Offsets (x, y) from the centre pixel to one end of each diameter, by the number of neighbour pixels.
 _DIAMETERS = {4: ((1, 0), (0, 1)), 8: ((1, 0), (1, 1), (0, 1), (-1, 1))}
 
 
@@ -96,7 +97,7 @@ def interpixel_response(image: FloatArray, neighbours: int) -> FloatArray:
     four neighbours, the minimum equals Sease, eq. 3.11, with the smaller of the coefficients B1 and B2 as B.
     """
     ring = _changes(image, neighbours)
-    # The neighbour of the last diameter is the first diameter with exchanged ends.
+    # The neighbour of the last diameter is the first diameter with swapped ends.
     following = [*ring[1:], _Changes(ring[0].behind, ring[0].ahead)]
     return np.asarray(np.min([_least_between(*pair) for pair in zip(ring, following, strict=True)], axis=0))
 

@@ -1,4 +1,4 @@
-"""Streak estimator based on corner detectors, as an object that a configuration can select."""
+"""Streak estimator based on corner detectors, in the form of a class that a configuration can select."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from knightcube.vision.streaks.streak_result import FrameMotion
 class CornerEstimator:
     """Streak estimator based on corner detectors.
 
-    The class implements `knightcube.vision.frame_job.StreakEstimator`. Only the methods import scipy, so that
-    a process which only forwards this object does not load scipy.
+    The class implements `knightcube.vision.frame_job.StreakEstimator`. The methods import scipy when they are
+    called, so that a process that only forwards the estimator does not load scipy.
     """
 
     settings: StreakSettings

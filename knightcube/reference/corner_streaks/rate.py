@@ -3,11 +3,11 @@
 The order of the two ends of a streak is initially unknown. All stars rotate about a common axis a, so that
 a.(v2 - v1) = 0 for the end directions v1 and v2 of each streak. The axis, except for its sign, is the
 direction that is most nearly perpendicular to all chords v2 - v1. The sign of a.(v1 x v2) then determines the
-order of the ends (Sease, eq. 3.17-3.19, corrected). The computation with unit vectors has no singularity,
-unlike a computation with the projected centre of rotation. OLAE computes the rotation, and a median-based
+order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike a computation with the projected centre of
+rotation, the computation with unit vectors has no singularity. OLAE computes the rotation, and a median-based
 scale of the residuals rejects outliers. The "Combined Indicator" of Sease uses the standard deviation of the
-residuals, which outliers increase. A single frame cannot distinguish omega from -omega, so that a prior rate
-must decide.
+residuals, which outliers increase. A single frame cannot distinguish the rate omega from -omega, so that a
+prior rate must determine the sign.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from knightcube.vision.objects.streak_ends import (
 )
 from knightcube.vision.streaks.streak_result import StreakStatus, admit, in_time, validate
 
-# Number of the strongest streaks, whose pairs are used to propose rotation axes.
+# Number of the strongest streaks, from whose pairs possible rotation axes are computed.
 _MOST_PROPOSERS = 24
 _PARALLEL = 1e-12
 # Minimum fraction of the measured streaks that must agree with the rotation.
 _LEAST_AGREEMENT = 0.5
-# Lower limit of the robust scale of the residuals, relative to the expected errors.
+# Lower limit of the robust standard deviation of the residuals, relative to the expected errors.
 _LEAST_SCALE = 0.3
 _MOST_ROUNDS = 10
 
@@ -58,13 +58,13 @@ def estimate_rate(
         pinhole: model of the camera.
         exposure: exposure time, s.
         settings: settings of the estimation.
-        prior_rate: (3,) prior body rate in camera axes, rad/s, which determines only the sense of rotation,
+        prior_rate: (3,) prior body rate in camera axes, rad/s, which only determines the sense of rotation,
             or None if unknown.
         prior_sigma: standard deviation of each component of the prior rate, rad/s.
         previous_checksum: checksum of the previous frame, by which a frozen camera is detected, or None.
 
-    Raises FlightError for an invalid frame, exposure or prior. The status of the result states why a frame
-    has no rate.
+    Raises FlightError for an invalid frame, exposure or prior. If no rate is found, the status of the result
+    states the reason.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = saturation_level(pixels, settings.saturation)
@@ -79,7 +79,7 @@ def estimate_rate(
         return in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
     typical = _typical_length(segmented.regions, settings)
     if typical < settings.least_length:
-        # The stars hardly move, so that the apparent streaks are blends of stars.
+        # The streaks are very short, so that apparent long streaks are blends of stars.
         return replace(result, status=StreakStatus.TOO_SHORT, length=typical)
     return result
 
@@ -87,7 +87,7 @@ def estimate_rate(
 def _rate(
     streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
 ) -> StreakResult:
-    """Return the streak result `seen` with the rate up to its sign, or with the reason of failure."""
+    """Return the streak result `seen` with the rate, whose sign is unknown, or with the reason of failure."""
     seen = replace(
         seen,
         endpoints=streaks.endpoints,
@@ -117,7 +117,7 @@ def _rate(
 
 
 def _typical_length(regions: Regions, settings: StreakSettings) -> float:
-    """Return the median length (px) of the brightest image regions, infinity for too few regions."""
+    """Return the median length (px) of the brightest regions, or infinity for too few regions."""
     if len(regions) < settings.least_streaks:
         return float("inf")
     brightest = np.argsort(-regions.flux, kind="stable")[: settings.most_streaks]
@@ -185,7 +185,8 @@ class RotationFit:
         endpoints: (n, 2, 2) end positions corrected for bias, px; the ends are ordered consistently for all
             streaks.
         used: (n,) whether each streak is used in the rotation.
-        residual: RMS error of one end, from the residuals of the used streaks (Sease, eq. 4.7), rad.
+        residual: RMS error of a streak end, computed from the residuals of the used streaks (Sease, eq. 4.7),
+            rad.
     """
 
     rotation_vector: FloatArray
@@ -235,7 +236,7 @@ def fit_rotation(
 def _consensus(
     endpoints: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Return flags (n,) of the streaks with reversed ends, and of the streaks that agree approximately."""
+    """Return flags (n,) of streaks with reversed ends, and flags (n,) of streaks that agree approximately."""
     vectors = pinhole.unit_vectors(endpoints)
     length = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1)
     allowed = np.maximum(settings.axis_tolerance, settings.outlier_sigmas * sigma)
@@ -253,8 +254,9 @@ def _reject_and_solve(
 ) -> tuple[OlaeSolution, BoolArray]:
     """Return the rotation and flags (n,) of the used streaks after iterative rejection of outliers.
 
-    In each iteration streaks are rejected or accepted again by their residuals, until the set of used streaks
-    does not change. Raises numpy.linalg.LinAlgError if the used streaks do not determine a rotation.
+    In each iteration, streaks are rejected, or accepted again, according to their residuals, until the set of
+    used streaks remains the same. Raises numpy.linalg.LinAlgError if the used streaks do not determine a
+    rotation.
     """
     weights = 1.0 / errors**2
     solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
@@ -286,7 +288,7 @@ def _motion_axes(sums: FloatArray, rodrigues: FloatArray) -> tuple[FloatArray, F
 
 
 def _arc_outward(endpoints: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return the image directions (n, 2, 2) along the arc that point outward at the ends of each streak."""
+    """Return the outward image directions (n, 2, 2) along the star's arc at both ends of each streak."""
     v = pinhole.unit_vectors(endpoints)
     velocity = -np.cross(rotation, v)
     image = velocity[..., :2] * v[..., 2:] - v[..., :2] * velocity[..., 2:]
@@ -303,9 +305,9 @@ def _covariance(
     """Return the covariance (3, 3) of the rotation vector, rad^2.
 
     The variances along and across the streaks are estimated separately from the residuals. Each variance is
-    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for the uncertainty of the variance
-    (Student's t distribution). The bias of the detector does not affect the residuals, so that the
-    uncertainty `endpoint_bias_sigma` of the bias is added.
+    multiplied by nu/(nu - 2), where nu is the number of degrees of freedom, to allow for the uncertainty of
+    the variance (Student's t distribution). The bias of the detector does not affect the residuals, so that
+    the uncertainty of the bias (`endpoint_bias_sigma`) is added separately.
     """
     weights = 1.0 / errors**2
     cross = cross_matrices(solution.sums)

@@ -30,7 +30,7 @@ class StreakSettings(EndpointSettings):
         axis_tolerance: tolerated error of an endpoint in the search for the rotation axis, px.
         outlier_sigmas: number of robust standard deviations above which a streak is rejected.
         worst_residual: largest accepted RMS residual of the endpoints, px. True streaks have residuals of at
-            most 0.6 px, and fragments that agree by chance have 1 to 4 px (campaign `streaks`).
+            most 0.6 px, and fragments that agree by chance have residuals of 1 to 4 px (campaign `streaks`).
         sign_sigmas: minimum prior rate along the rotation axis, in standard deviations of the prior rate, for
             which the prior decides the sense of rotation.
     """
@@ -53,9 +53,10 @@ class StreakSettings(EndpointSettings):
 
 _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
     # The endpoint biases for point spreads of 0.7 and 1.5 px are -0.14 and 0.40 px with Harris's detector.
-    # The biases for point spreads of 0.7 and 1.5 px are 0.34 and 0.71 px with the minimum eigenvalue.
-    # The endpoint biases for point spreads of 0.7 and 1.5 px are 1.23 and 1.68 px with Trajkovic-4.
-    # The endpoint biases for point spreads of 0.7 and 1.5 px are 0.93 and 1.24 px with Trajkovic-8.
+    # The endpoint biases for point spreads of 0.7 and 1.5 px are 0.34 and 0.71 px with the minimum
+    # eigenvalue. The endpoint biases for point spreads of 0.7 and 1.5 px are 1.23 and 1.68 px with
+    # Trajkovic-4. The endpoint biases for point spreads of 0.7 and 1.5 px are 0.93 and 1.24 px with
+    # Trajkovic-8.
     "harris": {},
     # The minimum eigenvalue is proportional to brightness^2, and Harris's response to brightness^4.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},

@@ -38,7 +38,8 @@ from knightcube.vision.startracker.solve import (
     solve_places,
 )
 
-# Minimum assumed error (px) of an endpoint, because small residuals of few streaks can be due to chance.
+# Lower limit of the assumed error (px) of an endpoint, because small residuals of few streaks can be due to
+# chance.
 _LEAST_SIGMA_PX = 0.02
 
 
@@ -101,7 +102,7 @@ def solve_ends(
     """Return the attitude at mid-exposure, and a streak result with the rate between start and end attitude.
 
     If the streaks cannot be identified, the streak result is returned unchanged. The covariance of the rate
-    is never changed, because it already describes the errors of the streak ends along and across the streaks.
+    is not changed, because it already describes the errors of the streak ends along and across the streaks.
 
     Args:
         found: streak result of the frame.
@@ -141,7 +142,7 @@ def _turn_to_vector(rotation: FloatArray) -> FloatArray:
     """Return the derivatives (3, 3) of the rotation vector with respect to an additional small rotation."""
     angle = float(np.linalg.norm(rotation))
     cross = cross_matrices(rotation[None])[0]
-    # For an angle of zero both terms of the coefficient diverge, but the coefficient has the limit 1/12.
+    # For an angle of zero both terms of the coefficient diverge, but their difference has the limit 1/12.
     second = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - 1.0 / (2.0 * angle * np.tan(0.5 * angle))
     return np.asarray(np.eye(3) + 0.5 * cross + second * cross @ cross)
 
@@ -161,8 +162,8 @@ def _scatter(both: TwoAttitudes, count: int) -> float:
     """Return the ratio of the observed variance of the residuals to the assumed variance.
 
     The fit of each attitude has two residual components per star and three parameters. The variance ratio is
-    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its uncertainty (Student's t
-    distribution).
+    multiplied by nu/(nu - 2), where nu is the number of degrees of freedom, to allow for the uncertainty of
+    the ratio (Student's t distribution).
 
     Args:
         both: attitudes at the start and end of the exposure.

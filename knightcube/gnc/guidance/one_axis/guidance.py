@@ -1,8 +1,8 @@
 """Guidance about one axis: checks plans, follows the last accepted path and then holds the end attitude.
 
-A plan is rejected if it is late, not finite, beyond the limits, out of order, for another target, or does not
-start at the estimated state. The rejection states the reason. A rejected plan does not change the commanded
-motion.
+A plan is rejected if it arrives late or out of order, contains values that are not finite, exceeds the
+limits, leads to another target, or does not start at the estimated state. The rejection states the reason. A
+rejected plan does not change the commanded motion.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 
 _CHECKED_POINTS = 600
 _SAME = 1e-6
-"""Largest accepted differences between the end of a path and the target, in the quaternion component q2 and
-in rate (rad/s)."""
+"""Largest accepted difference between the end of a path and the target, both in the quaternion component q2
+and in the rate (rad/s)."""
 
 
 class GuidanceState(StrEnum):
@@ -42,11 +42,11 @@ class AcceptanceRules:
     """The conditions for the acceptance of a plan.
 
     Attributes:
-        late_after: longest accepted time from the start of a plan's path to the arrival of the plan, s.
+        late_after: longest accepted delay of a plan, from the start time of its path to its arrival, s.
         angle_tolerance: largest difference between the start angle of a plan and the estimated angle, rad.
         rate_tolerance: largest difference between the start rate of a plan and the estimated rate, rad/s.
-        q2_limit: upper bound of |q2|; a relative excess of 1e-3 is accepted.
-        current_excess: largest relative excess over the plant's current limit anywhere on the path.
+        q2_limit: upper bound of |q2|, which a path may exceed by a relative amount of 1e-3.
+        current_excess: largest relative amount by which a path may exceed the plant's current limit.
     """
 
     late_after: float
@@ -100,7 +100,7 @@ class PathGuidance:
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path that is followed, or whose end attitude is held; None without one."""
+        """The path that is followed or whose end attitude is held; None without one."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
@@ -162,7 +162,7 @@ class PathGuidance:
         path = self._path
         if path is None:
             return None
-        # A control cycle asks several times for the same instant.
+        # A control cycle requests the sample of the same instant several times.
         if self._sampled is None or self._sampled[0] is not path or self._sampled[1] != now_ns:
             self._sampled = path, now_ns, path.sample(now_ns)
         return self._sampled[2]
@@ -178,7 +178,7 @@ class PathGuidance:
         return self.state(now_ns) is GuidanceState.FOLLOWING
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return whether an attitude other than the target is held because no plan arrived in time."""
+        """Return whether an attitude other than the target is held, because no new plan arrived in time."""
         if self._path is None or not self._path.has_ended(now_ns):
             return False
         if not self._arrives:

@@ -9,9 +9,9 @@ that the tracker can follow the planned path. Functions with singular names (`cu
 
 The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
 constant L/R of a coil, 0.1 ms, is short compared with the period, so the coil current is V/R while the
-H-bridge drives the coil, and otherwise zero. For a mean current I the supply delivers the power V |I| with V
-= R Imax, which heats the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady current, which
-equals V |I| times the duty cycle.
+H-bridge drives the coil, and otherwise zero. At a mean coil current I the supply delivers the power V |I|
+with V = R Imax, which is dissipated in the coil. The cost R I^2 of Sease, eq. (5.1), is the heat of a steady
+current, which equals V |I| times the duty cycle.
 
 The motion is discretised by the pseudospectral method of Sease, eq. (5.8). The n nodes are -1, 1 and the
 roots of P'(x), where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to
@@ -58,12 +58,13 @@ def steady_heat(current: FloatArray, resistance: float | FloatArray) -> FloatArr
 
 
 Q2_LIMIT = 0.68
-"""Largest |q2| of any path, at which cos(theta) is 0.075. At |q2| = 0.707 the coil has no torque."""
+"""Upper bound of |q2| of all paths; at this value cos(theta) is 0.075. At |q2| = 0.707 the coil has no
+torque."""
 
 
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
-"""Value of q2^2 at which the axis of the coil is parallel to the field and cos(theta) = 1 - 2 q2^2 is zero
-(Sease, eq. (5.15), corrected)."""
+"""Value of q2^2 at which the coil has no torque, because the coil axis is parallel to the field and
+cos(theta) = 1 - 2 q2^2 is zero (Sease, eq. (5.15), corrected)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +161,10 @@ def motion_of(
 def current_and_slopes(
     plant: SingleAxisPlant, q2: FloatArray, q2_rate: FloatArray, q2_acceleration: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the currents (n,), A, and the partial derivatives (n,) of the current by q2, q2' and q2''.
+    """Return currents (n,), A, and their partial derivatives (n,) with respect to q2, q2' and q2''.
 
-    The current follows from Sease, eq. (5.6), with the exact w' and with the torques of the suspension thread
-    and the disturbance.
+    The current follows from Sease, eq. (5.6), but with the exact w' and with the torques of the suspension
+    thread and the disturbance.
     """
     square = 1.0 - q2 * q2
     by_acceleration = 2.0 / np.sqrt(square)  # the derivative dw'/dq2'' equals dw/dq2'
@@ -208,7 +209,7 @@ class PathCost(StrEnum):
         return supply_power(current, plant.resistance * plant.current_limit)
 
     def smooth(self, plant: SingleAxisPlant, current: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the smoothed power (W) for currents (m,), A, and the derivative by the current (W/A)."""
+        """Return the smoothed power, W, for currents (m,), A, and the derivative of the power, W/A."""
         if self is PathCost.HEAT:
             pull = plant.resistance * current
             return pull * current, 2.0 * pull
@@ -254,7 +255,8 @@ def lgl_rule(count: int) -> LglRule:
     series = legendre.Legendre.basis(degree)
     inner = np.sort(np.real(series.deriv().roots()))
     slope, curvature = series.deriv(), series.deriv(2)
-    for _ in range(3):  # refines the eigenvalues of the companion matrix, which are accurate to 1e-12
+    # Three Newton steps refine the eigenvalues of the companion matrix, which are accurate to 1e-12.
+    for _ in range(3):
         inner = inner - slope(inner) / curvature(inner)
     nodes = np.concatenate([[-1.0], 0.5 * (inner - inner[::-1]), [1.0]])
 
@@ -284,7 +286,7 @@ class CubicPrey:
     def between(
         cls, start: float, start_slope: float, end: float, end_slope: float, horizon: float
     ) -> CubicPrey:
-        """Return the cubic from `start` to `end` in `horizon` s with given slopes q2' (1/s) at both ends."""
+        """Return the cubic from `start` to `end` in `horizon` s with the given end slopes q2', 1/s."""
         c2 = (3.0 * (end - start) - (2.0 * start_slope + end_slope) * horizon) / horizon**2
         c3 = (end_slope - start_slope - 2.0 * c2 * horizon) / (3.0 * horizon**2)
         return cls(start, start_slope, c2, c3)
@@ -299,7 +301,7 @@ class CubicPrey:
 
 
 FARTHEST = angle_of(Q2_LIMIT)
-"""Largest angle (rad) to which a path is continued at the end rate."""
+"""Largest angle (rad) up to which the commanded motion continues at the end rate after the end of a path."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,12 +371,13 @@ class PolynomialPath:
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> PathSample:
-        """Return the motion at `now_ns`: at rest before the start of the path, and coasting after the end."""
+        """Return the motion at `now_ns`: the initial motion before the path starts, a coast after it ends."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
             return self._coast(elapsed - self.horizon)
         s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
-        # Clenshaw's recurrence uses Python floats, which are faster than numpy arrays of twenty elements.
+        # Clenshaw's recurrence is computed with Python floats, which are faster than numpy arrays of twenty
+        # elements.
         twice = 2.0 * s
         a1 = a2 = b1 = b2 = c1 = c2 = 0.0
         for a, b, c in self.series[:-1]:

@@ -1,15 +1,15 @@
 """The planner of minimum-energy paths about one axis by virtual motion camouflage.
 
 The planner uses the method of Sease 2013, eqs. (5.8) to (5.15), with corrections. NLopt optimises the free
-path control parameters under |I| <= Imax and |q2| <= a bound at every time. If no path over the requested
-horizon (duration) keeps the limits, the horizon is stretched to the shortest feasible horizon, and the plan
-has the status STRETCHED. With a time cost, the horizon is optimised as well. Energy is the integral of R I^2
-in J, without the factor 1/2 of Sease, eq. (5.1).
+path control parameters under the limit |I| <= Imax of the current and an upper bound of |q2| at every time.
+If no path of the requested duration satisfies the limits, the duration is extended to the shortest feasible
+duration, and the plan has the status STRETCHED. If the duration has a cost, the duration is optimised as
+well. Energy is the integral of R I^2 in J, without the factor 1/2 of Sease, eq. (5.1).
 
-Every search for a horizon minimises energy plus time cost times horizon, between a shortest and a longest
-horizon. A time cost far above the power of the coil, with the requested horizon as lower bound, gives the
-requested horizon if it is feasible, and otherwise the shortest feasible horizon. The planner therefore never
-has to solve an infeasible nonlinear program.
+Every search for a duration (`horizon`) minimises energy plus time cost times duration, between a shortest and
+a longest duration. With a time cost far above the power of the coil, and the requested duration as lower
+bound, the result is the requested duration if it is feasible, and otherwise the shortest feasible duration.
+The planner therefore never has to solve an infeasible nonlinear program.
 
 The planner is deterministic, so that the same arguments give the same plan in any process.
 """
@@ -48,24 +48,24 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
 )
 
 ProgramAt = Callable[[float], PathProgram]
-"""Function from a horizon (s) to a nonlinear program whose variables are whitened about the prey path over
-this horizon."""
+"""Function that returns the nonlinear program for a duration (s), with variables whitened about the prey path
+of this duration."""
 
 SHORTEST_COST = 7.0
-"""Time cost, relative to the largest coil power R Imax^2, with which the shortest horizon is found. An
+"""Time cost, relative to the largest coil power R Imax^2, with which the shortest duration is found. An
 infinite time cost would give the bang-bang path, whose energy is up to 1 % above the optimum for the same
-horizon. With SHORTEST_COST, the horizon is about 0.3 % longer than the shortest horizon, and the energy is
+duration. With SHORTEST_COST, the duration is about 0.3 % longer than the shortest duration, and the energy is
 within 0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
-"""Largest factor by which a search with SHORTEST_COST may stretch a feasible requested horizon."""
+"""Largest factor by which a search with SHORTEST_COST may extend a feasible requested duration."""
 
 _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
 ALONG_LIMIT = 0.99
-"""Ratio of the largest current or |q2| of a path to the limit above which the path counts as running along
-the limit."""
+"""Ratio of the largest current or |q2| of a path to its limit, above which the path counts as reaching the
+limit."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
@@ -77,12 +77,12 @@ _TIME_COST_CHANGE = 0.03
 
 @dataclass(slots=True)
 class HorizonSearch:
-    """A search for a path and for the horizon (duration) of the path.
+    """A search for a path and for the duration of the path.
 
     Attributes:
-        program_at: function that returns the nonlinear program for a horizon, s.
-        warm: difference (N,) on the nodes between an earlier path and the prey path of the earlier problem,
-            for a warm start, or None for a start from the prey path.
+        program_at: function that returns the nonlinear program for a duration, s.
+        warm: difference (N,), on the nodes, between an earlier path and its prey path, for a warm start, or
+            None if the search starts from the prey path.
         evaluations: number of evaluations of the cost so far.
     """
 
@@ -93,9 +93,9 @@ class HorizonSearch:
     def within(self, asked: float, longest: float) -> tuple[PathProgram, Trial | None]:
         """Return the minimum-energy path over `asked` s, or over the shortest feasible time up to `longest`.
 
-        The current of a rest-to-rest slew over the horizon T scales with 1/T^2, so solutions without limits
-        give an estimate of the shortest feasible horizon. The nonlinear program with a free horizon starts
-        from this estimate. If the program has no solution, it is started again from a longer horizon.
+        The current of a rest-to-rest slew of duration T scales with 1/T^2, so solutions without limits give
+        an estimate of the shortest feasible duration. The nonlinear program with a free duration starts from
+        this estimate. If the program has no solution, the search is repeated from a longer duration.
         """
         if self.warm is not None:
             program = self.program_at(asked)
@@ -127,13 +127,13 @@ class HorizonSearch:
     def with_time_cost(
         self, guess: float, shortest: float, longest: float, time_cost: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path that minimises energy plus `time_cost` (W) times horizon, from a guess (s).
+        """Return the path that minimises energy plus `time_cost` (W) times duration, from a guess (s).
 
-        The derivative of the minimum energy by the horizon equals the partial derivative at the optimal path
-        (envelope theorem). A tried horizon is a lower bound of the optimum if a longer horizon reduces the
-        total cost, otherwise an upper bound. The next horizon T is chosen as if the energy were proportional
-        to 1/T^3, which holds for a slew without limits. Only the last of the solved programs imposes the
-        limits of current and angle.
+        The derivative of the minimum energy with respect to the duration equals the partial derivative at the
+        optimal path (envelope theorem). A tried duration is a lower bound of the optimum if a longer duration
+        reduces the total cost, and otherwise an upper bound. The next duration T is chosen as if the energy
+        were proportional to 1/T^3, which holds for a slew without limits. Only the last of the solved
+        programs imposes the limits of current and angle.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -175,11 +175,11 @@ class HorizonSearch:
     def _continued(
         self, failed: PathProgram, asked: float, longest: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return a path over at least `asked` s, by continuation from horizons at which a path was found.
+        """Return a path over at least `asked` s, by continuation from durations at which a path was found.
 
-        If the torque of the suspension thread exceeds the torque of the coil, only horizons that fit the free
-        oscillation of the body are feasible. From a horizon with a known path, the horizon is changed in
-        steps, each started from the last path. Shorter horizons are tried first.
+        If the torque of the suspension thread exceeds the torque of the coil, only durations that fit the
+        free oscillation of the body are feasible. From a duration with a known path, the duration is changed
+        in steps, and the search of each step starts from the last path. Shorter durations are tried first.
         """
         stretched: tuple[PathProgram, Trial] | None = None
         for factor in _ANCHORS:
@@ -203,7 +203,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program over `time` s, and the path within limits found from prey path + `apart`."""
+        """Return the program over `time` s, and a path within limits found from prey path plus `apart`."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
@@ -217,7 +217,7 @@ class HorizonSearch:
     def _resumed(self, program: PathProgram, warm: FloatArray, asked: float, longest: float) -> Trial | None:
         """Return the path found by a warm start, or None if the warm start fails.
 
-        If the earlier path ran along a limit, the limits are imposed at once.
+        If the earlier path reached a limit, the limits are imposed from the start.
         """
         start = program.beside_prey(warm, asked)
         worst = float(np.abs(program.ratios(start)).max())
@@ -240,14 +240,15 @@ class HorizonSearch:
 
 
 NODES = 24
-"""Number of nodes of a path. With 24 nodes, the relative error of the cost is below 1e-4 for horizons above
-1.1 times the shortest horizon, and a stretched horizon is at most 1.5 % too long. With 16 nodes, planning
-takes half the time and a stretched horizon is at most 2.5 % too long."""
+"""Number of nodes of a path. With 24 nodes, the relative error of the cost is below 1e-4 for durations above
+1.1 times the shortest duration, and an extended duration is at most 1.5 % too long. With 16 nodes, planning
+takes half the time and an extended duration is at most 2.5 % too long."""
 FINE_NODES = 40
-"""Number of nodes for paths that run along the current limit near the requested horizon. With 24 nodes the
-cost of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
+"""Number of nodes for paths that reach the current limit near the requested duration. With 24 nodes the cost
+of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
-"""Largest stretch of a horizon after which a path over the requested horizon is searched with more nodes."""
+"""Largest extension factor of a duration after which a path of the requested duration is searched with more
+nodes."""
 
 REFERENCE = 2.0
 MAX_STRETCH = 6.0
@@ -273,8 +274,9 @@ class StepPlan:
 
     Attributes:
         path: planned path, which starts at time zero until guidance sets the start time.
-        status: whether the requested horizon was kept or stretched to the shortest feasible horizon.
-        horizon_asked, horizon: requested and planned duration, s; equal with a time cost.
+        status: whether the requested duration was kept or extended to the shortest feasible duration.
+        horizon_asked, horizon: requested and planned duration, s; the values are equal if the duration has a
+            cost.
         energy: integral of R I^2 along the path, J.
         supplied: energy taken from the supply, which is the integral of V |I| along the path, J.
         peak_current: largest absolute coil current along the path, A.
@@ -330,16 +332,18 @@ def plan(
     """Return the minimum-energy path between two states in `horizon` s, or in the shortest feasible time.
 
     Rates are body rates in rad/s. The argument `reference` is the reference point q_r of Sease, eq. (5.10),
-    which must lie beyond the range of q2, and `q2_limit` is the upper bound of |q2|. The horizon is stretched
-    to at most `max_stretch` times the requested horizon. A stretched horizon is about 0.3 % longer than the
-    shortest feasible horizon on `nodes` nodes, and at most 1.5 % longer than the bang-bang time.
+    which must lie beyond the range of q2, and `q2_limit` is the upper bound of |q2|. The duration is extended
+    to at most `max_stretch` times the requested duration. An extended duration is about 0.3 % longer than the
+    shortest feasible duration on `nodes` nodes, and at most 1.5 % longer than the duration of the bang-bang
+    path.
 
-    With `time_cost` in W the path minimises energy plus `time_cost` times horizon. The optimised horizon is
-    between SHORTEST_WITH_TIME_COST s and `max_stretch` times `horizon`, and `horizon` is the initial guess.
-    The path followed until now is `last`, with an origin relative to the start of the new path. The initial
-    guess is the remaining part of `last`. The argument `cost` selects which energy is minimised.
+    If `time_cost`, W, is given, the path minimises energy plus `time_cost` times duration. The optimised
+    duration is between SHORTEST_WITH_TIME_COST s and `max_stretch` times `horizon`, which is the initial
+    guess. The argument `last` is the path followed until now, with an origin relative to the start of the new
+    path. The initial guess is the remaining part of the path `last`. The argument `cost` selects which energy
+    is minimised.
 
-    Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
+    Raises PlanningError if an argument is not finite or outside its limits, or if no permitted duration is
     feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
@@ -383,11 +387,12 @@ def plan(
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
-    """Return the difference (N,), on the nodes, between the rest of the path `last` and its prey path.
+    """Return the difference (N,), on the nodes, between the remaining path of `last` and its prey path.
 
-    None without a rest.
+    The result is None if nothing of the path remains.
 
-    If this difference is added to a second prey path, the sum has the boundary states of that prey path.
+    If the returned difference is added to a second prey path, the sum has the boundary states of the second
+    prey path.
     """
     if last is None:
         return None
@@ -478,10 +483,11 @@ def _check(
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """A planning job for a path between two states (q2 and rate, rad/s) in `horizon` s.
+    """A planning job for a path of `horizon` s between two states, which consist of q2 and rate (rad/s).
 
-    The job has a `number`, and the path starts at `origin_ns`. The path followed until now is `last`, with an
-    origin relative to `origin_ns`. The remaining attributes of a job are arguments of `plan`.
+    The job has a `number`, and the path starts at `origin_ns`. The attribute `last` is the path followed
+    until now, with an origin relative to `origin_ns`. The remaining attributes of a job are arguments of
+    `plan`.
     """
 
     number: int
@@ -536,8 +542,8 @@ def plan_step(
 
     The path is optimised by virtual motion camouflage (Sease 2013, eqs. (5.8) to (5.15)) with NLopt's SLSQP,
     under the current limit of the plant and |angle| <= 1.496 rad at every time, beyond which the coil has
-    almost no torque. If no path of the requested duration keeps the limits, the duration is stretched to the
-    shortest feasible duration, and the status of the plan is "stretched". A plan takes about 2 ms.
+    almost no torque. If no path of the requested duration satisfies the limits, the duration is extended to
+    the shortest feasible duration, and the status of the plan is "stretched". A plan takes about 2 ms.
 
     The method `plan.path.motion(times)` returns angle, rate and acceleration at times (n,), s after the
     start. The method `plant.currents` returns the coil currents for this motion.
@@ -546,7 +552,7 @@ def plan_step(
         plant: model with inertia, torque constant, coil and thread.
         start_angle: angle at the start, rad, measured from the direction of the largest torque.
         end_angle: angle at the end, rad.
-        horizon: duration, s; with `time_cost` the initial guess of the duration.
+        horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
         time_cost: cost of time, W; the duration is then optimised for minimum energy plus `time_cost` times

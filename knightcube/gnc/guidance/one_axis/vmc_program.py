@@ -2,20 +2,20 @@
 
 A path has the values q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey path and q_r the reference
 point (Sease, eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through the values on the
-nodes, so q2', q2'' and the current are exact between nodes too. The path control parameter v is 1 at both
+nodes, so q2', q2'' and the current are also exact between nodes. The path control parameter v is 1 at both
 ends. The path control parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q, with the
 differentiation matrix D (Sease, eq. (5.11), corrected). N - 4 path control parameters are free.
 
-The prey path is an affine function of the horizon T, and for a fixed prey path the path is an affine function
-of v - 1. Paths are therefore parametrised as prey(T) + M y with a matrix M and parameters y. Each column of
-the matrix M is a whitened change of the path, scaled by (q_p - q_r), that preserves the values and slopes at
-both ends. Trajectories are therefore affine functions of the optimisation variables, and the variables are
-well conditioned.
+The prey path is an affine function of the duration T (`horizon`), and for a fixed prey path the path is an
+affine function of v - 1. Paths are therefore parametrised as prey(T) + M y with a matrix M and parameters y.
+Each column of the matrix M is a whitened change of the path, scaled by (q_p - q_r), that preserves the values
+and slopes at both ends. Trajectories are therefore affine functions of the optimisation variables, and the
+variables are well conditioned.
 
-Two programs share cost and limits: minimum energy at a fixed horizon, and minimum energy plus the time cost
-of the horizon. The limits hold at every time and not only at the nodes. The limits are imposed at those
-points of a dense grid at which the previous solution exceeded a limit, until no limit is exceeded (the
-exchange method of semi-infinite programming).
+Two programs have the same energy and limits: one minimises the energy for a fixed duration, the other
+minimises the energy plus the time cost of a free duration. The limits hold at every time and not only at the
+nodes. The limits are imposed at those points of a dense grid at which the previous solution exceeded a limit,
+until no limit is exceeded (the exchange method of semi-infinite programming).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ DENSE_POINTS = 769
 
 @dataclass(frozen=True, slots=True)
 class SamplePoints:
-    """Points (m,) at which paths are evaluated, with matrices (3, m, N) that give q2, q2' and q2'' there."""
+    """Points (m,) with matrices (3, m, N) that map values on the nodes to q2, q2' and q2'' at the points."""
 
     points: FloatArray
     matrices: FloatArray
@@ -69,8 +69,8 @@ class Discretisation:
         cost: evaluation matrices on the 2 N nodes on which the energy is integrated. With only N nodes, the
             optimiser would exploit the quadrature error, because I^2 has about twice the degree of the path.
         cost_weights: quadrature weights (2 N,) of the energy, whose sum is 2.
-        dense: evaluation matrices at the points at which limits are checked; the points are denser towards
-            the ends, like the extrema of polynomials.
+        dense: evaluation matrices at the points at which limits are checked; like the extrema of polynomials,
+            the points are denser towards the ends.
         free: matrix (N, N - 4) that maps changes at the free nodes to changes at all nodes that preserve
             values and slopes at both ends.
     """
@@ -115,12 +115,13 @@ class BoundaryStates:
 
 @dataclass(frozen=True, slots=True)
 class PathFamily:
-    """The family of paths between two states on N nodes: still + T * drift + basis @ y for parameters y.
+    """The paths still + T * drift + basis @ y of duration T between two states on N nodes, parameters y.
 
     Attributes:
         grid: pseudospectral discretisation of the paths.
-        still: part (N,) of the prey path with zero slopes at both ends, which does not depend on the horizon.
-        drift: change (N,) of the prey path per second of horizon, due to the slopes at both ends.
+        still: part (N,) of the prey path with zero slopes at both ends, which does not depend on the
+            duration.
+        drift: change (N,) of the prey path per second of duration, due to the slopes at both ends.
         basis: change (N, N - 4) of the values on the nodes per unit of each parameter.
     """
 
@@ -165,7 +166,7 @@ class PathFamily:
 
 @dataclass(frozen=True, slots=True)
 class ObservedFamily:
-    """A path family at m points: q2 and derivatives by scaled time, affine in horizon and parameters."""
+    """A path family at m points: q2 and its derivatives by scaled time, affine in duration and parameters."""
 
     still: FloatArray
     drift: FloatArray
@@ -176,32 +177,32 @@ class ObservedFamily:
         return time_scale(horizon) * (self.still + horizon * self.drift + self.basis @ parameters)
 
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
-        """Return the derivative (3, m) of q2, q2' and q2'' with respect to the horizon.
+        """Return the derivative (3, m) of q2, q2' and q2'' with respect to the duration.
 
-        A longer horizon changes the prey path, and reduces the factors that convert derivatives by the scaled
-        time s to time derivatives.
+        A longer duration changes the prey path, and reduces the factors that convert derivatives with respect
+        to the scaled time s to time derivatives.
         """
         slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
         return np.asarray(self.drift + slower * trajectory)
 
 
 def time_scale(horizon: float) -> FloatArray:
-    """Return the factors (3, 1) that convert derivatives by s in [-1, 1] to time derivatives."""
+    """Return the factors (3, 1) that convert derivatives with respect to s in [-1, 1] to time derivatives."""
     per_second = 2.0 / horizon
     return np.array([[1.0], [per_second], [per_second * per_second]])
 
 
 LIMIT_TOLERANCE = 3e-4
-"""Largest accepted relative excess over a limit on the dense grid. Between the grid points, the relative
-excess then stays below 1e-3."""
+"""Largest relative amount by which a path may exceed a limit on the dense grid. Between the points of the
+dense grid, the relative excess then stays below 1e-3."""
 
 IMPOSED_MARGIN = 2e-4
-"""Relative margin by which an imposed limit is tightened, so that peaks between the imposed points keep the
-limit. Without this margin of the imposed limits, the exchange method converges slowly."""
+"""Relative margin by which an imposed limit is tightened, so that peaks between the imposed points do not
+exceed the limit. Without this margin of the imposed limits, the exchange method converges slowly."""
 
 SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
-"""Exceptions of a run of NLopt that ends without a result. NLopt 2.11 raises `nlopt.runtime_error`, and older
-versions raise Python's RuntimeError."""
+"""Exceptions with which a run of NLopt ends without a result. NLopt 2.11 raises `nlopt.runtime_error`, and
+older versions raise Python's RuntimeError."""
 CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 """Results of converged runs of NLopt."""
 _EXCHANGES = 10
@@ -213,7 +214,7 @@ _IMPOSE_EVERY = 16
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A point of the search space: the parameters (N - 4,) of a path and the horizon (s) of the path."""
+    """A point of the search space: the parameters (N - 4,) of a path and the duration (s) of the path."""
 
     parameters: FloatArray
     horizon: float
@@ -221,7 +222,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class FreeHorizon:
-    """Settings for optimising the horizon as well: bounds of the horizon (s) and time cost (W)."""
+    """Settings for the optimisation of the duration: bounds of the duration (s) and time cost (W)."""
 
     shortest: float
     longest: float
@@ -241,7 +242,7 @@ class ImposedLimits:
         """Return the limits to impose at the points that the mask `chosen` (2, dense) selects.
 
         The first row of the mask selects limits of the current and the second row limits of q2. The signs of
-        `ratios` (2, dense) tell whether the upper or the lower limit is imposed.
+        `ratios` (2, dense) determine whether the upper or the lower limit is imposed.
         """
         row, index = np.nonzero(chosen)
         return cls(index, np.sign(ratios[row, index]), row == 1)
@@ -251,8 +252,8 @@ class PathProgram:
     """The nonlinear program for a plant and a family of paths between two states, with cost and limits.
 
     Attributes:
-        family: paths between the two states, with parameters whitened about the prey path over the given
-            horizon.
+        family: paths between the two states, with parameters whitened about the prey path of the given
+            duration.
         evaluations: number of evaluations of the cost, over all solutions.
     """
 
@@ -266,7 +267,8 @@ class PathProgram:
     ) -> None:
         self._plant = plant
         self._cost = cost
-        # The ends of the path are given, so an end close to the limit of q2 reduces the margin.
+        # The ends of the path are given, so the margin to the limit of q2 is smaller if an end is close to
+        # the limit.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
         # Iterates of the optimiser may exceed |q2| = 0.707, where the computed current is infinite.
         # A value of q2 above the limit is clamped, so that the current stays finite.
@@ -305,7 +307,7 @@ class PathProgram:
         return family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
 
     def _current(self, trajectory: FloatArray, horizon: float) -> tuple[FloatArray, FloatArray]:
-        """Return currents (m,) and the derivatives (3, m) of the current by q2, dq2/ds and d2q2/ds2."""
+        """Return currents (m,), and their derivatives (3, m) with respect to q2, dq2/ds and d2q2/ds2."""
         q2 = trajectory[0]
         held = np.minimum(np.maximum(q2, -self._q2_cap), self._q2_cap)
         current, *slopes = current_and_slopes(self._plant, held, trajectory[1], trajectory[2])
@@ -315,7 +317,7 @@ class PathProgram:
         return current, stacked
 
     def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
-        """Return the energy (J), the gradient (N - 4,) of the energy, and the derivative by the horizon.
+        """Return the energy (J), its gradient (N - 4,), and its derivative with respect to the duration.
 
         For heat, the integral is that of Sease, eq. (5.8), without the factor 1/2 of eq. (5.1).
         """
@@ -338,7 +340,7 @@ class PathProgram:
     def excess(
         self, limits: ImposedLimits, points: ObservedFamily, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return excesses (m,) over limits, with gradients (m, N - 4) and derivatives (m,) by horizon."""
+        """Return excesses (m,) over limits, their gradients (m, N - 4), and derivatives (m,) by duration."""
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
         value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
@@ -360,13 +362,13 @@ class PathProgram:
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def from_prey(self, trial: Trial) -> FloatArray:
-        """Return the difference (N,) on the nodes between a path and the prey path of the same horizon."""
+        """Return the difference (N,) on the nodes between a path and the prey path of the same duration."""
         return np.asarray(self.family.basis @ trial.parameters)
 
     def unlimited(self, start: Trial) -> Trial | None:
-        """Return the minimum-energy path over the horizon of `start` without limits.
+        """Return the minimum-energy path without limits that has the duration of `start`.
 
-        None if none is found.
+        The result is None if no path is found.
         """
         trial, converged = self._minimise(start, None, None)
         if converged:
@@ -379,7 +381,7 @@ class PathProgram:
     def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
         """Return the minimum-energy path within the limits, from `start`; None when none was found.
 
-        If `free` is given, the horizon is optimised too, and the time cost is added to the energy.
+        If `free` is given, the duration is also optimised, and the time cost is added to the energy.
         """
         ratios = self.ratios(start)
         every = np.arange(ratios.shape[1]) % _IMPOSE_EVERY == _IMPOSE_EVERY // 2
@@ -400,7 +402,7 @@ class PathProgram:
         return None
 
     def _energy_tolerance(self, horizon: float) -> float:
-        """Return the tolerance of the energy (J): 1e-8 of the energy that the largest current takes."""
+        """Return the tolerance of the energy (J): 1e-8 of the energy at the largest current."""
         return 1e-8 * self._bang * horizon
 
     def _minimise(
@@ -425,7 +427,7 @@ class PathProgram:
 
         solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
         solver.set_min_objective(objective)
-        # A relative tolerance of 1e-5 of the objective determines a free horizon to 0.01 % or better.
+        # A relative tolerance of 1e-5 of the objective determines a free duration to 0.01 % or better.
         origin = variables.origin
         solver.set_ftol_abs(_FREE_TOLERANCE * time_cost * origin if free else self._energy_tolerance(origin))
         solver.set_maxeval(_EVALUATIONS)
@@ -456,14 +458,14 @@ class PathProgram:
 
 
 class _Variables:
-    """The optimisation variables: path parameters and, if free, the scaled logarithm of the horizon.
+    """The optimisation variables: path parameters and, if free, the scaled logarithm of the duration.
 
     The logarithm log(T/T0) is scaled so that the time cost has, like the whitened energy, a curvature of
     about one.
 
     Attributes:
         first: initial values of the variables.
-        root: scale factor of the logarithm of the horizon; zero for a fixed horizon.
+        root: scale factor of the logarithm of the duration; zero for a fixed duration.
     """
 
     def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:
@@ -473,12 +475,12 @@ class _Variables:
         self.first = np.append(start.parameters, 0.0) if free else start.parameters
 
     def trial(self, x: FloatArray) -> Trial:
-        """Return the parameters and the horizon of the path that the variables `x` describe."""
+        """Return the parameters and the duration of the path that the variables `x` describe."""
         horizon = self.origin * math.exp(self.root * x[self.size]) if self.free else self.origin
         return Trial(x[: self.size].copy(), horizon)
 
     def bound(self, solver: nlopt.opt) -> None:
-        """Set the bounds of a free horizon in the optimiser `solver`."""
+        """Set the bounds of a free duration in the optimiser `solver`."""
         if self.free is not None:
             bounds = self.free.shortest, self.free.longest
             low, high = (math.log(bound / self.origin) / self.root for bound in bounds)
@@ -488,7 +490,7 @@ class _Variables:
 
 
 def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return the chain-rule gradients (m, n) from slopes (3, m) by q2, q2', q2'' and their derivatives."""
+    """Return chain-rule gradients (m, n) from slopes (3, m) by q2, q2', q2'', and the slopes of these."""
     return np.asarray((slopes[:, :, None] * basis).sum(axis=0))
 
 

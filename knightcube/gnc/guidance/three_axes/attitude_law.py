@@ -2,15 +2,15 @@
 
 An attitude law aligns one body axis exactly with a first direction, and a second body axis with a second
 direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, fixed in the
-orbital axes (nadir, velocity, orbit normal), or point to the Sun or to a place on the ground. If the roll is
+orbital axes (nadir, velocity, orbit normal), or point to the Sun or to a point on the ground. If the roll is
 free, the second direction follows from the attitude at which the attitude law begins. The second direction is
 then fixed in the same axes, inertial or orbital, as the first direction, so that the body does not rotate
 about the first direction.
 
-The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
-direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
-given roll is an additional rotation about the pointing axis. A free roll is the roll of the body when the
-attitude law begins.
+The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
+`across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
+the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
+A free roll is the roll of the body when the attitude law begins.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTar
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 """Function from an ephemeris and times (n,) in s to unit vectors (n, 3), ICRS."""
 DIFFERENCE = 1.0
-"""Time step of the central differences that give rate and acceleration, s."""
+"""Time step (s) of the central differences by which rate and acceleration are computed."""
 MINIMUM_SINE = 1e-3
 """Smallest sine of the angle between the two directions; nearly parallel directions do not determine the
 roll."""
@@ -76,7 +76,7 @@ class AttitudeReferences:
     acceleration: FloatArray
 
     def position(self, time: float) -> tuple[int, float]:
-        """Return the index of the last instant before a time, s, and the fraction of the step passed."""
+        """Return the index of the last instant before a time, s, and the elapsed fraction of the step."""
         begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
         position = (time - begin) / step
         k = min(max(math.floor(position), 0), len(self.times) - 2)
@@ -219,7 +219,7 @@ def free_roll(
 
 
 def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
-    """Return the function for the direction to an object that moves on a straight line.
+    """Return the function for the direction to an object that moves on a straight line relative to the body.
 
     At the time `since`, s, the object is in `direction` (3,). The relative velocity of the object divided by
     the distance is `velocity` (3,), 1/s, which is zero for a fixed direction.
@@ -236,7 +236,8 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
 
-    The law starts with the attitude (4,) after the shortest rotation that aligns `axis` with `direction`.
+    The law starts with the given attitude (4,), changed by the shortest rotation that aligns `axis` with
+    `direction`.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)
@@ -289,7 +290,7 @@ def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArra
     """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
     cosine = float(start @ end)
-    if cosine < -1.0 + 1e-9:  # any normal axis rotates a direction into the opposite direction
+    if cosine < -1.0 + 1e-9:  # for opposite directions, any axis normal to them is suitable
         return vector
     return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
 

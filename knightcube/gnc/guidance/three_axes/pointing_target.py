@@ -1,7 +1,7 @@
 """Pointing targets that a configuration or a command can give a satellite.
 
-A target is an immutable value that configurations, packets and jobs contain. The module `attitude_law`
-computes the attitude law of a target.
+A target is an immutable value, which is used in configurations, packets and planning jobs. The module
+`attitude_law` computes the attitude law of a target.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from enum import IntEnum
 from knightcube.errors import UsageError
 
 _LENGTH = 1e-3
-"""Largest accepted deviation of the length of a commanded quaternion from one."""
+"""Largest accepted difference between the length of a commanded quaternion and one."""
 
 
 class Goal(IntEnum):
     """The pointing goals, with the values that represent them in the command packet.
 
-    The goals NADIR, VELOCITY and SUN have no arguments, INERTIAL has a quaternion, and GROUND has latitude
-    and longitude.
+    The goals NADIR, VELOCITY and SUN have no arguments, INERTIAL has a quaternion, GROUND has latitude and
+    longitude, and OBJECT has no arguments or right ascension and declination.
     """
 
     NADIR = 0
@@ -48,14 +48,15 @@ class Goal(IntEnum):
 
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
-"""Permitted numbers of arguments for goals that have arguments, the largest number last."""
+"""Permitted numbers of arguments of each goal that has arguments; the largest number is the last."""
 _RIGHT = 0.5 * math.pi
 ARGUMENTS: Mapping[Goal, tuple[tuple[str, str, float, float], ...]] = {
     Goal.INERTIAL: tuple((f"quaternion {axis}", "-", -1.0, 1.0) for axis in "xyzw"),
     Goal.GROUND: (("latitude", "rad", -_RIGHT, _RIGHT), ("longitude", "rad", -math.pi, 2.0 * math.pi)),
     Goal.OBJECT: (("right ascension", "rad", 0.0, 2.0 * math.pi), ("declination", "rad", -_RIGHT, _RIGHT)),
 }
-"""Name, unit and range of each argument of the goals that have arguments, for forms and documents."""
+"""Name, unit, minimum and maximum of each argument of the goals that have arguments, for forms and
+documents."""
 ROLLS = {
     Goal.INERTIAL: "an inertial attitude includes its roll: omit the roll",
     Goal.OBJECT: "an object is tracked with a free roll: omit the roll",

@@ -7,9 +7,9 @@ are
     q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
 
 The vector d is the sum of the torques of `knightcube.astro.earth.disturbance`: a constant torque in body
-axes, and the torques c x A(q) v by air and sunlight, which depend on the attitude. The torque of the coils
-has no component along the field, so not every path is feasible. All derivatives are analytic, because A(q) v
-is a quadratic form of q whose second derivatives are twice Davenport's matrix.
+axes, and the aerodynamic and solar radiation torques c x A(q) v, which depend on the attitude. The torque of
+the coils has no component along the field, so not every path is feasible. All derivatives are analytic,
+because A(q) v is a quadratic form of q whose second derivatives are twice Davenport's matrix.
 
 Paths are cubic Hermite curves (de Boor 1978, chapter IV), evaluated here because scipy.interpolate would take
 20 MiB of memory in each process that flies or plans a slew.
@@ -46,14 +46,14 @@ _AXES = np.arange(3)
 
 
 def heat_matrix(weights: FloatArray) -> FloatArray:
-    """Return the matrix (3, 3) of heating powers that are given as a matrix or as its diagonal (3,)."""
+    """Return the matrix (3, 3) of heating powers, which are given as a matrix or as its diagonal (3,)."""
     return np.diag(weights) if weights.ndim == 1 else weights
 
 
 def mean_squares(dipoles: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the means (k,) of m' W m over the k intervals between dipoles m (k + 1, 3).
+    """Return the means (k,) of m' W m over each of the k intervals between dipoles m (k + 1, 3).
 
-    Within an interval, the dipole is linear. W is the matrix `weights` (3, 3).
+    Within an interval, the dipole is a linear function of time. W is the matrix `weights` (3, 3).
     """
     left, right = dipoles[:-1], dipoles[1:]
     return np.asarray(((left @ weights) * (left + right) + (right @ weights) * right).sum(axis=1) / 3.0)
@@ -68,7 +68,7 @@ class SlewCraft:
         limit: dipole limit (3,) along each body axis, A m^2.
         weights: heating power per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         residual: residual dipole moment (3,) of the satellite, A m^2.
-        torque, air, light: sizes (3,) of the torques that are constant, due to air, and due to sunlight, N m.
+        torque, air, light: components (3,) of the constant, aerodynamic and solar radiation torque, N m.
     """
 
     inertia: FloatArray
@@ -80,7 +80,7 @@ class SlewCraft:
     light: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def facing(self, sizes: FloatArray) -> SlewCraft:
-        """Return the satellite model with disturbance torques of the given sizes (9,), N m."""
+        """Return the satellite model with the disturbance torque components `sizes` (9,), N m."""
         return replace(self, torque=sizes[CONSTANT], air=sizes[AIR], light=sizes[LIGHT])
 
 
@@ -91,7 +91,8 @@ class SlewEnvironment:
     Attributes:
         field: (n, 3) T.
         position: (n, 3) m.
-        pressures: pressures of air and sunlight, or None if torques by air and sunlight are not modelled.
+        pressures: pressure vectors of air and sunlight, or None if aerodynamic and solar radiation torques
+            are not modelled.
     """
 
     field: FloatArray
@@ -126,7 +127,7 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the second derivatives (n, 4, 4) by q of the products of `pull` (n, 3) and A(q) v.
+    """Return the second derivatives (n, 4, 4), by q, of the scalar products of `pull` (n, 3) and A(q) v.
 
     The second derivatives are twice Davenport's matrices.
     """
@@ -140,7 +141,7 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 class SlewDynamics:
-    """The equations of motion of a satellite at n times, in units of `scale` s and of `unit` A m^2.
+    """The equations of motion of a satellite at n times, with times in `scale` s and dipoles in `unit` A m^2.
 
     The state derivative x' is a constant plus the quadratic form z^T H z / 2 of z = (m + residual, b, e, w,
     q), where b and e are quadratic in q. One matrix product therefore gives the derivatives at all times at
@@ -148,7 +149,7 @@ class SlewDynamics:
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
-        """Store the environment; scale the direction of the position by the root of the gravity gradient."""
+        """Store the environment, with the position direction scaled by the root of the gravity gradient."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
         vectors = np.stack(
@@ -179,7 +180,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def slopes(self, x: FloatArray, m: FloatArray) -> FloatArray:
-        """Return the derivatives (n, 7, 10) of the state derivatives x' by states and dipoles."""
+        """Return the derivatives (n, 7, 10) of x' with respect to states and dipoles."""
         z, turned = self._quantities(x, m)
         result = self._steepness(z) @ self._by_unknowns(turned)
         result[:, 4:, :4] += (self._pushes @ x[:, None, :4, None])[:, :, :, 0]
@@ -197,7 +198,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z = (m + residual, b, e, w, q) (n, 16), and derivatives (n, 6, 4) of b and e by q."""
+        """Return z = (m + residual, b, e, w, q) (n, 16), and the derivatives (n, 6, 4) of b and e by q."""
         z, q = np.empty((len(x), _Z)), x[:, :4]
         turned = (self._forms.reshape(-1, 24, 4) @ q[:, :, None]).reshape(-1, 6, 4)
         z[:, _M], z[:, _W], z[:, _Q] = m + self._residual, x[:, 4:], q
@@ -205,11 +206,11 @@ class SlewDynamics:
         return z, turned
 
     def _steepness(self, z: FloatArray) -> FloatArray:
-        """Return the derivatives (n, 7, 16) of the state derivatives x' by the vectors z (n, 16)."""
+        """Return the derivatives (n, 7, 16) of x' with respect to the vectors z (n, 16)."""
         return np.asarray((z @ self._quadratic.reshape(-1, _Z).T).reshape(-1, 7, _Z))
 
     def _by_unknowns(self, turned: FloatArray) -> FloatArray:
-        """Return the derivatives (n, 16, 10) of the vectors z by states and dipoles.
+        """Return the derivatives (n, 16, 10) of the vectors z with respect to states and dipoles.
 
         The next call overwrites the returned array.
         """
@@ -223,7 +224,7 @@ _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
 def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
-    """Return the second derivatives (n, 3, 4, 4) of air and sunlight accelerations by the attitude."""
+    """Return second derivatives (n, 3, 4, 4), by attitude, of the accelerations due to air and sunlight."""
     count = len(around.field)
     result = np.zeros((count, 3, 4, 4))
     if around.pressures is not None:
@@ -235,9 +236,9 @@ def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return the symmetric matrices H (7, 16, 16) of the quadratic form z^T H z / 2 in x'."""
+    """Return the symmetric matrices H (7, 16, 16) of the quadratic forms z^T H z / 2 in x'."""
     result = np.zeros((7, _Z, _Z))
-    crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is component i of a x c
+    crossed = -cross_matrices(_EYE3)  # a . crossed[i] c is component i of a x c
     result[:3, _Q, _W][:, :3] = 0.5 * crossed
     result[_AXES, 15, 9 + _AXES] = 0.5
     result[3, 12 + _AXES, 9 + _AXES] = -0.5
@@ -296,7 +297,7 @@ class HermiteCubic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewPath:
-    """The path of a slew, given at times from zero on and interpolated by the cubics of the collocation.
+    """The path of a slew, given at times that begin with zero and interpolated by the collocation cubics.
 
     Attributes:
         times: (n,) s.
@@ -377,7 +378,7 @@ class Cone:
 
 
 class ConeConstraints:
-    """Exclusion cones at n times, as inequalities g >= 0 for the attitude.
+    """Exclusion cones at n times, expressed as inequalities g >= 0 for the attitude.
 
     The constraint value g is the cosine of the cone's half angle minus the cosine of the angle between body
     axis and direction. Each inequality is a quadratic form of the attitude quaternion.
@@ -395,14 +396,14 @@ class ConeConstraints:
             -shown_curvature(np.broadcast_to(cone.axis, (size, 3)), cone.direction(times)) for cone in cones
         ]
         self.curvatures = np.array(found).reshape(self.count, size, 4, 4)
-        """Second derivative (cones, n, 4, 4) of the cone constraints by the attitude."""
+        """Second derivatives (cones, n, 4, 4) of the cone constraints with respect to the attitude."""
 
     def values(self, q: FloatArray) -> FloatArray:
         """Return the values g (cones, n) at attitudes (n, 4), or g (m, cones, n) for m paths (m, 1, n, 4)."""
         return np.asarray(self._limits + 0.5 * np.sum(self.slopes(q) * q, axis=-1))
 
     def slopes(self, q: FloatArray) -> FloatArray:
-        """Return the derivatives (cones, n, 4) of the inequalities g by the attitude."""
+        """Return the derivatives (cones, n, 4) of the constraints g with respect to the attitude."""
         return np.asarray((self.curvatures @ q[..., None])[..., 0])
 
 
@@ -414,11 +415,11 @@ class AttitudeEnd:
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return True, because an attitude with zero error is always the target attitude."""
+        """Return True, because only the target attitude has a zero error."""
         return True
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return linear part (3, 4) and quadratic part (3, 4, 4) of the attitude error by the quaternion q.
+        """Return the linear part (3, 4) and the quadratic part (3, 4, 4), in q, of the attitude error.
 
         The error is the vector part of the product of q and the inverse of the target.
         """
@@ -443,7 +444,7 @@ class BoresightEnd:
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return linear (2, 4) and quadratic part (2, 4, 4), in q, of the sines of the pointing error."""
+        """Return the linear (2, 4) and quadratic part (2, 4, 4), in q, of the sines of the pointing error."""
         across = tangent_basis(self.axis)
         return np.zeros((2, 4)), shown_curvature(across, np.broadcast_to(self.direction, (2, 3)))
 
@@ -470,7 +471,7 @@ class EndConditions:
         return np.asarray(self._linear @ x + 0.5 * (self._forms @ x[:4]) @ x[:4])
 
     def slope(self, x: FloatArray) -> FloatArray:
-        """Return the derivatives (n, 7) of the errors by the state."""
+        """Return the derivatives (n, 7) of the errors with respect to the state."""
         result = self._linear.copy()
         result[:, :4] += self._forms @ x[:4]
         return result
@@ -485,8 +486,8 @@ def along(
 ) -> EnvironmentAt:
     """Return the environment of a slew that starts `begin` s after the start of the ephemeris.
 
-    If `areas` (3,) and `path` are given, the environment includes the pressures of air and sunlight on the
-    areas that a body on this path exposes.
+    If `areas` (3,) and `path` are given, the environment includes the pressure vectors of air and sunlight
+    for the areas that a body on this path exposes.
     """
 
     def around(times: FloatArray) -> SlewEnvironment:
@@ -502,7 +503,8 @@ def along(
 def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float) -> tuple[Cone, ...]:
     """Return the exclusion cones of a body `axis` (3,), one for each of `angles`, rad.
 
-    The names are `sun` and `moon`, measured from the centre, and `earth`, measured from the limb.
+    The keys of `angles` are `sun` and `moon`, with half angles from the centre, and `earth`, with an angle
+    from the limb.
     """
     date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
     moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)
@@ -537,7 +539,7 @@ _DEEP, _STILL = math.radians(5.0), 1e-4
 """Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected, and rate (rad/s)
 below which an end attitude counts as inertially fixed."""
 MINIMUM_TIME = math.inf
-"""Value of the time cost with which only the duration is minimised."""
+"""Value of `time_cost` that requests a minimum-time slew, for which only the duration is minimised."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -549,10 +551,10 @@ class SlewTask:
         along: function that returns the environment at times (n,), s after the start of the slew.
         quaternion, rate: attitude (4,) from ICRS into body axes and body rate (3,), rad/s, at the start.
         end: end conditions as a function of the slew's duration.
-        horizon, longest: requested and longest permitted duration, s. The slew is stretched if no path of the
-            requested duration is found.
-        time_cost: weight of the duration in the cost, W. With None the duration is fixed, and with
-            MINIMUM_TIME only the duration is minimised.
+        horizon, longest: requested and longest permitted duration, s. The duration is extended if no path of
+            the requested duration is found.
+        time_cost: weight of the duration in the cost, W. If the time cost is None, the duration is fixed; if
+            it is MINIMUM_TIME, only the duration is minimised.
         cones: exclusion cones that are avoided during the whole slew.
         nodes: number of collocation intervals.
     """

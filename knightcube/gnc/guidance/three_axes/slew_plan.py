@@ -4,15 +4,15 @@ Coils cause only torques normal to the magnetic field, so a path is planned toge
 The whole motion is discretised by collocation and solved by an interior point method (`slew_program`), from
 several initial guesses (`slew_search`). The path is then corrected until a Runge-Kutta integration of the
 motion reaches the end of the path. The collocation error on 24 intervals is a few thousandths of a degree.
-For the correction, each interval is integrated in small steps from the first node of the interval. The
-differences between the integrated states and the next nodes are removed with one factored Newton matrix
-(multiple shooting with the chord method). The energy of a slew is the heat produced in the coils, J. The
-planner is deterministic and has no side effects.
+For this correction, the motion is integrated in small steps from the first node of each interval. The
+differences between the integrated states and the states at the next nodes are removed with one factored
+Newton matrix (multiple shooting with the chord method). The energy of a slew is the heat produced in the
+coils, J. The planner is deterministic and has no side effects.
 
 The function `plan_order` plans a slew in orbit between two pointing targets, with a start inside a given time
 window. The direction of the field during the slew changes the energy of the slew by a factor of up to ten
-along an orbit. Slews are therefore planned on a coarse grid for several start times, and the best slew is
-planned on the fine grid.
+along an orbit. Slews with several start times are therefore planned on a coarse grid, and the best slew is
+planned again on the fine grid.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ from knightcube.gnc.guidance.three_axes.slew_program import Iterate, SlewProgram
 from knightcube.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSearch, SolvedPath
 
 STRETCH = 3.0
-"""Default of the longest duration to which `plan_slew` stretches a slew, as a multiple of the requested
+"""Default of the longest duration to which `plan_slew` extends a slew, as a multiple of the requested
 duration."""
 _STEPS = 4
 """Number of Runge-Kutta steps per collocation interval, an even number."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
-"""Largest number of corrections of a path, node error (half angle, rad) below which the corrections end, and
-node error above which the corrections have failed."""
+"""Largest number of corrections of a path, error at the nodes (half angle, rad) below which the corrections
+end, and error at the nodes above which the corrections have failed."""
 
 
 def closed(
@@ -76,7 +76,7 @@ def closed(
 ) -> Trajectory:
     """Return the trajectory near an iterate `point` that agrees with the integrated motion at all nodes.
 
-    Dipoles are in units of `unit` A m^2, and the function `along` returns the environment at given times.
+    The unit of dipoles is `unit` A m^2, and the function `along` returns the environment at given times.
     Raises PlanningError if the Newton matrix is singular or the corrections do not converge.
     """
     equations, at = program.equations, point.at
@@ -122,20 +122,20 @@ def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> t
 _DENSE = 16
 """Number of times at which cones are checked between a node and the next midpoint of a path."""
 _ROOM = math.radians(0.005)
-"""Minimum angle (rad) to an exclusion cone at the checked times. Between two checked times, the angle to a
-cone decreases by less than this minimum angle."""
+"""Minimum angle (rad) between camera axis and exclusion cone at the checked times. Between two checked times,
+the angle to a cone decreases by less than this minimum."""
 
 _OVER = 1.001
-"""Largest ratio of the flown dipole to the dipole limit along an accepted path."""
+"""Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
 _ASTRAY = 1.05
 """Assumed ratio of the dipole to the dipole limit for a path whose integration fails."""
 
 _ENDS = 9
-"""Number of durations for which the error message states whether the slew would end inside a cone."""
+"""Number of durations for which the error message checks whether the slew would end inside a cone."""
 
 
 class SlewStatus(StrEnum):
-    """Whether the requested duration was kept or stretched."""
+    """Whether the requested duration was kept (OPTIMAL) or extended (STRETCHED)."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -147,7 +147,7 @@ class SlewPlan:
 
     Attributes:
         path: planned path.
-        status: whether the requested duration was kept or stretched.
+        status: whether the requested duration was kept or extended.
         horizon_asked, horizon: requested and planned duration, s.
         energy: heat of the coils during the slew, J.
         peak: largest ratio of a coil's dipole moment to the dipole limit.
@@ -176,7 +176,7 @@ class SlewPlan:
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     """Return the best plan found for a slew task. Raises PlanningError with the reason if no path is found.
 
-    If the path `near` of a similar task of the same duration is given, the search starts from `near`.
+    If `near`, the path of a similar task with the same duration, is given, the search starts from this path.
     """
     check(task)
     tried = 0
@@ -194,10 +194,10 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
-    """Return the plan to which the path `near` of a similar task converges, or None.
+    """Return the plan found from the path `near` of a similar task, or None if the search fails.
 
-    The path `near` has the duration of the task. No other initial guess is tried. Raises PlanningError for
-    invalid values.
+    The path `near` has the duration of the task. Only the initial guess `near` is tried. Raises PlanningError
+    for invalid values.
     """
     check(task)
     search = SlewSearch(task, *GRIDS[0])
@@ -206,7 +206,7 @@ def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
 
 
 def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> SlewPlan | None:
-    """Return the plan of the first path whose integration keeps the limits and cones, or None."""
+    """Return the plan of the first path that satisfies limits and cones after integration, or None."""
     for path in paths:
         found: SolvedPath | None = path
         while found is not None:
@@ -225,7 +225,7 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
 
 
 def is_within_limits(task: SlewTask, plan: SlewPlan) -> bool:
-    """Return whether an integrated plan keeps the dipole limit and stays outside the exclusion cones."""
+    """Return whether an integrated plan satisfies the dipole limit and stays outside the exclusion cones."""
     return plan.peak <= _OVER and not _depths(task, plan.path).any()
 
 
@@ -272,7 +272,7 @@ def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPla
 
 
 def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the angles (cones, n), rad, by which a path stays outside each cone at n dense times."""
+    """Return the angles (cones, n), rad, by which a path stays outside each cone at n close times."""
     dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
     shown = path.references(dense).quaternion
     return np.array([cone.clearance(shown, dense) for cone in task.cones]).reshape(-1, len(dense))
@@ -281,8 +281,8 @@ def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
     """Return the violations (cones, 2 nodes), rad, of the margins to the cones between neighbouring points.
 
-    The required margin is `_ROOM`, but at most the angle between cone and path at the start and at the end of
-    the path.
+    The required margin is `_ROOM`, or the angle between cone and camera axis at the start or at the end of
+    the path, if this angle is smaller.
     """
     clear = _clearances(task, path)
     room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
@@ -291,12 +291,12 @@ def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
 
 
 LEAD = 2.0 * DIFFERENCE
-"""Time (s) by which the ephemeris must begin before the first start and end after the last end, because rates
-are computed by central differences."""
+"""Time (s) by which the ephemeris must begin before the earliest start of a slew and end after the latest
+end, because rates are computed by central differences."""
 WINDOW_RANGE = (0.0, 2e4)
 """Permitted range of the length of the window of start times, s."""
 _BEGINS = 12
-"""Number of equal intervals between the compared start times in a window."""
+"""Number of equal intervals into which the compared start times divide a window."""
 _COARSE = 12
 """Number of collocation intervals of the coarse plans by which start times are compared."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
@@ -347,7 +347,7 @@ class OrderedSlew:
         task: planning task for the chosen start time.
         plan: planned path of the slew.
         begin: start of the slew, in s after the start of the ephemeris. In results of `knightcube.plan_slew`,
-            the start is measured from the argument `time`.
+            `begin` is measured from the argument `time`.
         compared: number of start times that were planned.
     """
 
@@ -382,7 +382,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
         except PlanningError as error:
             failed = error
         else:
-            # Plans are compared first by the stretch of the horizon, then by the cost.
+            # Plans are compared first by the extension of the duration, then by the cost.
             if order.time_cost is None:
                 value = (plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0, plan.energy)
             elif math.isinf(order.time_cost):
@@ -390,7 +390,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
             else:
                 value = (0.0, plan.energy + order.time_cost * plan.horizon)
             compared.append((value, float(begin)))
-    # If there is no window or no coarse slew was found, the first start time is used.
+    # If the window has zero length or no coarse slew was found, the first start time is used.
     for begin in [begin for _, begin in sorted(compared)] or [first]:
         task = task_at(order, ephemeris, begin)
         try:
@@ -484,13 +484,13 @@ def plan_slew(
         start: pointing target that is held until the slew begins; a free roll is taken as zero.
         goal: pointing target at the end; with a free roll, only the direction of the target counts.
         duration: requested duration of the slew, s.
-        longest: longest duration to which the slew may be stretched if no slew of `duration` is found, s.
-            The default is three times `duration`.
+        longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
+            default is three times `duration`.
         window: length of the time interval in which the slew may begin, s. The start time of minimum energy
             is chosen.
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
-            energy plus `time_cost` times the duration. Infinity gives the shortest slew, and None keeps the
-            duration.
+            energy plus `time_cost` times the duration. If the time cost is infinite, the shortest slew is
+            planned; if it is None, the duration is fixed.
         pointing_axis: unit vector (3,) of the body axis that points to the targets.
         across_axis: unit vector (3,) of the body axis from which a roll is measured, normal to
             `pointing_axis`.

@@ -1,23 +1,23 @@
 """A slew as a nonlinear program, discretised by collocation and solved by an interior point method.
 
 The motion is discretised by separated Hermite-Simpson collocation, which is of fourth order (Betts, Practical
-Methods for Optimal Control, 2010, section 4.5). The dipole is linear on each interval, so a dipole that keeps
-the limits at all nodes keeps the limits at all times. The unknowns are the states at nodes and midpoints of
-the intervals, and the dipoles at the nodes.
+Methods for Optimal Control, 2010, section 4.5). The dipole is linear on each interval, so a dipole that
+satisfies the limits at all nodes satisfies the limits at all times. The unknowns are the states at nodes and
+midpoints of the intervals, and the dipoles at the nodes.
 
 The vector of unknowns and Lagrange multipliers has 31 elements per interval: the state (7) and the dipole (3)
 of the first node, the multipliers of the midpoint's equations (7), the state of the midpoint (7) and the
 multipliers of the equations at the end of the interval (7). The multipliers of the start conditions precede
 all intervals, and the multipliers of the end conditions follow all intervals. Each equation involves only
-neighbouring elements, so the Newton matrix is banded and is factored by LAPACK. LAPACK is imported only when
-it is used, because the control process imports this module without solving programs.
+neighbouring elements of this vector, so the Newton matrix is banded and is factored by LAPACK. LAPACK is
+imported only when it is used, because the control process imports this module without solving programs.
 
 The vector of inequalities g >= 0 contains the lower and upper limits of the dipoles (2, k + 1, 3), followed
 by the exclusion cones (cones, 2 k), for k intervals. The interior point method is that of Wachter and Biegler
 (Mathematical Programming 106, 2006) with second-order corrections. The curvature test of Chiang and Zavala
-(Mathematical Programming, 2016) replaces the count of eigenvalues. Without inequalities, the interior point
-method reduces to Newton's method. Far from a feasible point, the second derivatives of the equations lead to
-bad steps and are omitted (Gauss-Newton).
+(Mathematical Programming, 2016) replaces the usual count of the negative eigenvalues of the Newton matrix.
+Without inequalities, the interior point method reduces to Newton's method. Far from a feasible point, the
+second derivatives of the equations lead to bad steps and are omitted (Gauss-Newton).
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ _ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, including the rows that 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandLayout:
-    """Indices of a slew's states, dipoles and multipliers in the vector of unknowns and in the band matrix.
+    """Indices of states, dipoles and multipliers of a slew in the vector of unknowns and in the band matrix.
 
     Attributes:
         states: indices (2 k + 1, 7) of the states at nodes and midpoints of k intervals.
         dipoles: indices (k + 1, 3) of the dipoles at the nodes.
-        equations: indices (k, 14) of the multipliers of the intervals' equations.
+        equations: indices (k, 14) of the multipliers of the collocation equations of the intervals.
         start: indices (7,) of the multipliers of the start conditions.
         end: indices (ends,) of the multipliers of the end conditions.
         begins: indices (k + 1,) of the first element of each interval and of the last node.
@@ -176,8 +176,9 @@ class LinearisedEquations:
         begun: residuals (7,) of the start conditions, which fix the state at the start.
         ended: residuals (ends,) of the end conditions, which are the attitude and rate errors at the end of
             the slew.
-        jacobian: derivatives (k, 14, WIDE) of the collocation equations by the unknowns of each interval.
-        ending: derivatives (ends, 7) of the end conditions by the state at the end.
+        jacobian: derivatives (k, 14, WIDE) of the collocation equations with respect to the unknowns of each
+            interval.
+        ending: derivatives (ends, 7) of the end conditions with respect to the state at the end.
     """
 
     at: Trajectory
@@ -255,11 +256,11 @@ class Transcription:
         return LinearisedEquations(at, *self.remainders(at), jacobian, ending)
 
     def slope(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of the Lagrangian by all unknowns and multipliers.
+        """Return the derivative (size,) of the Lagrangian with respect to all unknowns and multipliers.
 
-        The Lagrangian is the cost plus the equations weighted by `multipliers`, so the derivatives by the
-        multipliers are the residuals of the equations. Elements of `multipliers` (size,) at indices of
-        unknowns are ignored.
+        The Lagrangian is the cost plus the equations weighted by `multipliers`, so the derivatives with
+        respect to the multipliers are the residuals of the equations. The elements of `multipliers` (size,)
+        at the indices of unknowns are ignored.
         """
         at, layout = linear.at, self.layout
         result = np.zeros(layout.size)
@@ -285,10 +286,11 @@ class Transcription:
         state_part: FloatArray,
         dipole_part: FloatArray,
     ) -> FloatArray:
-        """Return the Newton matrix, the second derivatives of the Lagrangian, as a band matrix.
+        """Return the Newton matrix (the second derivatives of the Lagrangian) as a band matrix.
 
         The barrier and convexification terms `state_part` (2 k + 1, 7, 7) are added to the second derivatives
-        by the states, and the terms `dipole_part` (k + 1, 3) to the second derivatives by the dipoles.
+        with respect to the states, and the terms `dipole_part` (k + 1, 3) to those with respect to the
+        dipoles.
         """
         h = self._step
         bend = self._bend(linear, multipliers[self.layout.equations])
@@ -371,8 +373,8 @@ class SlewLimits:
     def stiffness(self, at: Trajectory, stiff: FloatArray, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return second derivatives of the barrier by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
 
-        The products of first derivatives of the inequalities g are weighted with `stiff`, and the second
-        derivatives of g with `bent`.
+        The weights of the products of first derivatives of the inequalities g are `stiff`, and the weights of
+        the second derivatives of g are `bent`.
         """
         dipoles, cones = self._parts(stiff, at)
         _, weights = self._parts(bent, at)
@@ -385,7 +387,7 @@ class SlewLimits:
         return states, heavy
 
     def _parts(self, values: FloatArray, at: Trajectory) -> tuple[FloatArray, FloatArray]:
-        """Return the parts of `values`, one per limit, that belong to the dipoles and to the cones."""
+        """Return the elements of `values` for the dipole limits and those for the exclusion cones."""
         nodes = 0 if self.dipole is None else 2 * at.dipoles.size
         dipoles = values[:nodes].reshape(2, -1, 3) if nodes else values[:0]
         return dipoles, values[nodes:].reshape(self.cones.count, len(at.states) - 1)
@@ -395,14 +397,15 @@ _TOLERANCE = 1e-6
 _TO_BOUNDARY = 0.995
 _HALVINGS = 7
 _CORRECTED, _CORRECTIONS = 4, 2
-"""Number of step halvings with a second-order correction, and number of corrections per halving."""
+"""Number of step halvings that include second-order corrections, and number of corrections per halving."""
 _HEAVIER = 1.2
 """Weight of the constraint violation in the merit function, relative to the largest Lagrange multiplier."""
 _FAR = 0.03
-"""Sum of the constraint violations beyond which the curvature of the equations is omitted."""
+"""Sum of the constraint violations above which the second derivatives of the equations are omitted."""
 _DAMPED = 3e-3
-"""Minimum convexification far from a feasible point, which prevents too long steps. The minimum
-convexification holds for a constraint violation of one, and is proportional to smaller violations."""
+"""Minimum convexification far from a feasible point, which prevents excessive steps. This value applies to a
+constraint violation of one and above; for smaller violations, the minimum is proportional to the
+violation."""
 _CONVEX = 1e-3, 1e4
 FIRST_BARRIER = 1e-3
 
@@ -416,7 +419,8 @@ class Iterate:
         multipliers: Lagrange multipliers of the equations, at their indices in the vector (size,) of all
             elements.
         slack, dual: slack variables and dual variables of the inequalities g >= 0.
-        slope: derivative (size,) of the Lagrangian without the inequalities, by all unknowns and multipliers.
+        slope: derivative (size,) of the Lagrangian without the inequalities, with respect to all unknowns and
+            multipliers.
     """
 
     linear: LinearisedEquations
@@ -456,7 +460,7 @@ class SlewProgram:
         self.steps = 0
 
     def factors(self, point: Iterate) -> Factors:
-        """Return the factors of a Newton matrix for the smallest change of a path that removes residuals.
+        """Return the factors of the Newton matrix of the smallest path change that removes the residuals.
 
         The matrix omits the second derivatives of the equations, because a matrix with these derivatives
         hardly penalises large steps near a flat optimum. Raises PlanningError if the matrix is singular.
@@ -518,7 +522,7 @@ class SlewProgram:
         limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
-        # Estimate of the dual variables for unchanged states and dipoles.
+        # The dual variables are estimated for unchanged states and dipoles.
         toward = barrier / point.slack - stiff * off
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
@@ -589,7 +593,7 @@ class NewtonRun:
         first: float = FIRST_BARRIER,
         last: float = 1e-8,
     ) -> None:
-        """Start from the trajectory `guess` with Lagrange `multipliers` (size,), or with zero if None.
+        """Start from the trajectory `guess` with Lagrange `multipliers` (size,), or zeros if None is given.
 
         The equations should be scaled so that the cost is of the order of one. The barrier parameter
         decreases from `first` to `last`.
@@ -612,7 +616,7 @@ class NewtonRun:
         """Return the optimum found within `maximum` more Newton steps, or None if no optimum was found."""
         if self.is_over:
             return None
-        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only makes the next step shorter
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow only shortens the next step
             return self._run(maximum)
 
     def _run(self, maximum: int) -> Iterate | None:
@@ -638,7 +642,7 @@ class NewtonRun:
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:
-    """Return the largest fraction of `change`, at most one, for which `values` remain positive."""
+    """Return the largest fraction of `change`, at most one, by which positive `values` remain positive."""
     falling = change < 0.0
     if not falling.any():
         return 1.0

@@ -1,12 +1,13 @@
 """The search for the path of a slew, from guesses on a coarse grid to a path on a fine grid.
 
 An initial guess is a curve of the angular momentum over time. Coils cause no torque along the magnetic field,
-so the derivative of the inertial angular momentum is always normal to the field. The condition that torque
-and field are normal is linear, so every momentum curve that reaches the end is the sum of a fixed curve and
-weighted modes. The attitude follows from the momentum by integration. A least-squares fit of about a dozen
-mode amplitudes finds curves that end at the target, stay outside the cones and need little heat. The fit of
-the mode amplitudes is started from many random amplitudes at once. Gravity gradient and other disturbance
-torques are neglected in the initial guesses. The random starts of the fit are the same in every call.
+so the derivative of the inertial angular momentum is always normal to the field. The condition that the
+torque is normal to the field is linear, so every momentum curve that reaches the end is the sum of a fixed
+curve and weighted modes. The attitude follows from the momentum by integration. A least-squares fit of about
+a dozen mode amplitudes finds momentum curves that end at the target, stay outside the cones and cause little
+heat. The fit of the mode amplitudes is started from many random amplitudes at once. Gravity gradient and
+other disturbance torques are neglected in the initial guesses. The random starts of the fit are the same in
+every call.
 
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
 (a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A
@@ -53,11 +54,12 @@ from knightcube.gnc.guidance.three_axes.slew_program import (
 )
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
-"""Final barrier parameter of paths used only as warm starts, and of paths to be flown."""
+"""Final barrier parameter of paths used only as warm starts (first value), and of paths for the slew (second
+value)."""
 MET, _FLOWN_MET = 1e-2, 3e-3
-"""Constraint violation below which an iterate that is not yet optimal is accepted as a warm start, and as a
-path to be flown. Early acceptance saves time, because many runs converge slowly. The final integration of the
-path removes the remaining violations."""
+"""Constraint violation below which an iterate that is not yet optimal is accepted as a warm start (first
+value), and as a path for the slew (second value). Early acceptance saves time, because many runs converge
+slowly. The final integration of the path removes the remaining violations."""
 _STEPS_FREE = 25
 """Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
@@ -90,7 +92,7 @@ class SolvedPath:
 
 
 class SlewSolver:
-    """A solver for paths of one slew task. Dipoles are in units of `unit` A m^2.
+    """A solver that computes paths of one slew task. The unit of dipoles is `unit` A m^2.
 
     The angles `extra` (cones, 2 nodes), rad, widen the cones at the points of the fine grid. Paths use at
     most the fraction `share` of the dipole limit. The counter `steps` is the number of Newton steps, and
@@ -118,7 +120,7 @@ class SlewSolver:
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: SolvedPath) -> bool:
-        """Return whether a path planned without the dipole limit keeps the dipole limit and the cones."""
+        """Return whether a path planned without dipole limit satisfies the dipole limit and the cones."""
         kept = self.kept(found.equations).values(found.at.states[1:, :4])
         return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
@@ -197,7 +199,7 @@ class SlewSolver:
         return SolvedPath(program, point)
 
     def kept(self, equations: Transcription) -> ConeConstraints:
-        """Return the cone constraints at all nodes and midpoints of the equations except the first node."""
+        """Return the cone constraints at all collocation nodes and midpoints except the first node."""
         wider = self.extra if self.extra.shape[1] == 2 * equations.count else 0.0
         return ConeConstraints(self._task.cones, np.asarray(wider), equations.times[1:])
 
@@ -221,10 +223,10 @@ def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
 _BEGINS, _SPREAD = 24, 0.4
 """Number of random starts of the momentum fit, and standard deviation of the random mode amplitudes."""
 _COSINES = 6
-"""Number of cosine terms per axis of the torque as a function of time."""
+"""Number of cosine terms that describe the time dependence of the torque about each axis."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights in the momentum fit: of the end error (per rad), of the depth inside a cone (per unit of cosine),
+"""Weights in the momentum fit of the end error (per rad), of the depth inside a cone (per unit of cosine),
 and of the mode amplitudes."""
 _ROOM = 0.03
 """Margin between a guess and an exclusion cone, as a difference of cosines."""
@@ -232,8 +234,9 @@ _DAMPED = 1.0
 _LONGEST_STEP = 4.0
 """Largest step of the mode amplitudes in an iteration of the momentum fit."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Heat of a mode below which the mode is discarded, and singular value below which a direction of the end
-momentum is not controlled. Each value is relative to the largest heat or singular value."""
+"""Heat of a mode below which the mode is discarded (first value), and singular value below which a direction
+of the end momentum is not controlled (second value). Both values are relative to the largest heat and to the
+largest singular value."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
 """End error (rad) and depth inside a cone (as a difference of cosines) above which a guess is tried after all
 other guesses."""
@@ -285,7 +288,7 @@ class _MomentumCurves:
 def _curves(
     craft: SlewCraft, around: SlewEnvironment, start: FloatArray, end: End, scale: float
 ) -> _MomentumCurves:
-    """Return the momentum curves from start to end, with modes of additive heat (orthogonal modes)."""
+    """Return the momentum curves from start to end, with orthogonal modes, whose heats are additive."""
     count = len(around.field)
     step, strength = scale / (count - 1), np.linalg.norm(around.field, axis=1)
     field = around.field / strength[:, None]
@@ -413,25 +416,27 @@ ENOUGH = 3
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors by which the requested duration is multiplied in turn until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Ratios of successive durations, in the first and in the last step, while a slew is shortened. The three
-pairs are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
+"""Ratios of successive durations while a slew is shortened: in the first step, and at which shortening ends.
+The three pairs are for the coarse grid, for the fine grid, and for slews without a time cost on the fine
+grid."""
 _CROSSED = 1.3
-"""Widening of a cone that a path crosses between two points, relative to the depth of the path inside the
-cone."""
+"""Angle by which a cone that a path crosses between two points is widened, relative to the depth of the path
+inside the cone."""
 _BEYOND = math.radians(0.02)
-"""Additional widening (rad) of a cone that a path crosses between two points."""
+"""Additional angle (rad) by which a cone that a path crosses between two points is widened."""
 _BETWEEN = 16
 """Number of intervals of an intermediate grid, used if a path from the coarse grid does not converge directly
 on the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
-"""Ratio of the flown dipole to the dipole limit above which a path is abandoned, and additional factor by
-which the duration of other paths above the limit is lengthened."""
+"""Ratio of the integrated dipole to the dipole limit above which a path is abandoned, and additional factor
+by which the duration of other paths above the limit is extended."""
 _PEAK = 0.9
-"""Ratio of the largest dipole to the dipole limit that the first duration of the continuation aims at."""
+"""Ratio of the largest dipole to the dipole limit for which the first duration of the continuation is
+chosen."""
 
 
 class HorizonContinuation:
-    """Continuation of a task's paths while the duration, the dipole limit or the cones change in steps."""
+    """Continuation of the paths of a task, with stepwise changes of duration, dipole limit or cones."""
 
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
         """Create a continuation that starts no further step when the solver's `work` exceeds `budget`."""
@@ -440,7 +445,7 @@ class HorizonContinuation:
         self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return a fine path within the limits, found from a coarse path without the dipole limit."""
+        """Return a path within the limits on the fine grid, found from a coarse path without dipole limit."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
@@ -483,7 +488,7 @@ class HorizonContinuation:
         ]
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path with wider cones, found from a path that crosses cones between its points, or None.
+        """Return a path for wider cones, found from a path that crosses cones between its points, or None.
 
         The largest depths inside the cones between each two points are `depths` (cones, 2 nodes), rad. The
         cones at the last point of the path are not widened.
@@ -496,10 +501,10 @@ class HorizonContinuation:
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
 
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
-        """Return a path with smaller dipoles, found from a path whose flown dipole is `peak` times the limit.
+        """Return a path with smaller dipoles, found from a path whose dipole reaches `peak` times the limit.
 
         The new path uses a smaller fraction of the dipole limit. If no path with smaller dipoles exists or
-        the duration is free, the new path takes longer. Returns None if no path is found.
+        the duration is free, the new path has a longer duration. Returns None if no path is found.
         """
         task, solver, time = self._task, self._solver, found.horizon
         if peak > _LOST:
@@ -554,11 +559,11 @@ class HorizonContinuation:
         return best
 
     def _fastest(self, found: SolvedPath) -> float:
-        """Return the approximate duration, s, to which a path must be stretched to keep the dipole limit."""
+        """Return the approximate shortest duration, s, of a path that satisfies the dipole limit."""
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
     def _begins(self, start: SolvedPath, shortest: float) -> list[float]:
-        """Return the durations, s, at which a continuation may begin, the shortest first."""
+        """Return the durations, s, at which a continuation may begin, in increasing order."""
         time = max(self._fastest(start), shortest)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
         if start.horizon == self._task.horizon and self._task.time_cost is None and start.horizon in times:
@@ -578,16 +583,17 @@ class HorizonContinuation:
 
 
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
-"""Number of collocation intervals and budget of work of each successive search. No further guess is tried
-when the work, measured in Newton steps times intervals, exceeds the budget. A work of 1,000 takes about 0.1
-s. Ten intervals are too coarse for paths around exclusion cones, because coarse paths around cones differ
+"""Number of collocation intervals of each successive search, and its budget of work. No further guess is
+tried when the work, measured in Newton steps times intervals, exceeds the budget. A work of 1,000 takes about
+0.1 s. Ten intervals are too coarse for paths around exclusion cones, because coarse paths around cones differ
 too much from paths on the fine grid."""
 _WALKS = 1.8
-"""Work, relative to the budget of a search, after which the continuation ends with the best path so far."""
+"""Work, relative to the budget of a search, after which the continuation ends and returns the best path so
+far."""
 _MAXIMUM_TRIED = 16
 """Largest number of initial guesses that are tried for one duration."""
 _LOOK = 8
-"""Number of Newton steps from a guess before the constraint violation is checked for the first time."""
+"""Number of Newton steps from a guess after which the constraint violation is checked for the first time."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
 """Further stages of the iteration from a guess: the number of Newton steps of each stage, and the constraint
 violation above which the guess is deferred instead of starting the stage. After eight steps, the violation is
@@ -614,7 +620,7 @@ class SlewSearch:
         self.tried = 0
 
     def paths(self) -> Iterator[SolvedPath]:
-        """Yield paths that keep all limits at nodes and midpoints, the best path first."""
+        """Yield paths that satisfy all limits at nodes and midpoints, the best path first."""
         time_cost = self._task.time_cost
         for batches in self._rungs():
             relaxed: list[SolvedPath] = []
@@ -639,7 +645,7 @@ class SlewSearch:
         return self._walker.widened(found, depths) if self._widened <= _WIDENED else None
 
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
-        """Return a path with smaller dipoles than `found`, whose dipole is `peak` times the limit."""
+        """Return a path with smaller dipoles than the path `found`, which reaches `peak` times the limit."""
         self._widened += 1
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
@@ -666,7 +672,7 @@ class SlewSearch:
         yield self._late(deferred)
 
     def _relaxed(self, horizon: float, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield batches of paths without the dipole limit; append slowly converging guesses to `deferred`."""
+        """Yield batches of paths without dipole limit, and append slowly converging guesses to `deferred`."""
         batch: list[SolvedPath] = []
         solver, patience = self.solver, self.solver.steps + _STEPS_WITHOUT_PATH
         equations = solver.equations(horizon, self._coarse)

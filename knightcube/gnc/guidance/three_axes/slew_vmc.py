@@ -9,8 +9,8 @@ The needed torque follows from a path by inverse dynamics. Coils cause no torque
 an equality constraint sets the component of the needed torque along the field to zero on all nodes. The
 dipole moment is that of least heat among the dipole moments that cause the needed torque, and the cost is the
 heat. Limits of the dipole moment and exclusion cones are imposed at those quadrature points at which the
-previous solution exceeded a limit. At the dipole limit, the planner does not use the freedom to add a dipole
-moment along the field.
+previous solution exceeded a limit. When the dipole limit is reached, the planner does not reduce the largest
+component by adding a dipole moment along the field.
 
 The prey paths are the smooth rotation about the eigenaxis and the guesses of `slew_search`. A solution is
 corrected and integrated by `slew_plan` in the same way as a path of the collocation, without the optimiser of
@@ -71,32 +71,34 @@ Numbers = NDArray[Any]
 NODES = 28
 """Number of nodes of a path."""
 _REFERENCE = 2.0
-"""Reference point r of each modified Rodrigues parameter; the parameters of a prey path are smaller."""
+"""Reference point r of each modified Rodrigues parameter, which exceeds the parameters of all prey paths."""
 _TRIED = 3
 """Number of guesses of `slew_search` that serve as prey paths for one duration."""
 _AXES = np.arange(3)
 _STEP = 1e-30
 """Imaginary step of the complex-step derivatives, which have no rounding error."""
 _NEAR, _LOST, _EASED = 0.9, 1.1, 4
-"""Ratio of the dipole to the usable limit above which the limit is imposed, ratio of the integrated dipole to
-the limit above which a path is abandoned, and largest number of integrations with smaller usable limits."""
+"""Ratio of the dipole to the usable limit above which the limit is imposed (first value), ratio of the
+integrated dipole to the limit above which a path is abandoned (second value), and largest number of
+integrations with reduced usable limits (third value)."""
 _BESIDE = math.radians(0.1)
-"""Widening (rad) of exclusion cones, because cones are not imposed between quadrature points."""
+"""Angle (rad) by which exclusion cones are widened, because cones are not imposed between quadrature
+points."""
 _HOPELESS = 1.5
-"""Excess over a limit above which no path within the limits is searched from the path."""
+"""Excess over a limit above which a path is not used to search for a path within the limits."""
 _EXCHANGES, _EVALUATIONS = 6, 150
-"""Largest number of exchanges of imposed limits, and of evaluations of the heat per run of NLopt."""
+"""Largest number of updates of the imposed limits, and of evaluations of the heat per run of NLopt."""
 _TOLERANCE, _MET, _KEPT = 1e-6, 1e-6, 1e-5
-"""Relative tolerance of the heat, tolerance of the scaled constraints, and largest accepted excess over a
-limit."""
+"""Relative tolerance of the heat (first value), tolerance of the scaled constraints (second value), and
+largest accepted excess over a limit (third value)."""
 
 
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     """Return the plan of least heat found for a slew task by virtual motion camouflage.
 
-    If the path `near` of a similar task of the same duration is given, `near` is the first prey path, and the
-    plan found from `near` is returned. Raises PlanningError with the reason if no path is found, and for a
-    task with a time cost, because the planner does not optimise the duration.
+    If `near`, the path of a similar task with the same duration, is given, it is the first prey path, and a
+    plan found with this prey path is returned immediately. Raises PlanningError with the reason if no path is
+    found, and for a task with a time cost, because the planner does not optimise the duration.
     """
     plan = None if near is None else plan_near(task, near)
     if plan is not None:
@@ -117,7 +119,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
-    """Return the plan with the prey path `near`, which has the duration of the task, or None.
+    """Return the plan found with the prey path `near`, which has the duration of the task, or None.
 
     Raises PlanningError for invalid values and for a task with a time cost.
     """
@@ -151,11 +153,12 @@ def prey_paths(task: SlewTask, horizon: float) -> Iterator[FloatArray]:
 
 
 def _end_attitude(end: End, near: FloatArray) -> FloatArray:
-    """Return the attitude (4,) at the end; with a free roll, the one with the least rotation from `near`."""
+    """Return the attitude (4,) at the end; if the roll is free, that with the least rotation from `near`."""
     if isinstance(end, AttitudeEnd):
         return end.quaternion
     seen = shown(near[None], end.direction[None])[0]
-    # The half-way quaternion between the direction seen at `near` and the boresight axis has no roll.
+    # The half-way quaternion between the direction in the body axes at `near` and the boresight axis has no
+    # roll.
     half = np.append(np.cross(end.axis, seen), 1.0 + float(seen @ end.axis))
     if float(np.linalg.norm(half)) < 1e-6:  # opposite directions
         half = np.append(tangent_basis(end.axis)[0], 0.0)
@@ -198,7 +201,7 @@ def _integrated(task: SlewTask, program: VmcProgram, parameters: FloatArray) -> 
 def mrp_motion(x: Numbers) -> tuple[Numbers, Numbers, Numbers]:
     """Return attitudes (n, 4), rates (n, 3) and accelerations (n, 3) of a motion in Rodrigues parameters.
 
-    The argument (3, n, 3) contains modified Rodrigues parameters with first and second derivatives by time.
+    The argument (3, n, 3) contains modified Rodrigues parameters and their first and second time derivatives.
     """
     p, v, a = x
     square, slope = np.sum(p * p, axis=1, keepdims=True), np.sum(p * v, axis=1, keepdims=True)
@@ -210,7 +213,7 @@ def mrp_motion(x: Numbers) -> tuple[Numbers, Numbers, Numbers]:
 
 
 def mrp_slopes(p: FloatArray, rate: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3) of modified Rodrigues parameters (n, 3) for body rates (n, 3)."""
+    """Return the time derivatives (n, 3) of modified Rodrigues parameters (n, 3) for body rates (n, 3)."""
     square, along = np.sum(p * p, axis=1, keepdims=True), np.sum(p * rate, axis=1, keepdims=True)
     return np.asarray(0.25 * ((1.0 - square) * rate + 2.0 * cross(p, rate) + 2.0 * along * p))
 
@@ -228,9 +231,9 @@ class ObservedPaths:
         nodes: FloatArray,
         basis: FloatArray,
     ) -> None:
-        """Observe the paths `nodes` + `basis` y, (N, 3) and (N, 3, k), at the points of `samples`.
+        """Set up the paths `nodes` (N, 3) + `basis` (N, 3, k) y for evaluation at the points of `samples`.
 
-        Times are in units of `scale` s, and cones are widened by `margin` (cones, 1) rad.
+        The unit of time is `scale` s, and cones are widened by `margin` (cones, 1) rad.
         """
         times, unit = 0.5 * scale * (samples.points + 1.0), float(np.mean(task.craft.limit))
         around = task.along(times)
@@ -245,7 +248,7 @@ class ObservedPaths:
         self._last: tuple[bytes, FloatArray, FloatArray] | None = None
 
     def motion(self, y: FloatArray) -> FloatArray:
-        """Return Rodrigues parameters with two derivatives (3, n, 3) for path parameters y (k,)."""
+        """Return Rodrigues parameters and two time derivatives (3, n, 3) for path parameters y (k,)."""
         return np.asarray(self._still + (self._basis @ y).transpose(0, 2, 1))
 
     def values(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -340,7 +343,7 @@ class VmcProgram:
         return ObservedPaths(*parts, self._nodes, self._basis)
 
     def _whitening(self) -> FloatArray:
-        """Return the parameter change (k, k) that gives heat and torque along the field a unit Hessian."""
+        """Return the transformation (k, k) of the parameters that gives the whitened cost a unit Hessian."""
         _, slopes = self._observed(self._grid.cost).values(np.zeros(self.size))
         root = np.zeros((4, 4))
         root[:3, :3], root[3, 3] = np.linalg.cholesky(self._heat), self._along
@@ -349,11 +352,11 @@ class VmcProgram:
 
     @property
     def _along(self) -> float:
-        """The scale of the dipole equivalent of the torque along the field, by which it counts like heat."""
+        """The factor that makes the dipole equivalent of a torque along the field comparable to heat."""
         return math.sqrt(float(np.trace(self._heat)) / 3.0)
 
     def trajectory(self, y: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return states (n, 7) and dipoles (n, 3) at shares (n,) of the duration, for parameters y (k,)."""
+        """Return states (n, 7) and dipoles (n, 3) at fractions (n,) of the duration for parameters y (k,)."""
         paths = self._observed(SamplePoints.at(self._grid.rule, 2.0 * share - 1.0))
         q, w, _ = paths.turned(paths.motion(y))
         return np.concatenate([q, w], axis=1), paths.values(y)[0][:, :3]
@@ -366,7 +369,7 @@ class VmcProgram:
         return heat, 2.0 * np.tensordot(pull, slopes[:, :3], 2)
 
     def along_field(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the scaled needed torques along the field (N,) on the nodes, and their gradients (N, k)."""
+        """Return the scaled torques along the field (N,) needed at the nodes, and their gradients (N, k)."""
         values, slopes = self._equal.values(y)
         factor = self._along / math.sqrt(len(values))
         return factor * values[:, 3], factor * slopes[:, 3]
@@ -403,7 +406,7 @@ class VmcProgram:
         return None
 
     def _minimised(self, start: FloatArray, imposed: BoolArray) -> FloatArray | None:
-        """Return the optimum of one run of SLSQP under the imposed limits, or None if none is found."""
+        """Return the optimum of one run of SLSQP under the imposed limits, or None if the run fails."""
         solver, last = nlopt.opt(nlopt.LD_SLSQP, self.size), start
 
         def objective(y: FloatArray, gradient: FloatArray) -> float:
