@@ -21,14 +21,15 @@ fit, and the covariance would be too small.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrices
+from knightcube.astro.arrays import BoolArray, FloatArray, cross_matrices
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.startracker.attitude_fit import (
     inflation,
@@ -182,6 +183,7 @@ class _Seen:
         unknowns: parameters that are fitted together with the attitude.
         whitener: transformation (n, 2, 3) of a direction error into two components of unit variance.
         late: displacement of each direction due to a line time error of one standard deviation (n, 3), rad.
+        before: reciprocal prior variances of the last parameters: the lens errors (bend) and the delay.
     """
 
     observed: FloatArray
@@ -191,6 +193,7 @@ class _Seen:
     unknowns: Unknowns
     whitener: FloatArray = field(init=False)
     late: FloatArray = field(init=False)
+    before: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         # The `whitener` is a pseudo-inverse, because a direction has no error along the line of sight.
@@ -200,51 +203,28 @@ class _Seen:
         late = self.unknowns.late
         late = np.einsum("nij,nj->ni", self.slopes, late) if len(late) else np.zeros((0, 3))
         object.__setattr__(self, "late", late)
-
-    @property
-    def before(self) -> FloatArray:
-        """The reciprocal prior variances of the last parameters: the lens errors (bend) and the delay."""
-        return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
-
-    @property
-    def camera(self) -> IntArray:
-        """The indices of the lens errors (bend) and of the delay among the fitted parameters."""
-        return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
+        object.__setattr__(self, "before", np.append(self.unknowns.bend, np.ones(min(len(late), 1))))
 
     def parameters(self, pose: _FittedPose) -> float:
         """Return the effective number of parameters that the stars determine instead of the prior."""
-        before = self.before * np.diagonal(pose.covariance)[self.camera]
+        before = self.before * np.diagonal(pose.covariance)[3 + int(self.unknowns.scale) :]
         return len(pose.covariance) - float(before.sum())
 
     def fitted(self, start: _FittedPose, weight: FloatArray) -> _FittedPose:
         """Return the pose with the smallest sum of the stars' chi-squares, weighted with `weight` (n,)."""
-        whitener = self.whitener * np.sqrt(weight)[:, None, None]
-        matrix, scale, known, bends = start.matrix, start.scale, self.before, len(self.unknowns.bend)
+        bends, known = len(self.unknowns.bend), self.before
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
-        for _ in range(_MOST_STEPS):
-            pose = self._pose(matrix, scale, held)
-            seen, predicted = self.directions(pose), self.reference @ matrix.T
-            normal, gradient = _normal(whitener, seen, predicted, self.late, self.unknowns.scale, bends)
-            normal[self.camera, self.camera] += known
-            gradient[self.camera] += known * held
-            try:
-                inverse = np.linalg.inv(normal)
-            except np.linalg.LinAlgError as error:
-                raise AttitudeError(f"{len(weight)} stars are too close together for an attitude") from error
-            step = -inverse @ gradient
-            if not np.all(np.abs(step[: 3 + int(self.unknowns.scale)]) < 1.0):
-                raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
-            matrix = turned(matrix, step[:3])
-            scale *= float(np.exp(step[3])) if self.unknowns.scale else 1.0
-            held = held + step[self.camera]
-            if np.abs(step).max() < _SETTLED:
-                break
-        return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
-
-    def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _FittedPose:
-        """Return a pose, whose lens errors (bend) and delay have the fitted values `held`."""
-        bends = len(self.unknowns.bend)
-        return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
+        given = np.ascontiguousarray(self.observed), self.whitener, np.ascontiguousarray(self.reference)
+        first = np.ascontiguousarray(start.matrix), float(start.scale), held, self.unknowns.scale
+        try:
+            agreed, matrix, scale, held, inverse = _fitted(*given, self.late, weight, known, *first)
+        except np.linalg.LinAlgError as error:
+            raise AttitudeError(f"{len(weight)} stars are too close together for an attitude") from error
+        if not agreed:
+            raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
+        bend = np.zeros(BENDS)
+        bend[:bends] = held[:bends]
+        return _FittedPose(matrix, scale, bend, float(held[bends:].sum()), inverse)
 
     def directions(self, pose: _FittedPose) -> FloatArray:
         """Return observed unit vectors (n, 3) at mid-exposure, corrected for the lens errors of a pose."""
@@ -260,7 +240,48 @@ class _Seen:
         return self.directions(pose) - self.reference @ pose.matrix.T
 
 
-def _normal_numpy(
+def _fitted_numpy(
+    observed: FloatArray,
+    whitener: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    weight: FloatArray,
+    known: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    held: FloatArray,
+    free_scale: bool,
+) -> _Fitted:
+    """Return whether the stars agree, and matrix, scale, last parameters `held` and covariance of a fit.
+
+    The parameters are the rotation, ln scale if `free_scale`, some of the lens errors, and the delay unless
+    `late` is empty. The lens errors and the delay, `held`, have the reciprocal prior variances `known`.
+    Raises LinAlgError if the normal matrix is singular.
+    """
+    whitener = whitener * np.sqrt(weight)[:, None, None]
+    bend, first, bends = np.zeros(BENDS), 3 + int(free_scale), len(held) - int(len(late) > 0)
+    last = first + np.arange(len(known))
+    for _ in range(_MOST_STEPS):
+        bend[:bends] = held[:bends]
+        seen = bent(stretched(observed, scale), bend)
+        if len(late):
+            seen = seen - held[bends] * late
+        normal, gradient = _normal(whitener, seen, reference @ matrix.T, late, free_scale, bends)
+        normal[last, last] += known
+        gradient[last] += known * held
+        inverse = np.linalg.inv(normal)
+        step = -inverse @ gradient
+        if not np.all(np.abs(step[:first]) < 1.0):
+            return False, matrix, scale, held, inverse
+        matrix = turned(matrix, step[:3])
+        scale *= float(np.exp(step[3])) if free_scale else 1.0
+        held = held + step[last]
+        if np.abs(step).max() < _SETTLED:
+            break
+    return True, matrix, scale, held, inverse
+
+
+def _normal(
     whitener: FloatArray, seen: FloatArray, predicted: FloatArray, late: FloatArray, scale: bool, bends: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return normal matrix (p, p) and gradient (p,) of the residuals, scaled to unit variance.
@@ -280,50 +301,173 @@ def _normal_numpy(
     return flat.T @ flat, flat.T @ residual
 
 
-@compiled_form_of(_normal_numpy)
-def _normal(
-    whitener: FloatArray, seen: FloatArray, predicted: FloatArray, late: FloatArray, scale: bool, bends: int
-) -> tuple[FloatArray, FloatArray]:
-    """See `_normal_numpy`."""
-    count = 3 + scale + bends + (len(late) > 0)
-    normal, gradient = np.zeros((count, count)), np.zeros(count)
+_Fitted = tuple[bool, FloatArray, float, FloatArray, FloatArray]
+
+
+@compiled_form_of(_fitted_numpy)
+def _fitted(
+    observed: FloatArray,
+    whitener: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    weight: FloatArray,
+    known: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    held: FloatArray,
+    free_scale: bool,
+) -> _Fitted:
+    first = 4 if free_scale else 3
+    count = first + len(known)
+    matrix, held, step = matrix.copy(), held.copy(), np.empty(count)
+    normal, gradient, inverse = np.empty((count, count)), np.empty(count), np.empty((count, count))
+    for _ in range(_MOST_STEPS):
+        _write_normal(
+            observed, whitener, reference, late, weight, matrix, scale, held, free_scale, normal, gradient
+        )
+        for k in range(len(known)):
+            normal[first + k, first + k] += known[k]
+            gradient[first + k] += known[k] * held[k]
+        inverse = np.linalg.inv(normal)
+        longest, sound = 0.0, True
+        for i in range(count):
+            step[i] = 0.0
+            for j in range(count):
+                step[i] -= inverse[i, j] * gradient[j]
+            longest = max(longest, abs(step[i]))
+            sound &= i >= first or abs(step[i]) < 1.0
+        if not sound:
+            return False, matrix, scale, held, inverse
+        _turn(matrix, step)
+        scale *= math.exp(step[3]) if free_scale else 1.0
+        for k in range(len(known)):
+            held[k] += step[first + k]
+        if longest < _SETTLED:
+            break
+    return True, matrix, scale, held, inverse
+
+
+@loop_helper
+def _write_normal(
+    observed: FloatArray,
+    whitener: FloatArray,
+    reference: FloatArray,
+    late: FloatArray,
+    weight: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    held: FloatArray,
+    free_scale: bool,
+    normal: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Write the normal matrix (p, p) and the gradient (p,) of the stars without the prior."""
+    count, delayed = len(gradient), len(late) > 0
+    bends = len(held) - int(delayed)
+    bend, seen, predicted = np.zeros(8), np.empty(3), np.empty(3)
     slope, flat = np.empty((3, count)), np.empty(count)
-    for star in range(len(seen)):
-        (x, y, z), (px, py, pz) = seen[star], predicted[star]
-        slope[0, 0], slope[0, 1], slope[0, 2] = 0.0, pz, -py
-        slope[1, 0], slope[1, 1], slope[1, 2] = -pz, 0.0, px
-        slope[2, 0], slope[2, 1], slope[2, 2] = py, -px, 0.0
-        tx, ty = x / z, y / z
-        square, last = tx * tx + ty * ty, 3
-        if scale:
-            slope[0, 3], slope[1, 3], slope[2, 3] = x * z * z, y * z * z, z * z * z - z
-            last = 4
-        for k in range(bends):  # in the order of `bend_slope`
-            if k in (0, 1, 4, 5):
-                along = (tx, ty, 0.0, 0.0, square, square * square)[k]
-                slope[0, last] = along * x * z * z
-                slope[1, last] = along * y * z * z
-                slope[2, last] = along * (z * z * z - z)
-            else:
-                dx = z * (0.0, 0.0, square, 0.0, 0.0, 0.0, tx, ty)[k]
-                dy = z * (0.0, 0.0, 0.0, square, 0.0, 0.0, -ty, tx)[k]
-                inward = x * dx + y * dy
-                slope[0, last], slope[1, last], slope[2, last] = dx - x * inward, dy - y * inward, -z * inward
-            last += 1
-        if len(late):
-            slope[0, last], slope[1, last], slope[2, last] = -late[star, 0], -late[star, 1], -late[star, 2]
-        for row in range(2):
-            wx, wy, wz = whitener[star, row]
-            off = wx * (x - px) + wy * (y - py) + wz * (z - pz)
-            for i in range(count):
-                flat[i] = wx * slope[0, i] + wy * slope[1, i] + wz * slope[2, i]
-                gradient[i] += flat[i] * off
-                for j in range(i + 1):
-                    normal[i, j] += flat[i] * flat[j]
+    bend[:bends] = held[:bends]
+    normal[:], gradient[:] = 0.0, 0.0
+    for star in range(len(observed)):
+        _see(observed[star], scale, bend, seen)
+        for axis in range(3):
+            if delayed:
+                seen[axis] -= held[bends] * late[star, axis]
+                slope[axis, count - 1] = -late[star, axis]
+            predicted[axis] = 0.0
+            for k in range(3):
+                predicted[axis] += matrix[axis, k] * reference[star, k]
+        _write_slopes(seen, predicted, free_scale, bends, slope)
+        _add_star(whitener[star], weight[star], seen, predicted, slope, flat, normal, gradient)
     for i in range(count):
         for j in range(i):
             normal[j, i] = normal[i, j]
-    return normal, gradient
+
+
+@loop_helper
+def _see(observed: FloatArray, scale: float, bend: FloatArray, seen: FloatArray) -> None:
+    """Write the unit vector `observed` (3,) to `seen` after `stretched` and `bent`."""
+    squared, z = scale * scale, observed[2]
+    shrink = 1.0 / math.sqrt(squared + (1.0 - squared) * z * z)
+    x, y, z = observed[0] * scale * shrink, observed[1] * scale * shrink, z * shrink
+    tx, ty = x / z, y / z
+    square = tx * tx + ty * ty
+    along = bend[0] * tx + bend[1] * ty + (bend[4] + bend[5] * square) * square
+    dx = z * (square * bend[2] + tx * bend[6] + ty * bend[7])
+    dy = z * (square * bend[3] - ty * bend[6] + tx * bend[7])
+    inward = x * dx + y * dy
+    seen[0] = x + along * x * z * z + dx - x * inward
+    seen[1] = y + along * y * z * z + dy - y * inward
+    seen[2] = z - along * z * (x * x + y * y) - z * inward
+    size = math.sqrt(seen[0] * seen[0] + seen[1] * seen[1] + seen[2] * seen[2])
+    for axis in range(3):
+        seen[axis] /= size
+
+
+@loop_helper
+def _write_slopes(
+    seen: FloatArray, predicted: FloatArray, scale: bool, bends: int, slope: FloatArray
+) -> None:
+    """Write the derivatives of a residual by rotation, scale and lens errors to `slope` (3, p)."""
+    (x, y, z), (px, py, pz) = seen, predicted
+    slope[0, 0], slope[0, 1], slope[0, 2] = 0.0, pz, -py
+    slope[1, 0], slope[1, 1], slope[1, 2] = -pz, 0.0, px
+    slope[2, 0], slope[2, 1], slope[2, 2] = py, -px, 0.0
+    tx, ty = x / z, y / z
+    square, last = tx * tx + ty * ty, 3
+    if scale:
+        slope[0, 3], slope[1, 3], slope[2, 3] = x * z * z, y * z * z, z * z * z - z
+        last = 4
+    for k in range(bends):  # in the order of `bend_slope`
+        if k in (0, 1, 4, 5):
+            along = (tx, ty, 0.0, 0.0, square, square * square)[k]
+            slope[0, last] = along * x * z * z
+            slope[1, last] = along * y * z * z
+            slope[2, last] = along * (z * z * z - z)
+        else:
+            dx = z * (0.0, 0.0, square, 0.0, 0.0, 0.0, tx, ty)[k]
+            dy = z * (0.0, 0.0, 0.0, square, 0.0, 0.0, -ty, tx)[k]
+            inward = x * dx + y * dy
+            slope[0, last], slope[1, last], slope[2, last] = dx - x * inward, dy - y * inward, -z * inward
+        last += 1
+
+
+@loop_helper
+def _add_star(
+    whitener: FloatArray,
+    weight: float,
+    seen: FloatArray,
+    predicted: FloatArray,
+    slope: FloatArray,
+    flat: FloatArray,
+    normal: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add a star to the lower half of the normal matrix (p, p) and to the gradient (p,)."""
+    for row in range(2):
+        wx, wy, wz = whitener[row]
+        off = wx * (seen[0] - predicted[0]) + wy * (seen[1] - predicted[1]) + wz * (seen[2] - predicted[2])
+        for i in range(len(flat)):
+            flat[i] = wx * slope[0, i] + wy * slope[1, i] + wz * slope[2, i]
+            gradient[i] += weight * flat[i] * off
+            for j in range(i + 1):
+                normal[i, j] += weight * flat[i] * flat[j]
+
+
+@loop_helper
+def _turn(matrix: FloatArray, turn: FloatArray) -> None:
+    """Rotate an attitude matrix (3, 3) in place, as `turned` does."""
+    x, y, z = turn[0], turn[1], turn[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    first, second = 1.0, 0.5
+    if angle > 0.0:
+        first, second = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+    for j in range(3):
+        a, b, c = matrix[0, j], matrix[1, j], matrix[2, j]
+        ca, cb, cc = y * c - z * b, z * a - x * c, x * b - y * a
+        matrix[0, j] = a - first * ca + second * (y * cc - z * cb)
+        matrix[1, j] = b - first * cb + second * (z * ca - x * cc)
+        matrix[2, j] = c - first * cc + second * (x * cb - y * ca)
 
 
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:

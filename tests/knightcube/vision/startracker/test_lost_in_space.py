@@ -280,7 +280,8 @@ def test_all_forms_find_the_same_matches_and_candidates_in_the_same_order(
         *SKY.triangles.table,
     )
     assert_forms_agree(_look_up, *looked_up)
-    *matches, read = _look_up.numpy_form(*looked_up)
+    found: tuple[Any, ...] = _look_up.numpy_form(*looked_up)
+    *matches, read = found
     assert 0 < read <= most
     tried = np.stack([matches[0][0], matches[1][0]], axis=1).astype(np.int64)
     for known in (tried[:0], tried):
