@@ -2,10 +2,10 @@
 
 The guardian has its own connection to the I2C bus. The guardian sets the coils to zero from its start until
 the first heartbeat, and 0.3 s after the last heartbeat. While heartbeats are missing, zero is written again
-every 0.1 s, to override a late write of the flight process or the effect of a brown-out. When heartbeats
+every 0.1 s, to override a late write by the flight process or the effect of a brown-out. When heartbeats
 return, the guardian stops writing. The guardian ignores SIGTERM and SIGINT, and ends only when the flight
-process says goodbye or dies. Neither this module nor its imports use numpy, so that the guardian starts
-within a few hundredths of a second and needs little memory.
+process sends the goodbye message or dies. Neither this module nor its imports use numpy, so that the guardian
+starts within a few hundredths of a second and needs little memory.
 
 `GuardianLine` runs in the flight process. `GuardianLine` starts the guardian before the coils can be
 energised, sends the heartbeats, and replaces a guardian that dies or stops reading. Sending a heartbeat never
@@ -52,13 +52,13 @@ PATIENCE_NS = 5_000_000_000
 
 
 class Watch:
-    """Decision when to set the coils to zero, from the times (monotonic clock, ns) of the heartbeats."""
+    """Decides when to set the coils to zero, from the times (monotonic clock, ns) of the heartbeats."""
 
     def __init__(self, now_ns: int) -> None:
         self.orphaned = False
         """Whether the flight process has ended without a goodbye message."""
         self.outages = 0
-        """Number of times that heartbeats stopped."""
+        """Number of times that the heartbeats have stopped."""
         self._beating = False
         self._due_ns = now_ns
         self._zeroed = 0
@@ -122,7 +122,7 @@ class CoilSwitch:
     """Switch that sets the coils to zero over an I2C bus, which is reopened after each failure."""
 
     def __init__(self, opener: Callable[[str], ByteWriter], where: str, numbers: Sequence[int]) -> None:
-        """Use writes given by three `numbers` each: address, register and value."""
+        """Use I2C writes that consist of three `numbers` each: address, register and value."""
         self._opener = opener
         self._where = where
         self._writes = tuple(zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True))
@@ -150,7 +150,7 @@ class CoilSwitch:
 
 
 class Guardian:
-    """Guardian loop, which monitors the heartbeats until the flight process says goodbye or dies."""
+    """Guardian loop, which monitors the heartbeats until the flight process ends."""
 
     def __init__(self, flight: socket.socket, switch: CoilSwitch, now_ns: Callable[[], int]) -> None:
         self._flight = flight
@@ -161,7 +161,7 @@ class Guardian:
         self._failing = False
 
     def serve(self) -> None:
-        """Run the guardian until the flight process says goodbye or dies."""
+        """Run the guardian until the flight process sends the goodbye message or dies."""
         if self._switch.off():
             self._send(READY)
         while not self._watch.over(self._now_ns()):
@@ -172,7 +172,7 @@ class Guardian:
                 self._zero()
 
     def _listen(self) -> bool:
-        """Wait for a message until a write of zero is due, and return whether a goodbye arrived."""
+        """Wait for a message until a write of zero is due, and return whether a goodbye message arrived."""
         left = max(0, self._watch.due_ns - self._now_ns()) * 1e-9
         sockets = [] if self._watch.orphaned else [self._flight]
         if not select.select(sockets, [], [], left)[0]:
@@ -265,8 +265,8 @@ class GuardianLine:
     def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
         """Wait until the guardian has set the coils to zero.
 
-        Raises NotResponding if this takes more than `patience` seconds. If `patient` is true, no error is
-        raised, and the guardian reports later that it has reached the coils.
+        Raises NotResponding after `patience` seconds. If `patient` is true, no error is raised, and the
+        guardian reports later when the coils are at zero.
         """
         received = b""
         if select.select([self._line], [], [], patience)[0]:
@@ -293,7 +293,7 @@ class GuardianLine:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
             self._drop()
-            # A failed start must not end the calling task, because the start is retried later.
+            # A failed start does not raise an error, because the start is retried later.
             with contextlib.suppress(NotResponding):
                 self._process, self._line = self._start()
                 self._lost = False
@@ -301,7 +301,7 @@ class GuardianLine:
         return news
 
     def close(self) -> None:
-        """End the guardian, which sets the coils to zero once more. A second call changes nothing."""
+        """End the guardian, which sets the coils to zero once more. A second call has no effect."""
         try:
             self._line.send(BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
             self._process.wait(_END_TIMEOUT_S)
@@ -343,8 +343,8 @@ class GuardianLine:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Signals to the process group of the flight must not reach the guardian.
-                # The kernel continues a stopped process in a separate group when its parent dies.
+                # A separate process group keeps signals to the group of the flight process away from the
+                # guardian. If the guardian is stopped, the kernel continues it when its parent dies.
                 process_group=0,
             )
         except OSError as error:

@@ -54,7 +54,7 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit status, 0 for success, 1 for a failure and 2 for wrong usage."""
+    """Run a command and return the exit status: 0 for success, 1 for a failure, 2 for wrong arguments."""
     options = _parser().parse_args(arguments)
     command: Callable[[argparse.Namespace], int] = options.command
     try:

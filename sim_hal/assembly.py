@@ -1,9 +1,9 @@
-"""Assembly of the simulated hardware of a configuration, which is a world with emulated devices.
+"""Assembly of the simulated hardware of a configuration: a simulated world with emulated devices.
 
 The emulated buses and lines implement the same Protocols as those on Linux, so simulated flights exercise the
 flight drivers. The body is held still at its initial attitude until its release. The modules of cameras and
-orbit devices are imported only where they are used, because the import takes half a second and a testbed
-flight does not need them.
+orbit devices are imported only where they are used, because their import takes half a second and a testbed
+flight does not need these modules.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Futu
 
 @dataclass(frozen=True, slots=True)
 class OrbitDevices:
-    """The configured devices that need an orbit. The attribute `wide` holds the horizon cameras."""
+    """Emulated devices that need an orbit. The attribute `wide` holds the horizon cameras."""
 
     gps: Any = None
     cells: Any = None
@@ -69,10 +69,11 @@ class OrbitDevices:
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All simulated devices. Drivers use only wires and cameras; faults and tests use all devices.
+    """All simulated devices. Drivers use only wires and cameras; simulated faults and tests use all devices.
 
-    Devices of other packages' drivers are of any type; faults act on the devices of our drivers only.
-    `utc_offset_ns` is the simulated UTC minus the simulation time, or None in a world without an orbit.
+    Emulated devices for drivers of other packages may have any type; simulated faults act only on devices for
+    the drivers of this package. `utc_offset_ns` is the simulated UTC minus the simulation time, or None in a
+    world without an orbit.
     """
 
     simulation: TimedSimulation
@@ -96,7 +97,7 @@ class Hardware:
 
     @property
     def pwm(self) -> Any:
-        """The PWM chip of the coils, if the coils are driven by one."""
+        """The PWM chip that drives the coils."""
         return self.circuit.chip
 
     def release(self, epoch_ns: int) -> None:
@@ -119,10 +120,10 @@ def assemble(
 ) -> Hardware:
     """Build the hardware of `config` in the world of its simulation `section`, and connect it to `wires`.
 
-    The function `now_ns` returns the simulation time. `expose` and `expose_wide` replace the renderers of the
-    cameras, which in real time run in another process. Raises ConfigError for an invalid world.
+    The function `now_ns` returns the simulation time. The functions `expose` and `expose_wide` replace the
+    camera renderers; in real time they run in another process. Raises ConfigError for an invalid world.
     """
-    # All devices start at the same instant; in real time the clock advances while they are built.
+    # All devices use this start time, because in real time the clock advances while they are built.
     start_ns = now_ns()
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     circuit, monitor = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wires)
@@ -136,7 +137,7 @@ def assemble(
     )
     unit = emulated(given)
     if (magnetometer := config.magnetometer) is not None:
-        # The second magnetometer has errors of its own.
+        # The errors of the second magnetometer are drawn with another seed.
         own = msgspec.structs.replace(config, inertial_unit=magnetometer)
         other = msgspec.structs.replace(section, seed=section.seed + 1)
         generator = np.random.default_rng([section.seed, ORBIT_STREAM, 3])
@@ -153,7 +154,7 @@ def assemble(
     if truth is not None:
         truth.watch(world, _true_description(config, section, world))
         truth.power = power
-    # Devices with events at the same time run in the order of this list.
+    # Events at the same time are processed in the order of this list.
     devices = [unit, camera, orbit.gps, *orbit.wide, faults, power, truth, circuit, monitor, orbit.cells]
     timed = [device for device in devices if hasattr(device, "next_event_ns")]
     simulation, others = TimedSimulation(world.advance_to, timed), (faults, orbit, objects, utc_offset_ns)
@@ -198,7 +199,7 @@ def _star_camera(
 
 
 def _true_description(config: Config, section: Simulation, world: World) -> dict[str, FloatArray] | None:
-    """Return the fields of the true-description packet, or None for a world without a craft."""
+    """Return the fields of the packet `true_description`, or None for a world without a satellite."""
     craft = getattr(world, "craft", None)
     if craft is None or not isinstance(config, OrbitConfig):
         return None
@@ -221,9 +222,9 @@ def assemble_coils(
     now_ns: Callable[[], int],
     wires: EmulatedWires,
 ) -> tuple[Any, Any]:
-    """Build the coil circuit and the current monitor, which may be None.
+    """Build the coil circuit and the current monitor, which is None if not configured.
 
-    The circuit of another package's coil driver has the methods `currents` and `mean_supply` of CoilCircuit.
+    For a coil driver of another package, the circuit has at least the methods `currents` and `mean_supply`.
     """
     truth = section.truth
     if truth.resistance is not None and len(truth.resistance) != len(config.coils.slots):
@@ -290,7 +291,7 @@ def emulated_camera(
     *,
     mounting: FloatArray | None = None,
 ) -> EmulatedCamera:
-    """Return the star camera on a moving body, with the `mounting` (4,) or the configured one."""
+    """Return the star camera on a moving body, with the given `mounting` (4,) or the configured mounting."""
     mounting = np.array(camera.mounting) if mounting is None else mounting
     readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
     tracks = no_objects if objects is None else objects.tracks
@@ -298,7 +299,7 @@ def emulated_camera(
 
 
 def fault_generator(seed: int) -> np.random.Generator:
-    """Return the random generator for device faults, independent of the seed's other generators."""
+    """Return the random generator for device faults, independent of other generators with the same seed."""
     return np.random.default_rng([seed, _FAULT_STREAM])
 
 
@@ -325,7 +326,7 @@ def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
 
 
 class StarRenderer:
-    """Renderer of one star camera; the noise of a frame depends only on the seed and the frame number."""
+    """Renderer of a star camera's frames; the noise of a frame depends only on seed and frame number."""
 
     def __init__(self, camera: Camera, sky: SkySection, seed: int) -> None:
         self._model = camera_model(camera, sky)
@@ -335,7 +336,7 @@ class StarRenderer:
     def render(
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack] = ()
     ) -> Image:
-        """Return frame number `sequence`, exposed along `attitudes` (k, 4) at `times` (k,), s."""
+        """Return the frame number `sequence`, exposed at the `attitudes` (k, 4) at `times` (k,), s."""
         from sim_hal.star_camera import render  # noqa: PLC0415 - see above
 
         generator = np.random.default_rng([self._seed, sequence])

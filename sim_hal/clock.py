@@ -1,8 +1,9 @@
 """Simulated time: the clock, the scheduling of emulated devices, and a queue of timed actions.
 
 A sleep on the simulated clock advances the world to the deadline and returns at once. Tickers that are due
-run one after the other, in the order in which they were created, so a flight repeats bit for bit. A job that
-sleeps, such as a driver that waits for its chip, advances the world, but no other ticker runs meanwhile.
+run one after the other, in the order in which they were created, so that a repeated flight is identical to
+the bit. A job that sleeps, such as a driver that waits for its chip, advances the world, but other tickers do
+not run during this sleep.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ class EmulatedDevice(Protocol):
 
 
 class SerialEnd(Protocol):
-    """The device's end of a serial line."""
+    """The emulated device's end of a serial line."""
 
     baud_rate: int
 
     def write(self, data: bytes, now_ns: int) -> None:
-        """Queue bytes at `now_ns`, to be sent after all bytes that already wait."""
+        """Queue bytes at `now_ns`; they are sent after all bytes that are already queued."""
 
     def read(self, now_ns: int) -> bytes:
         """Return unread bytes from the host that have arrived by `now_ns`."""
@@ -45,7 +46,7 @@ class SerialEnd(Protocol):
 
 
 class FaultTimeline:
-    """A queue of timed fault actions, which runs like an emulated device."""
+    """A queue of timed fault actions, with the interface of an emulated device."""
 
     def __init__(self) -> None:
         self._order = itertools.count()
@@ -66,7 +67,10 @@ class FaultTimeline:
 
 
 class TimedSimulation:
-    """A world and its devices; the world advances to each device's next event, at which the device runs."""
+    """A world and its devices.
+
+    The world advances from event to event, and each device processes its events.
+    """
 
     def __init__(self, advance_world: Callable[[int], None], devices: Sequence[EmulatedDevice]) -> None:
         self._advance_world = advance_world
@@ -91,7 +95,7 @@ class TimedSimulation:
 
 
 class TimedWorld(Protocol):
-    """A simulated world that a SimClock advances."""
+    """Interface of a simulated world that a SimClock advances."""
 
     def next_event_ns(self) -> int:
         """Return the time of the next event in the simulated world."""
@@ -104,9 +108,9 @@ class TimedWorld(Protocol):
 
 
 class SimClock:
-    """A Clock that jumps to each deadline.
+    """A Clock of simulated time, which jumps to each deadline without waiting.
 
-    The clock begins at `start_ns`, and `utc_start_ns` is the UTC at time 0.
+    The clock begins at the time `start_ns`, and `utc_start_ns` is the UTC at the time 0.
 
     Attributes:
         tickers: running tickers, in the order in which they were created.
@@ -169,7 +173,7 @@ class SimClock:
 
 
 class SimTicker(ContainedJob):
-    """A job that runs periodically on simulated time; a kick runs it at once."""
+    """A job that runs periodically in simulated time; the method `kick` runs it at once."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
         super().__init__(name, job, clock.now_ns)

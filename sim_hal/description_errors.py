@@ -1,8 +1,9 @@
-"""The errors of a flight configuration's description of the satellite, drawn from a seed.
+"""Errors of the satellite description in a flight configuration, drawn from a seed.
 
 The flight software knows moments of inertia, coils and sensors to the accuracies that its configuration
 states. The simulated satellite therefore differs from the description: each error is drawn uniformly and
-independently within a multiple of its accuracy. Moments that violate the triangle inequality are drawn again.
+independently within a multiple of its accuracy. Moments of inertia that violate the triangle inequality are
+drawn again.
 """
 
 from __future__ import annotations
@@ -23,19 +24,21 @@ _STREAM = 0xD1FF
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescriptionErrors:
-    """The true values of a satellite relative to its description.
+    """True properties of a satellite relative to its description.
 
     Attributes:
         moments: ratios (3,) of the true to the described principal moments of inertia.
         axes: rotation vector (3,) from the described to the true principal axes, rad, body axes.
-        coils: dipole of each coil divided by its described length, as the columns of a matrix (3, 3 g) for g
-            groups of three coils. The columns are in axes of `sim_hal.worlds.free_body.coil_frames`.
+        coils: true dipole of each coil divided by the magnitude of its described dipole, as columns of a
+            matrix (3, 3 g) for g groups of three coils. The columns are in axes of
+            `sim_hal.worlds.free_body.coil_frames`.
         gyro: matrix (3, 3) from the true rate to the rate that the gyro measures, without the gyro's bias.
         field: matrix (3, 3) from the true to the measured magnetic field, without the magnetometer's bias.
         field_bias: bias (3,) of the magnetometer, T.
-        camera: rotation vector (3,) of the star camera from its described mounting, rad, body axes.
-        horizon: rotation vectors (n, 3) of the n horizon cameras from their described mountings, rad, body
+        camera: rotation vector (3,) from the described to the true mounting of the star camera, rad, body
             axes.
+        horizon: rotation vectors (n, 3) from the described to the true mountings of n horizon cameras, rad,
+            body axes.
     """
 
     moments: FloatArray
@@ -56,7 +59,7 @@ NO_ERRORS = DescriptionErrors(
 def description_errors(config: Config, section: Simulation) -> DescriptionErrors:
     """Return the errors that are drawn from the seed of `section`.
 
-    There are no errors for a body that is not in orbit.
+    A body that is not in orbit has no errors.
     """
     body = section.free_body
     if body is None or body.errors == 0.0 or not isinstance(config, OrbitConfig):

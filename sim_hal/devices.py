@@ -1,4 +1,4 @@
-"""The functions that connect our emulated devices to the emulated wires (`flight.schema.devices`)."""
+"""Functions that connect the emulated devices of this package to emulated wires (`flight.schema.devices`)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _ADDRESSES = {SENSOR_PARTS["icm20948"]: 0x69, SENSOR_PARTS["lis3mdl"]: 0x1C}
 
 
 def true_coils(emulation: Emulation, coils: Coils) -> CoilSettings:
-    """Return the true properties of the coils."""
+    """Return the true properties of the simulated coils."""
     truth = emulation.section.truth
     wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs, coils.limits)
     supply = truth.supply_voltage or coils.supply_voltage

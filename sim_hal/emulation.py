@@ -1,7 +1,7 @@
-"""The far ends of the wires: emulated buses and lines by name, and what an emulator of a device is given.
+"""Emulated buses and serial lines by name, and the inputs of a device's emulator.
 
 A driver's registration (`flight.schema.devices`) names the function that connects its emulated device here.
-In lock-step the host's ends are in memory, and in real time the lines are pseudo-terminals.
+In lock-step, serial lines exist only in memory; in real time, they are pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ class EmulatedWires:
         return self.lines.get(self._kinds.get(kind, ""))
 
     def i2c(self, bus: int | str | None = None) -> EmulatedI2cBus:
-        """Return an I2C bus, made at its first use; None means the bus of the coils."""
+        """Return an I2C bus, which is created at its first use; None means the bus of the coils."""
         name = self._coil_bus if bus is None else device_file(bus)
         return self.buses.setdefault(name, EmulatedI2cBus())
 
     def serial(self, device: str, baud_rate: int) -> SerialPort:
-        """Return the host's end of a line in memory. Raises NotResponding."""
+        """Return the host's end of a serial line in memory. Raises NotResponding."""
         line = self.lines.get(device)
         if not isinstance(line, EmulatedSerialLine):
             raise NotResponding(device, "no emulated device is connected to this line")
@@ -88,23 +88,23 @@ class EmulatedWires:
 
 
 def line_generator(seed: int, *line: int) -> np.random.Generator:
-    """Return the random generator for a serial line's faults, independent of the seed's other generators."""
+    """Return a serial line's random generator for faults, independent of other uses of the seed."""
     return np.random.default_rng([seed, _LINE_STREAM, *line])
 
 
 @dataclass(frozen=True, slots=True)
 class Emulation:
-    """What an emulator of a device is given.
+    """Inputs of a device's emulator.
 
     Attributes:
         kind: section of the device in the configuration, for example `gps`.
         wires: emulated connections, to which the emulator connects its device.
         config: configuration of the flight.
-        section: section `simulation`, with the truth that differs from the configuration.
+        section: section `simulation`, with true values that differ from the configuration.
         generator: random generator of this device.
         now_ns: function that returns the simulation time, ns.
         start_ns: simulation time at the start, ns.
-        world: the world; the coils, which are built first, must not use it.
+        world: simulated world; the emulator of the coils, which is built before the world, must not use it.
         sense: function from a time (ns) to the motion and magnetic field at the inertial unit, with the
             unit's calibration errors and the field of the coils.
         supply: function from the begin and end of a time window (ns) to the mean supply voltage (V) and

@@ -2,13 +2,13 @@
 
 A free-running camera has no trigger. The camera exposes frames continuously, and the kernel stamps each frame
 with the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. The driver
-returns earlier frames to the kernel without reading their pixels.
+returns the buffers of earlier frames to the kernel without reading their pixels.
 
 A flag of the kernel driver states whether the time stamp refers to the start of exposure (SOE) or to the end
 of the frame. The kernel driver uvcvideo always sets the flag SOE. Unless the module parameter `hwtimestamps`
 is set, however, uvcvideo stamps the arrival of the first packet of a frame (uvc_video_decode_start), which is
-after the end of the exposure. The setting `Stamp` can override the meaning of the time stamps that the kernel
-driver states.
+after the end of the exposure. The setting `stamp` can override the meaning of the time stamps that the kernel
+driver flags.
 
 `VideoDevice` executes the system calls. A failed call raises OSError with the kernel's errno. The device is
 opened in non-blocking mode, so that no call waits for a frame. The structures and request numbers are those
@@ -302,7 +302,7 @@ class VideoDevice:
         return PixelLayout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
 
     def set_interval(self, interval_ns: int) -> int:
-        """Request a frame interval (ns) and return the resulting interval, 0 if it cannot be set."""
+        """Request a frame interval (ns) and return the resulting interval, or 0 if it cannot be set."""
         answer = StreamParameters(type=VIDEO_CAPTURE)
         try:
             self._ask(G_PARM, answer)
@@ -318,7 +318,7 @@ class VideoDevice:
         return time.numerator * _SECOND_NS // time.denominator if time.denominator else 0
 
     def control_range(self, control: int) -> ControlRange | None:
-        """Return the value range of a control, None if the device does not have the control."""
+        """Return the value range of a control, or None if the device does not have the control."""
         answer = QueryControl(id=control)
         try:
             self._ask(QUERYCTRL, answer)
@@ -354,7 +354,7 @@ class VideoDevice:
         return int(request.count)
 
     def dequeue(self) -> Filled | None:
-        """Return the oldest filled buffer, None if there is none.
+        """Return the oldest filled buffer, or None without a filled buffer.
 
         The caller must return the buffer by `queue`.
         """
@@ -381,7 +381,7 @@ class VideoDevice:
             return
         if self._streaming:
             self._streaming = False
-            with contextlib.suppress(OSError):  # a lost camera has already stopped
+            with contextlib.suppress(OSError):  # stopping a lost camera raises an error
                 self._ask(STREAMOFF, ctypes.c_int(VIDEO_CAPTURE))
         for memory in self._maps:
             memory.close()
@@ -420,7 +420,7 @@ class V4l2Settings:
         columns, rows: size of the image, pixels.
         pixel_format: name of a pixel format in PIXEL_FORMATS.
         exposure_ns: usual exposure time, ns; the frame interval is set to the same value.
-        gain: gain in the camera's own units, None to leave the gain unchanged.
+        gain: gain in the camera's own units, or None to leave the gain unchanged.
         stamp: meaning of the time stamps.
         stamp_delay_ns: delay of the time stamp after the start or end of exposure, ns.
         settling: number of frames that may still have the old exposure time after a change.
@@ -448,10 +448,10 @@ UVC_STAMPS = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
 
 # A time stamp can be slightly in the future, because the kernel estimates the offset of the camera's clock.
 _STAMP_AHEAD_NS = 10_000_000
-# tolerance of the frame interval, relative to the exposure time
+# Tolerance of the frame interval, relative to the exposure time.
 _INTERVAL_SLACK = 0.05
 _CONTRADICTIONS = 3
-# consecutive absurd time stamps after which the camera is reopened
+# Number of consecutive impossible time stamps after which the camera is reopened.
 _ABSURD = 8
 
 
@@ -466,7 +466,7 @@ class ExposureTiming:
         self._counts = counts
         self._arrival_stamps = False
         self._contradictions = 0
-        self._absurd = 0  # consecutive frames with an absurd time stamp
+        self._absurd = 0  # number of consecutive frames with an impossible time stamp
         self._stamp_ns = 0  # last valid time stamp
 
     def begin(self, driver: str) -> None:
@@ -475,9 +475,9 @@ class ExposureTiming:
         self._contradictions = self._absurd = self._stamp_ns = 0
 
     def start_of(self, filled: Filled, exposure_ns: int) -> int | None:
-        """Return the host time (ns) of the start of a frame's exposure, or None for an absurd time stamp.
+        """Return the host time (ns) of the start of a frame's exposure, or None for an impossible time stamp.
 
-        A time stamp must not be in the future, nor earlier than that of the previous frame. Raises
+        A time stamp in the future, or earlier than that of the previous frame, is impossible. Raises
         CorruptData after several consecutive impossible time stamps, and for time stamps of a different
         clock.
         """
@@ -488,7 +488,7 @@ class ExposureTiming:
             self._counts.absurd += 1
             self._absurd += 1
             if self._absurd >= _ABSURD:
-                # A clock that has stepped back must not block the camera after it is opened again.
+                # The reset allows the camera to be opened again after its clock has stepped back.
                 self._absurd = self._stamp_ns = 0
                 raise CorruptData(
                     self._name,
@@ -509,9 +509,9 @@ class ExposureTiming:
     def contradicts(self, interval_ns: int, exposure_ns: int) -> bool:
         """Return whether the interval between two frames is shorter than the reported exposure time.
 
-        A body rate is computed from streak length divided by exposure time, so that a wrong exposure time
-        makes all rates wrong. A single short interval can be caused by a late time stamp. Raises Refused
-        after several consecutive short intervals.
+        Body rates are computed as streak length divided by exposure time, so a wrong exposure time would make
+        all rates wrong. A single short interval can be caused by a late time stamp. Raises Refused after
+        several consecutive short intervals.
         """
         if interval_ns >= exposure_ns * (1.0 - _INTERVAL_SLACK):
             self._contradictions = 0
@@ -590,7 +590,7 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
 
 
 def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
-    """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange."""
+    """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange if this fails."""
     if device.control_range(AUTO_GAIN) is not None:
         device.set_control(AUTO_GAIN, 0)
     gain = settings.gain
@@ -649,7 +649,7 @@ class V4l2Camera:
         self._trigger_ns: int | None = None
         self._changed_ns = 0
         self._to_settle = 0
-        self._failing_ns: int | None = None  # time of the first of consecutive read failures
+        self._failing_ns: int | None = None  # time of the first of successive read failures
 
     def open(self) -> None:
         """Open the device and start streaming. Raises NotResponding, Refused or OutOfRange with advice."""
@@ -678,9 +678,9 @@ class V4l2Camera:
             raise meaning(self.name, error, "setting the exposure") from error
 
     def collect(self) -> Frame | None:
-        """Return the selected frame, None if it has not arrived. Raises DeviceError.
+        """Return the selected frame, or None if it has not arrived. Raises DeviceError.
 
-        Frames other than the selected frame are returned to the kernel.
+        The buffers of other frames are returned to the kernel.
         """
         device = self._opened()
         try:
@@ -701,7 +701,7 @@ class V4l2Camera:
             device.close()
 
     def _dequeue(self, device: VideoDevice) -> Filled | None:
-        """Return the oldest filled buffer, None if there is none or during a short read failure."""
+        """Return the oldest filled buffer, or None without one or during a short read failure."""
         try:
             filled = device.dequeue()
         except OSError as error:
@@ -770,7 +770,7 @@ class V4l2Camera:
         return Frame(number, start_ns, self._exposure_ns, self._clock.now_ns(), pixels)
 
     def _start_of(self, filled: Filled) -> int | None:
-        """Return the start (ns) of a frame's exposure, or None for a damaged or absurdly timed frame."""
+        """Return the start (ns) of a frame's exposure, or None for a damaged frame or an impossible time."""
         layout, pixels = self._layout, self._pixels
         if filled.flags & FLAG_ERROR:
             self.counts.spoiled += 1

@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 MOST_COILS = 6
-"""Largest number of coils: two complete sets of three, for which the telemetry packets have room."""
+"""Largest number of coils: two sets of three, for which the telemetry packets have fields."""
 COIL_NAMES = ("x", "y", "z", "4", "5", "6")
-"""Names of the coils in messages, in order of the list; a fourth and further coil is named by its number."""
+"""Names of the coils in messages, in configured order; from the fourth coil on, the names are numbers."""
 Axes = frozenset[int]
 """Indices of coils in the order of `COIL_NAMES`."""
 NO_AXES: Axes = frozenset()
@@ -56,8 +56,8 @@ class ImuReading:
 class ImuLink:
     """Counters of the inertial unit's serial line since the start of the driver.
 
-    The counters never decrease. On a silent line, `last_byte_ns` does not change. On a corrupted line, bytes
-    arrive but no packets.
+    The counters never decrease. If the line is silent, `last_byte_ns` does not change. If the line is
+    corrupted, bytes arrive but no packets.
 
     Attributes:
         bytes_received: number of received bytes.
@@ -94,7 +94,7 @@ class GpsReading:
         velocity_sigma: reported standard deviation of the velocity per axis, m/s, or NaN if unknown.
         satellites: number of GPS satellites used in the solution.
         valid: whether the receiver reports time, leap seconds and position as valid.
-        rolled_over: whether the date was moved by 1024 weeks, after which the receiver's week number repeats.
+        rolled_over: whether the date was moved by 1024 weeks, the period of the receiver's week number.
     """
 
     time_ns: int
@@ -126,8 +126,8 @@ class GpsLink:
         rolled_over: number of navigation solutions whose date was moved by 1024 weeks.
         refused: number of commands that the receiver rejected.
         refusal: text about the last rejected command, or an empty text.
-        protocol: protocol version that the receiver reports, 0 if unknown.
-        condition: reason why no usable fix arrives, with its remedy, or an empty text.
+        protocol: protocol version that the receiver reports, or 0 if unknown.
+        condition: reason why no usable fix arrives, with the remedy, or an empty text.
         last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
     """
 
@@ -184,7 +184,7 @@ class PowerReading:
         voltage: mean supply voltage over about one second, V.
         current: mean total current of the coils over about one second, A.
         power: mean power over about one second, W.
-        newest: total current in the newest ADC conversion, A.
+        newest: total current of the newest ADC conversion, A.
         newest_since_ns: earliest possible start of the newest ADC conversion, host time in ns.
         clipped: whether a conversion exceeded the range of the monitor, so that the true current may be
             larger.
@@ -206,14 +206,14 @@ class CoilState:
     Attributes:
         command: (3,) requested currents, A.
         current: (3,) currents written to the PWM chip, limited and rounded to PWM counts, A.
-        written_ns: host time since which these currents are written, ns; -1 before the first write.
+        written_ns: host time at which these currents were first written, ns; -1 before the first write.
         saturated: whether the current of any coil was limited.
         command_ns: host time of the newest command, ns; -1 before the first command.
         stale: whether the newest command was too old, so that the driver set the coils to zero.
         faults: number of failed bus transactions since start.
-        error: text of the current failure, empty if the last transaction succeeded.
-        braked: flags of the bridges with both inputs high, in which a leg that is stuck high drives no
-            current.
+        error: text of the present failure, or an empty text if the last transaction succeeded.
+        braked: flags of the braked bridges, which have both inputs high so that no current flows even if a
+            leg is stuck high.
     """
 
     command: FloatArray
@@ -262,7 +262,7 @@ class TorqueCoils(Protocol):
     def command(self, currents: FloatArray) -> None:
         """Request the current of each coil (n,), A. Never waits for the bus.
 
-        Currents above the limit are limited. If a value is not finite, the coils are set to zero and
+        Larger currents are reduced to the limit. If a value is not finite, the coils are set to zero and
         OutOfRange is raised.
         """
 
@@ -291,7 +291,7 @@ class PowerMonitor(Protocol):
     """Monitor of the total current and power of the coils."""
 
     def latest(self) -> PowerReading | None:
-        """Return the newest reading, None before the first reading."""
+        """Return the newest reading, or None before the first reading."""
 
     def error(self) -> str:
         """Return the text of the current failure, or an empty text while readings arrive."""
@@ -307,7 +307,7 @@ class FrameSource(Protocol):
         """Start one exposure now. Raises NotResponding if the camera is lost."""
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, None if there is no new frame. Never blocks."""
+        """Return the newest finished frame once, or None without a new frame. Never blocks."""
 
     def close(self) -> None:
         """Close the camera."""
@@ -333,7 +333,7 @@ class SolarStrings(Protocol):
     """Monitor of the currents of the solar cell strings."""
 
     def latest(self) -> StringReading | None:
-        """Return the newest reading, None before the first reading."""
+        """Return the newest reading, or None before the first reading."""
 
     def error(self) -> str:
         """Return the text of the current failure, or an empty text while readings arrive."""

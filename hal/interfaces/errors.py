@@ -20,7 +20,7 @@ class NotResponding(DeviceError):
 
 
 class _Answering:
-    """The context manager of `answering`, a class because a generator would be several times as slow."""
+    """Context manager of `answering`; a class, because a generator would be several times as slow."""
 
     __slots__ = ("_device",)
 

@@ -29,7 +29,7 @@ FAILED = b"x"
 
 
 NOTE = "coils"
-"""Name of the file that contains the I2C bus of the coils' chips and the writes that switch them off."""
+"""Name of the file with the I2C bus of the coils' chips and the writes that switch the coils off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class CoilReach:
 
     @property
     def words(self) -> list[str]:
-        """The numbers of the writes as hexadecimal words."""
+        """Addresses, registers and values of the writes as hexadecimal words."""
         return [f"0x{number:02x}" for write in self.writes for number in write]
 
     def note(self, folder: Path) -> None:

@@ -1,7 +1,8 @@
 """Protocols of the connections to the hardware: clock, serial port, I2C bus, and the rig that contains them.
 
-The package hal implements these Protocols on Linux, and sim_hal implements them with emulated devices. Flight
-and simulation differ only below these Protocols, so that each simulated run executes the flight drivers.
+The package hal implements these Protocols on Linux, and sim_hal implements them with emulated devices. Above
+these Protocols, flight and simulation use the same software, so that each simulated run executes the flight
+drivers.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from hal.interfaces.guardian import CoilReach
 
 SECOND_NS = 1_000_000_000
 LATE_NS = 25_000_000
-"""Lateness (ns) of an emulated device that a flight can notice: the period of a control cycle."""
+"""Lateness (ns) of an emulated device that affects a flight: the period of a control cycle."""
 
 
 class Ticker(Protocol):
@@ -46,9 +47,9 @@ class Ticker(Protocol):
 
 
 class Clock(Protocol):
-    """Clock of the flight, with monotonic time in integer nanoseconds.
+    """Clock of the flight software, with monotonic time in integer nanoseconds.
 
-    All modules get the time from a clock.
+    All modules get the time from such a clock.
     """
 
     def now_ns(self) -> int:
@@ -94,7 +95,7 @@ class SerialPort(Protocol):
 
 
 class I2cBus(Protocol):
-    """I2C bus with the methods of smbus2 that the drivers use. Each call is one bus transaction.
+    """I2C bus with those methods of smbus2 that the drivers use. Each call is one bus transaction.
 
     A call returns within the timeout of the bus, and raises OSError with the kernel's I2C fault code if the
     bus or device does not answer. The methods are thread-safe.
@@ -127,23 +128,27 @@ class RawI2cBus(I2cBus, Protocol):
 
 
 class SpiDevice(Protocol):
-    """One device on an SPI bus, which its chip select line selects during each frame."""
+    """One device on an SPI bus, which is selected by its chip select line during each frame."""
 
     def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
         """Send frames one after the other, and return the bytes received during each. Raises OSError."""
 
 
 class Wires(Protocol):
-    """Connections to the devices, opened by name: those of the board, or emulated ones of the same names.
+    """Connections to the devices, opened by name: those of the board, or emulated connections.
 
-    A connection that is already open is returned again, and all are closed at the end of the flight.
+    A connection that is already open is returned again, and all connections are closed at the end of the
+    flight.
     """
 
     def serial(self, device: str, baud_rate: int) -> SerialPort:
         """Return the serial port of a device file. Raises NotResponding."""
 
     def i2c(self, bus: int | str | None = None) -> RawI2cBus:
-        """Return an I2C bus, by number or file; None means the bus of the coils. Raises DeviceError."""
+        """Return the I2C bus with a number or device file; None means the bus of the coils.
+
+        Raises DeviceError.
+        """
 
     def spi(self, device: str, speed_hz: int, mode: int) -> SpiDevice:
         """Return a device on an SPI bus, for example `/dev/spidev0.0`. Raises DeviceError."""
@@ -153,7 +158,7 @@ class HostFaults(Protocol):
     """Simulated faults inside the flight process, in its workers and file operations."""
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return copies of the worker specifications whose functions can fail by simulated faults."""
+        """Return copies of the worker specifications with functions that can fail by simulated faults."""
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
         """Return a wrapper of the job runner `runner` that can fail.
@@ -167,21 +172,22 @@ class HostFaults(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Hardware or simulation on which a flight runs: clock, connections and settings.
+    """Hardware or simulation on which the flight software runs: clock, connections and settings.
 
     Attributes:
-        clock: clock of the flight.
+        clock: clock of the flight software.
         wires: connections to the devices.
         release: function called with the clock time of mission time zero, ns, when the flight starts.
         realtime: whether the flight runs in real time; otherwise it is a lock-step simulation.
-        seed: seed of the simulation, 0 on hardware.
+        seed: seed of the simulation, or 0 on hardware.
         latency: simulated latencies of planner and vision (ns), used in a lock-step simulation only.
-        reach: access of the guardian to the coils, used in real time only.
-        host: simulated faults inside the flight process, None for no faults.
-        cameras: emulated cameras, first the star camera, if fitted; None if the drivers open real cameras.
-        earliest_utc_ns: UTC (ns since 1970) before the flight, by which a GPS receiver's week is resolved.
+        reach: how the guardian accesses the coils, used in real time only.
+        host: simulated faults inside the flight process, or None.
+        cameras: emulated cameras, beginning with the star camera (None if not fitted); None for real cameras.
+        earliest_utc_ns: earliest possible UTC (ns since 1970) of the flight, which resolves the ambiguous
+            week number of a GPS receiver.
         lateness: function that returns how often emulated devices in real time were later than `LATE_NS`, and
-            their largest lateness, s; None for other devices.
+            their largest lateness, s; None without emulated devices in real time.
     """
 
     clock: Clock

@@ -1,8 +1,9 @@
 """Parameters, optics and detector of the camera that views Earth and Sun.
 
 The optics blur the Earth's image by a narrow Gaussian and scatter a little light over the whole frame. The
-Sun's disc has limb darkening, can be hidden by the Earth, and is dimmed by the air. Scattering in the optics
-causes the Sun's glare. The detector has a response curve, noise and fixed-pattern noise, and outputs counts.
+Sun's disc has limb darkening, can be hidden by the Earth, and is dimmed by the atmosphere. Scattering in the
+optics causes the Sun's glare. The detector has a response curve, noise and fixed-pattern noise, and outputs
+counts.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EarthCameraModel:
-    """A wide-angle CMOS camera; the radiance of a white Lambertian surface with the Sun at the zenith is 1.
+    """A wide-angle CMOS camera; radiance 1 is that of a white Lambertian surface with the Sun at the zenith.
 
     Attributes:
         lens: camera geometry, a `Pinhole` or a `Lens` with distortion.
@@ -75,7 +76,7 @@ class EarthCameraModel:
         blooming: whether charge beyond the full well spills along the column, for the linear response.
         pedestal: counts of a pixel without light.
         noise: standard deviation of the temporal noise, counts, for the logarithmic response.
-        fixed_pattern: standard deviation of the pixels' constant offsets after calibration, counts.
+        fixed_pattern: standard deviation of the constant pixel offsets after calibration, counts.
         response_spread: relative standard deviation of the pixels' sensitivities, for the linear response.
         dead_pixels: number of pixels that always read zero.
         hot_pixels: number of pixels that always read a bright value.
@@ -84,7 +85,7 @@ class EarthCameraModel:
         scatter: fraction of the light that the optics scatter over wide angles.
         scatter_angle: angle at which the scattered light has half its central radiance, rad.
 
-    Raises OutOfRange for values out of range, and ValueError for a lens with other numbers of rows and
+    Raises OutOfRange for values out of range, and ValueError for a lens with different numbers of rows and
     columns.
     """
 
@@ -169,7 +170,7 @@ def pixel_rays(lens: CameraModel) -> FloatArray:
 def _pixel_rays(lens: Lens) -> FloatArray:
     rows, columns = np.mgrid[0 : lens.rows, 0 : lens.columns]
     rays = lens.unit_vectors(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float))
-    rays = np.asfortranarray(rays)  # so that the computations along the rays are fast
+    rays = np.asfortranarray(rays)  # column-major order makes the computations along the rays fast
     rays.setflags(write=False)
     return rays
 
@@ -181,7 +182,7 @@ def _coarse_rays(lens: Lens) -> Float32Array:
 
 
 _SUBPIXELS = 6
-"""Number of sampling points of the Sun's disc per pixel along each axis."""
+"""Number of sampling points per pixel along each axis, for the Sun's disc."""
 
 
 def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -> None:
@@ -214,10 +215,10 @@ def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) ->
 def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -> None:
     """Add the sunlight that the optics scatter to `image` (rows, columns).
 
-    The scattered radiance decreases from its centre as 1/(1 + (s/s0)^2) with the chord s, which is the
-    Harvey-Shack model for polished optics with a slope of two. The fraction `scatter` of the light is
-    scattered over the hemisphere. The lens has no hood, so sunlight reaches the lens from the whole half
-    space in front of the camera.
+    The scattered radiance decreases from its centre as 1/(1 + (s/s0)^2), where s is the chord between unit
+    vectors. This is the Harvey-Shack model for polished optics with a slope of two. The fraction `scatter` of
+    the light is scattered over the hemisphere. The lens has no hood, so sunlight reaches it from the entire
+    hemisphere in front of the camera.
     """
     axis, _ = towards_sun(scene)
     if axis[2] <= 0.0 or model.scatter == 0.0:
@@ -242,7 +243,7 @@ def scatter_centre(model: EarthCameraModel) -> float:
 def _window(
     lens: CameraModel, axis: FloatArray, radius: float, margin: int
 ) -> tuple[int, int, int, int] | None:
-    """Return left, top, width and height of the window that contains the blurred Sun's disc, or None."""
+    """Return left, top, width and height of the blurred Sun's window, or None if it is outside the frame."""
     angle = np.arange(16) * (np.pi / 8.0)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(axis)
     # A 16-sided polygon contains the disc if its corners are 1/cos(pi/16) times as far from the centre.
@@ -250,7 +251,7 @@ def _window(
     rim = rim[~np.isnan(rim[:, 0])]
     if not len(rim):
         return None
-    # The rim's pixels are clipped before the cast to int, because they overflow near 90 deg off axis.
+    # Image points are clipped before the cast to int, because they overflow near 90 deg off axis.
     outer = np.array([lens.columns, lens.rows]) - 1 + margin
     low = np.maximum(np.floor(rim.min(axis=0)) - margin, -margin)
     high = np.minimum(np.ceil(rim.max(axis=0)) + margin, outer)
@@ -290,7 +291,7 @@ def _scattered(model: EarthCameraModel, image: Float32Array) -> Float32Array:
 
 @lru_cache(maxsize=4)
 def _between(bins: int, pixels: int) -> Float32Array:
-    """Return the matrix (pixels, bins) of the linear interpolation from the centres of bins to pixels."""
+    """Return the matrix (pixels, bins) that interpolates linearly from bin centres to pixels."""
     place = np.clip((np.arange(pixels) + 0.5) / _BIN - 0.5, 0.0, bins - 1.0)
     return np.maximum(1.0 - np.abs(place[:, None] - np.arange(bins)), 0.0).astype(np.float32)
 
@@ -299,9 +300,9 @@ def _between(bins: int, pixels: int) -> Float32Array:
 def _kernel(
     down: int, across: int, scatter: float, angle: float, focal_length: float
 ) -> tuple[npt.NDArray[np.complex64], tuple[int, int]]:
-    """Return the Fourier transform of the scattering kernel between bins, and the shape of the transform.
+    """Return the Fourier transform of the scattering kernel between bins, and the padded array shape.
 
-    The kernel has the profile of `add_glare`, with image distances divided by the focal length as angles.
+    The kernel has the radial profile of `add_glare`; angles are image distances divided by the focal length.
     """
     shape = (next_fast_len(2 * down), next_fast_len(2 * across))
     y, x = (np.minimum(np.arange(n), n - np.arange(n)) * (_BIN / focal_length) for n in shape)
@@ -332,7 +333,7 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
     flat = signal.reshape(-1)
     flat[dead] = 0.0
     flat[hot] = hot_counts
-    signal += np.float32(0.5)  # with 0.5, truncation rounds to the nearest count
+    signal += np.float32(0.5)  # adding 0.5 makes the truncation round to the nearest count
     np.clip(signal, 0.0, model.highest_count, out=signal)
     return np.asarray(signal.astype(model.count_type))
 
@@ -340,8 +341,8 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
 def spill(charge: Float32Array, full_well: float) -> None:
     """Spread charge beyond the full well along the columns of `charge` (rows, columns).
 
-    Half of the excess moves up and half moves down. Each pixel fills up before the next one receives charge,
-    and charge that reaches an edge of the detector is lost.
+    Half of the excess moves up and half moves down. Each pixel fills up before the next pixel receives
+    charge, and charge that reaches an edge of the detector is lost.
     """
     for column in np.flatnonzero(np.any(charge > full_well, axis=0)):
         line = charge[:, column]
@@ -365,7 +366,7 @@ def _normal(model: EarthCameraModel, sigma: float, generator: np.random.Generato
 def _pattern(
     model: EarthCameraModel,
 ) -> tuple[Float32Array, Float32Array, IntArray, IntArray, Float32Array]:
-    """Return the pixels' offsets (counts), sensitivity errors, dead pixels, hot pixels and hot counts."""
+    """Return pixel offsets (counts), sensitivity errors, dead pixels, hot pixels and hot pixels' counts."""
     rng = np.random.default_rng(model.seed)
     size = model.rows * model.columns
     offsets = _normal(model, model.fixed_pattern, rng)
@@ -377,7 +378,7 @@ def _pattern(
 
 
 _FINE = np.sqrt(1.0 / 12.0) * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
-"""Offsets (4, 2), px, of two Gauss-Legendre points along each axis from a pixel's centre."""
+"""Offsets (4, 2), px, of 2 x 2 Gauss-Legendre points from a pixel's centre."""
 
 
 def render(model: EarthCameraModel, scene: EarthScene, generator: np.random.Generator) -> Image:
@@ -413,7 +414,8 @@ def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
     light[near] = found
     at_limb = near[~sight.hits & (found > 0.0)]
     if len(at_limb):
-        # Pixels whose centre is on the ground next to the limb may extend beyond the limb.
+        # Pixels next to the limb are included, because a pixel with its centre on the ground may extend
+        # beyond the limb.
         wide = np.zeros((model.rows + 2, model.columns + 2), dtype=bool)
         down, across = np.divmod(at_limb, model.columns)
         for step in range(9):

@@ -2,8 +2,8 @@
 
 Radiance is stated relative to that of a white Lambertian surface with the Sun at the zenith.
 
-The air density decreases exponentially with height. The air scatters sunlight once, which gives the soft
-limb, twilight, and haze over the ground. The optical depth along an oblique path is the vertical optical
+The air density decreases exponentially with height. Single scattering of sunlight in the air produces the
+soft limb, twilight, and haze over the ground. The optical depth along an oblique path is the vertical optical
 depth times Chapman's function. For a scale height far below the Earth's radius this function is sqrt(pi X/2)
 exp(X mu^2/2) erfc(mu sqrt(X/2)), where X is the ratio of Earth radius to scale height and mu the cosine of
 the zenith angle (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). The formula is also valid for
@@ -14,7 +14,7 @@ Lines of sight are intersected exactly with the WGS 84 ellipsoid, in axes that a
 ellipsoid is the unit sphere. The ground is Lambertian. Direct sunlight is attenuated by the air on the way to
 the ground and again on the way to the camera. Land, sea and cloud are noise with a power-law spectrum,
 sampled on a sphere in a periodic volume at two scales: continents and weather, and coasts and single clouds.
-The map is not the real Earth, but has the bright edges inside the limb that disturb a horizon detector.
+The map does not show the real Earth, but has bright edges inside the limb, which disturb a horizon detector.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 
 ATMOSPHERE = "atmosphere"
 _DEEPEST = -9.0
-"""Smallest argument of erfcx, at which the optical depth is already 1e35; smaller arguments are clipped."""
+"""Smallest argument of erfcx (optical depth 1e35); smaller arguments are clipped to this value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Atmosphere:
         scale_height: m.
         optical_depth: vertical optical depth, by default of Rayleigh scattering at 550 nm (Bucholtz 1995,
             Appl. Opt. 34).
-        multiple: ratio of all scattered light to light that is scattered once.
+        multiple: ratio of all scattered light to singly scattered light.
     """
 
     scale_height: float = 8000.0
@@ -96,7 +96,7 @@ class Atmosphere:
         return np.asarray(self.optical_depth * math.sqrt(math.pi) * root * erfcx(argument))
 
     def scattered(self, depth: Float32Array, bottom: Float32Array, sunward: Float32Array) -> Float32Array:
-        """Return the fraction of sunlight scattered along lines of sight, before the phase function.
+        """Return the fraction of sunlight scattered along lines of sight, without the phase function.
 
         `depth` (...) is the optical depth along the line of sight. `bottom` (...) is the air density at the
         line's lowest point, relative to the ground. `sunward` (...) is the optical depth towards the Sun,
@@ -124,7 +124,7 @@ def _icrs_pole() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarthScene:
-    """Positions and attitudes of camera, Earth and Sun at one time.
+    """Positions and attitudes of camera, Earth and Sun at one instant.
 
     Attributes:
         position: geocentric position (3,) of the camera, m, ICRS.
@@ -196,7 +196,7 @@ _SLOPE = -2.3
 _RADIUS = 0.42 * _CELLS
 """Radius (cells) of the Earth's sphere in the noise volume."""
 _MAGNIFICATION, _FINE = 11.0, 0.5
-"""Spatial scale and amplitude of the fine noise relative to the coarse noise."""
+"""Magnification of the coordinates, and amplitude, of the fine noise relative to the coarse noise."""
 _SOFT = 0.1
 """Width of the transition at a coast or a cloud edge, in standard deviations of the noise."""
 
@@ -216,7 +216,7 @@ def albedo(directions: FloatArray | Float32Array, seed: int) -> Float32Array:
 
 
 def _covered(heights: Float32Array, share: float) -> Float32Array:
-    """Return the cover by land or cloud (n,), from 0 to 1, where a noise is (n,); its mean is `share`."""
+    """Return the cover (n,), from 0 to 1 with mean `share`, by land or cloud for noise values (n,)."""
     above = (heights - np.float32(ndtri(1.0 - share))) / np.float32(_SOFT) + np.float32(0.5)
     return np.asarray(np.clip(above, 0.0, 1.0))
 
@@ -224,7 +224,7 @@ def _covered(heights: Float32Array, share: float) -> Float32Array:
 def _read(noise: npt.NDArray[np.complex64], places: Float32Array) -> npt.NDArray[np.complex64]:
     """Return the periodic noise (n,), interpolated linearly between the cells, at `places` (3, n) in cells.
 
-    The land's noise is the real part and the cloud's the imaginary part, so that both are read at once.
+    The real part is the noise for land and the imaginary part that for clouds, so both are read at once.
     """
     low = np.floor(places)
     along, across, up = places - low
@@ -244,7 +244,7 @@ def _read(noise: npt.NDArray[np.complex64], places: Float32Array) -> npt.NDArray
 def _between(
     before: npt.NDArray[np.complex64], after: npt.NDArray[np.complex64], share: Float32Array
 ) -> npt.NDArray[np.complex64]:
-    """Return the linear interpolation (n,) between two values (n,), which overwrites `after`."""
+    """Return the linear interpolation (n,) between values `before` and `after` (n,), overwriting `after`."""
     after -= before
     after *= share
     after += before
@@ -255,7 +255,7 @@ def _between(
 def _noise(seed: int) -> npt.NDArray[np.complex64]:
     """Return two periodic volumes of independent noise of unit variance, as one flat array.
 
-    The real part is the noise of the land, and the imaginary part the noise of the clouds.
+    The real part is the noise for land, and the imaginary part is the noise for clouds.
     """
     across = np.fft.fftfreq(_CELLS, 1.0 / _CELLS).astype(np.float32)
     wave = np.sqrt(across[:, None, None] ** 2 + across[None, :, None] ** 2 + across**2)
@@ -294,7 +294,7 @@ class EarthIntersection:
 
 
 def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
-    """Return the intersections of `rays` (n, 3), camera axes and any length, with the Earth."""
+    """Return the intersections of `rays` (n, 3) of any length, in camera axes, with the Earth."""
     axes = semi_axes()
     origin = scene.in_earth(scene.position) / axes
     into_earth = (scene.camera_matrix @ scene.earth_matrix.T) / axes
@@ -316,9 +316,9 @@ def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
 
 
 def near_earth(scene: EarthScene, rays: Float32Array) -> IntArray:
-    """Return the indices of the `rays` (n, 3), camera axes, that may pass the Earth below the height `TOP`.
+    """Return the indices of the `rays` (n, 3), camera axes, that may pass below the height `TOP`.
 
-    The indices include all rays for which `look` finds such a height, and some others.
+    The indices include all rays for which `look` returns a height below `TOP`, and some further rays.
     """
     axes = semi_axes()
     origin = scene.in_earth(scene.position) / axes
@@ -382,7 +382,7 @@ def _unit(vectors: Float32Array) -> Float32Array:
 RIM_DARKENING = 0.6
 """Linear coefficient of limb darkening near 550 nm (Cox 2000, Allen's Astrophysical Quantities)."""
 _RINGS, _SPOKES = 24, 48
-"""Numbers of rings and spokes of the sampling points on the Sun's disc."""
+"""Numbers of rings and of radial directions of the sampling points on the Sun's disc."""
 
 
 def nadir(scene: EarthScene) -> FloatArray:
@@ -409,7 +409,7 @@ def visible_share(scene: EarthScene) -> float:
 
 
 def darkening(share: FloatArray) -> FloatArray:
-    """Return the brightness of the Sun's disc, relative to its mean, at squared radii (...) from 0 to 1."""
+    """Return the brightness of the Sun's disc (mean 1) at squared relative radii (...) from 0 to 1."""
     rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
     return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
 

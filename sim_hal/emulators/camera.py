@@ -1,4 +1,4 @@
-"""A camera that exposes along the body's true motion and delivers the frame after the read-out.
+"""Emulated camera that exposes along the body's true motion and delivers the frame after the read-out.
 
 The attitude is sampled every 10 ms during an exposure, and the renderer integrates the light along the
 sampled attitude. The renderer returns a future, so that another process can render in real time.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SAMPLE_NS = 10_000_000
 
 Expose = Callable[[int, FloatArray, FloatArray, "Sequence[SourceTrack]"], "Future[Image]"]
-"""Function that renders a frame from its number, times (k,), s, camera attitudes (k, 4) and object tracks."""
+"""Function that renders a frame from number, times (k,), s, camera attitudes (k, 4) and object tracks."""
 Moving = Callable[[int, FloatArray], "Sequence[SourceTrack]"]
 """Function that returns object tracks, given an exposure's start (ns) and times (k,), s, since the start."""
 
@@ -52,13 +52,13 @@ class _Exposure:
 
 
 class EmulatedCamera:
-    """An emulated camera, which is a FrameSource and an emulated device.
+    """An emulated camera, which implements FrameSource and EmulatedDevice.
 
     Attributes:
         fault: present fault, "off", "frozen", "torn" or a key of `SPOILT`; empty for a camera without a
             fault.
         late_ns: additional delay of the frames, ns.
-        one_of: number n of a fault in which the camera reacts only to every n-th trigger.
+        one_of: number n; because of a fault the camera reacts only to every n-th trigger if n exceeds 1.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class EmulatedCamera:
         self.advance(self._now_ns())
 
     def poll(self) -> Frame | None:
-        """Return the newest frame once, after its read-out, or None."""
+        """Return the newest frame once, or None before its read-out has ended."""
         exposure, now_ns = self._exposure, self._now_ns()
         if exposure is None or exposure.image is None or not exposure.image.done():
             return None
@@ -148,7 +148,7 @@ class EmulatedCamera:
         self._exposure = None
 
     def _alter(self, frame: Frame) -> Frame:
-        """Return the frame after the present fault has changed it."""
+        """Return the frame as changed by the present fault."""
         if self.fault == "frozen" and self._last is not None:
             return replace(frame, sequence=self._last.sequence, pixels=self._last.pixels)
         if self.fault == "torn" and self._last is not None:
@@ -177,7 +177,7 @@ def blinded(pixels: Image, seed: int) -> Image:
 
 
 def capped(pixels: Image, seed: int) -> Image:
-    """Return a frame behind a lens cap, with the level and the noise of the pixels without a star."""
+    """Return a frame as taken with a lens cap: the level and the noise of pixels without a star."""
     level = float(np.median(pixels))
     noise = 1.4826 * float(np.median(np.abs(pixels - level)))
     dark = np.random.default_rng(seed).normal(level, noise, pixels.shape)
@@ -193,4 +193,4 @@ SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }
-"""Functions that return each fault's pixels (rows, columns) from a frame's pixels and number."""
+"""Functions that change the pixels (rows, columns) of a frame with a given number, by fault."""

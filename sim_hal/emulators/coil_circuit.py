@@ -30,20 +30,20 @@ from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 
 Pulse = tuple[int, int]
-"""High time of an output in a PWM period, as first count and number of counts."""
+"""Time in a PWM period during which an output is high, as first count and number of counts."""
 
 _HISTORY_NS = 500_000_000
 """Time (ns) over which the supply current is recorded."""
 
 
 class Bridge(NamedTuple):
-    """Pulses on the inputs A and B of an H-bridge that is always enabled."""
+    """Pulses on the inputs A and B of an H-bridge, whose outputs are always enabled."""
 
     a: Pulse
     b: Pulse
 
     def net_counts(self) -> int:
-        """Return the signed number of PWM counts in which the coil is driven."""
+        """Return the signed number of PWM counts per period in which the coil is driven."""
         return self.a[1] - self.b[1]
 
     def driven(self) -> list[tuple[int, int]]:
@@ -63,7 +63,7 @@ class Bridge(NamedTuple):
 
 
 class Chopping(NamedTuple):
-    """Chopped current drawn from the supply after `since_ns`.
+    """Chopped supply current from a change of the PWM outputs until the next change.
 
     Attributes:
         since_ns: time at which the PWM outputs changed, ns.
@@ -124,7 +124,7 @@ _OFF = Bridge(_LOW, _LOW)
 
 
 class CoilCondition(Enum):
-    """Condition of a coil or its bridge; if one leg is stuck, the other leg follows its input."""
+    """Condition of a coil or its bridge; if one leg of the bridge is stuck, the other leg still works."""
 
     SOUND = "sound"
     OPEN = "open"
@@ -165,9 +165,9 @@ class CoilCircuit:
     ) -> None:
         """Create the circuit of coils with the true properties `truth`.
 
-        `uncertainty` (A) bounds the uniform random error of a coil current, which is drawn at each write of
-        the coil's channels. `bus_voltage` (V) is the voltage that a current monitor measures, by default the
-        coils' supply voltage.
+        `uncertainty` (A) is the bound of the uniform random error of a coil current, which is drawn at each
+        write of the coil's channels. `bus_voltage` (V) is the voltage that a current monitor measures, by
+        default the coils' supply voltage.
         """
         self.chip = chip
         self._coils = tuple(
@@ -201,14 +201,14 @@ class CoilCircuit:
         return self._currents
 
     def become(self, axis: int, condition: CoilCondition, short_ohm: float = 5.0) -> None:
-        """Set the condition of a coil; a shorted coil loads its bridge with `short_ohm`."""
+        """Set the condition of a coil; a shorted coil loads its bridge with `short_ohm` ohm."""
         self._conditions[axis] = condition
         self._stuck[axis] = _STUCK.get(condition, _FREE)
         self._short_ohm[axis] = short_ohm
         self.update(self._coils[axis][1])
 
     def update(self, written: int) -> None:
-        """Update the currents after a STOP. The bit mask `written` contains the written PWM channels."""
+        """Update the currents after an I2C STOP. The bit mask `written` contains the written PWM channels."""
         count, high = len(self._coils), self.chip.high
         draws = self._generator.random(count).tolist() if written else [0.5] * count
         for axis, ((channel_a, channel_b), channels, step, limit) in enumerate(self._coils):
@@ -235,7 +235,7 @@ class CoilCircuit:
             self._drawn[axis] = drawn
             self._values[axis] = current
         self._currents = np.array(self._values)
-        # Without an oscillator the outputs are constant, and any period gives the same currents.
+        # If the oscillator is off, the outputs are constant, and the currents do not depend on the period.
         period_ns = 1e9 / (self.chip.frequency or 1.0)
         pulses: tuple[tuple[Bridge, float], ...] = tuple(zip(self._bridges, self._drawn, strict=True))
         self._supply.note(Chopping(self._now_ns(), self.chip.counter_start_ns, period_ns, pulses))
@@ -297,7 +297,8 @@ class EmulatedIna219:
         self.frozen: dict[int, int] = {}
         self.lag_ns = 0
         self._calibration = 0
-        self._past: deque[tuple[int, int, int]] = deque()  # times, shunt and bus registers of conversions
+        # Times, shunt registers and bus registers of past conversions.
+        self._past: deque[tuple[int, int, int]] = deque()
         self.brown_out()
 
     def brown_out(self) -> None:
@@ -319,7 +320,7 @@ class EmulatedIna219:
             self._calibration = (self._calibration ^ 1 << bit) & _CALIBRATION_BITS
 
     def register(self, register: int) -> int:
-        """Return a register's word without the side effects of a bus read."""
+        """Return the content of a register without the side effects of a bus read."""
         if register in self.frozen:
             return self.frozen[register]
         self._convert()
@@ -399,7 +400,7 @@ class EmulatedIna219:
             self._past.popleft()
 
     def _shown(self) -> tuple[int, int]:
-        """Return the reported conversions of shunt and bus, which are `lag_ns` old."""
+        """Return the reported shunt and bus registers, which are `lag_ns` old."""
         if not self.lag_ns or not self._past:
             return self._shunt, self._bus
         until_ns = self._now_ns() - self.lag_ns
@@ -416,6 +417,6 @@ class EmulatedIna219:
 
 
 def _digitised(steps: float, code: int, low: int, high: int) -> int:
-    """Return the clipped register value of a voltage (12-bit steps) at the resolution of the ADC code."""
+    """Return the clipped register value of a voltage (12-bit steps), rounded to the ADC's resolution."""
     coarse = 1 if code & 8 else 1 << (3 - (code & 3))
     return min(high, max(low, round(steps / coarse) * coarse))

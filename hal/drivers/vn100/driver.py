@@ -1,18 +1,18 @@
 """VN-100 driver, which configures the unit, converts its output to readings and recovers a lost unit.
 
 The unit sends its attitude as a Hamilton quaternion (q0, q1, q2, q3), scalar last, which rotates the sensor
-frame into NED. In this project's convention the same four numbers rotate NED into the sensor frame. Constant
-linear maps in the settings convert the attitude and the measured vectors to the mission's reference frame and
-the body axes (`knightcube.astro.quaternion.attitude_map`). Readings that are not finite or physically
-impossible are rejected and counted.
+frame into NED. In this project's quaternion convention the same four numbers describe the rotation of NED
+into the sensor frame. Constant linear maps in the settings convert the attitude and the measured vectors to
+the mission's reference frame and the body axes (`knightcube.astro.quaternion.attitude_map`). Readings that
+are not finite or physically impossible are rejected and counted.
 
-The generator `set_up` yields the commands that configure a unit, and the caller decides how to
-wait for the answers. `Recovery` advances by one step at each poll and never blocks. A unit that lost power or
-was reset runs with the settings in its flash memory, possibly at another baud rate. Received packets, also
-packets of unknown fields, show that the baud rate is correct. If bytes arrive but no packets, the recovery
-first asks the unit at the configured baud rate. If the unit does not answer, the recovery tries other baud
-rates, alternating with the configured rate. At the correct baud rate, the recovery configures the unit again,
-one command at a time. A unit that sends an additional output is configured again as well.
+The generator `set_up` yields the commands that configure a unit, and receives the answers from its caller,
+which may wait or poll. `Recovery` advances by one step at each poll and never blocks. A unit that lost power
+or was reset runs with the settings in its flash memory, possibly at another baud rate. Received packets, even
+with unknown fields, show that the baud rate is correct. If bytes arrive but no packets, the recovery first
+sends a query at the configured baud rate. If the unit does not answer, the recovery tries other baud rates,
+alternating with the configured rate. At the correct baud rate, the recovery configures the unit again, one
+command at a time. A unit that sends an output that was not requested is also configured again.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ STANDARD_GRAVITY = 9.80665
 
 # A packet contains TimeStartup, Quaternion, AngularRate and Accel (group 1) and Mag (group 3).
 OUTPUT_SET = {0: 0x0131, 2: 0x0100}
-_QMR_LENGTH = 137  # length (bytes) of a VNQMR line with a CRC16
-_LINE_LOAD_LIMIT = 0.8  # largest fraction of the line capacity used by measurements
+_QMR_LENGTH = 137  # length (bytes) of an ASCII line VNQMR with a CRC16
+_LINE_LOAD_LIMIT = 0.8  # largest fraction of the serial line's capacity that measurements may use
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,8 +75,8 @@ class Vn100Settings:
             accepted.
         response_timeout_ns: timeout of an answer for each attempt, ns.
         tries: number of attempts to send a command before the unit is considered silent.
-        stuck_after: number of consecutive identical samples after which samples are rejected as stuck,
-            because a working sensor has noise; 0 disables the check.
+        stuck_after: number of consecutive identical samples after which samples are rejected as stuck; a
+            working sensor has noise. The value 0 disables the check.
     """
 
     attitude_map: FloatArray
@@ -122,7 +122,7 @@ PASSING_ERRORS = frozenset({-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF})
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Command to the unit, whose answer is recognised by the command's name and first field."""
+    """Command to the unit; its answer contains the same command name and first field."""
 
     command: str
     fields: tuple[object, ...]
@@ -151,7 +151,7 @@ class Question:
 
 
 Dialogue = Generator[Question, tuple[str, ...], None]
-"""Generator that yields commands and receives the fields of the answers. Raises Refused."""
+"""Generator that yields commands and receives the answers' fields. Raises Refused."""
 
 
 def set_up(settings: Vn100Settings) -> Dialogue:
@@ -208,8 +208,8 @@ def _same(asked: str, echoed: str, base16: bool) -> bool:
 # Baud rates in order of likelihood, beginning with the factory setting.
 BAUD_RATES = (115200, 230400, 921600, 460800, 57600, 38400, 19200, 9600)
 
-_PATIENCE_NS = 150_000_000  # time without a reading after which the recovery begins
-_LISTEN_NS = 90_000_000  # listening time at one baud rate, three packets at 40 Hz
+_PATIENCE_NS = 150_000_000  # time (ns) without a reading after which the recovery begins
+_LISTEN_NS = 90_000_000  # listening time (ns) at one baud rate: three packets at 40 Hz
 _REFUSED_WAIT_NS = 1_000_000_000
 
 
@@ -218,7 +218,7 @@ class Recovery:
 
     Attributes:
         completed: number of times the unit was configured again.
-        refusal: text of the unit's last refusal, empty if there was none.
+        refusal: text of the unit's last refusal, or an empty text.
     """
 
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
@@ -244,7 +244,7 @@ class Recovery:
 
     def reset(self) -> None:
         """Record that the unit has restarted, and therefore runs with the settings in its flash memory."""
-        # The first sample after a recovery shows the restart that the recovery has already handled.
+        # The first sample after a recovery shows the old restart, which the recovery has already handled.
         self._was_reset = not self._is_fresh
 
     def advance(
@@ -256,7 +256,8 @@ class Recovery:
             now_ns: current time, ns.
             readings: number of readings received in this poll.
             sentences: ASCII sentences received in this poll.
-            packets: number of valid packets received since the start of the driver, also of unknown fields.
+            packets: number of valid packets since the start of the driver, including those with unknown
+                fields.
             received: number of bytes received since the start of the driver.
 
         Raises NotResponding if the port is lost.
@@ -295,16 +296,16 @@ class Recovery:
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
         """Listen at the current baud rate and then either configure the unit or change the baud rate.
 
-        The unit is configured if valid packets arrive or if the line is silent. If only
-        invalid bytes arrive, the unit is first asked at the configured baud rate, because these bytes may be
-        packets of an unknown layout.
+        The unit is configured if valid packets arrive or if the line is silent. If only invalid bytes arrive,
+        the configuration is first tried at the configured baud rate, because these bytes may be packets with
+        an unknown layout.
         """
         assert self._listening_since_ns is not None
         if packets > self._packets:
             self._begin(now_ns)
         elif now_ns - self._listening_since_ns >= _LISTEN_NS:
             if received == self._bytes or not (self._has_asked or self._port.baud_rate != self._own_rate):
-                # A silent line is possible because the output of the unit is switched off.
+                # The line may be silent because the output of the unit is switched off.
                 self._has_asked = received != self._bytes
                 self._begin(now_ns)
             else:
@@ -359,7 +360,7 @@ class Recovery:
             self._is_fresh = True
             self.completed += 1
             self.refusal = ""
-            # If no readings arrive from now on, the recovery begins again after the usual time.
+            # If no readings arrive, the recovery begins again after `_PATIENCE_NS`.
             self._reading_ns = now_ns
 
     def _repeat(self, question: Question, now_ns: int) -> None:
@@ -390,8 +391,8 @@ class Recovery:
 TESLA_PER_GAUSS = 1e-4
 _UNIT_NORM_TOLERANCE = 1e-2
 _ZERO_RATE = (0.0, 0.0, 0.0)
-_CERTAIN = 4  # unexpected samples or messages after which the unit counts as misconfigured
-_ODD_TIME_NS = 5_000_000_000  # time without an unexpected message after which their count begins again
+_CERTAIN = 4  # number of unexpected samples or messages that show a misconfigured unit
+_ODD_TIME_NS = 5_000_000_000  # time (ns) without unexpected messages after which their count is reset
 _ANSWERS = frozenset(
     {"RRG", "WRG", "WNV", "RFS", "RST", "ASY", "TAR", "KMD", "KAD", "SGB", "SFB", "SIH", "ERR"}
 )
@@ -453,9 +454,9 @@ class ReadingConverter:
         self._alike = 0
 
     def reading(self, item: BinaryPacket | AsciiLine) -> ImuReading | None:
-        """Return the reading in a packet or line, None without a reading or if it is rejected.
+        """Return the reading in a packet or line, or None without a reading or if the reading is rejected.
 
-        A reading of which only the rate is invalid has the rate NaN.
+        If only the rate of a reading is invalid, the rate is set to NaN.
         """
         sample = self._binary_sample(item) if isinstance(item, BinaryPacket) else self._ascii_sample(item)
         if sample is None:
@@ -490,7 +491,7 @@ class ReadingConverter:
         values = self._map @ np.array((*q, *rate, *mag, *accel))
         if not has_rate:
             values[4:7] = math.nan
-        # Of the two equivalent signs of the quaternion, the sign with a positive scalar part is returned.
+        # Of the two equivalent quaternions q and -q, the one with a positive scalar part is returned.
         quaternion = values[:4] / math.copysign(norm, values[3])
         length = item.layout.length if isinstance(item, BinaryPacket) else item.length
         return ImuReading(
@@ -504,7 +505,7 @@ class ReadingConverter:
         )
 
     def _fault(self, *sample: tuple[float, ...]) -> str:
-        """Return which quantity of a rejected sample is impossible, with its value and limit."""
+        """Return a text with the impossible quantity of a rejected sample, its value and its limit."""
         settings, quaternion = self._settings, sample[0]
         quantities = (
             ("rate", 1.0, settings.rate_range, "rad/s"),
@@ -540,7 +541,7 @@ class ReadingConverter:
             self._on_reset()
 
     def _is_other(self, item: BinaryPacket | AsciiLine) -> bool:
-        """Return whether a packet or line is neither the requested output nor an answer."""
+        """Return whether a packet or line is neither the requested output nor an answer to a command."""
         if isinstance(item, BinaryPacket):
             return item.layout.header != self._wanted
         command = item.sentence.command
@@ -590,7 +591,7 @@ class _Places:
     """Positions of the time and of the sensor values in the list of a packet's values.
 
     Attributes:
-        time: index of the device time, None if the packet contains no time.
+        time: index of the device time, or None if the packet contains no time.
         sensors: slices of quaternion, rate, magnetic field and acceleration.
     """
 
@@ -599,7 +600,7 @@ class _Places:
 
 
 def _places(layout: OutputLayout) -> _Places | None:
-    """Return the positions of a reading's values in a packet, None if a sensor value is missing."""
+    """Return the positions of a reading's values in a packet, or None if a sensor value is missing."""
     sensors: list[slice] = []
     for names in _SOURCES:
         place = next((layout.places[name] for name in names if name in layout.places), None)
@@ -622,7 +623,10 @@ class Vn100:
     """Driver of a VN-100 on a serial port, which implements `hal.interfaces.devices.InertialUnit`."""
 
     def __init__(self, port: SerialPort, clock: Clock, settings: Vn100Settings) -> None:
-        """Use an open port. Raises Refused or OutOfRange for settings that unit or line do not support."""
+        """Use an open port.
+
+        Raises Refused or OutOfRange for settings that the unit or the serial line does not support.
+        """
         check(settings, port.baud_rate)
         self._unit_error = ""
         self._port = port
@@ -721,7 +725,7 @@ class Vn100:
         raise self._no_answer(question.text(), before)
 
     def _await(self, question: Question) -> tuple[str, ...] | None:
-        """Wait for the answer to a command and return it, None after the timeout or a transient error."""
+        """Wait for the answer to a command and return it, or None after the timeout or a transient error."""
         deadline_ns = self._clock.now_ns() + self._settings.response_timeout_ns
         while True:
             for item in self._receive():

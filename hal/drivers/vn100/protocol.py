@@ -6,17 +6,17 @@ The CRC is CRC-16/XMODEM over the bytes between the sync byte and the CRC. The q
 the device: gauss, degrees, m/s^2, rad/s and ns.
 
 An ASCII sentence consists of `$VNxxx,field,...*checksum` and a line end (VectorNav UM001 v2.43, section 4.2).
-The checksum covers the bytes between `$` and `*`, excluding both. Two hexadecimal digits are the XOR of the
-bytes, and four digits are a CRC-16/XMODEM. The unit also accepts `XX`, which means no checksum. The remark on
-polynomial 0x07 in section 4.2 of the manual is wrong.
+The checksum covers the bytes between `$` and `*`, excluding both. A checksum of two hexadecimal digits is the
+XOR of the bytes, and a checksum of four digits is a CRC-16/XMODEM. The unit also accepts `XX` instead of a
+checksum. The remark on polynomial 0x07 in section 4.2 of the manual is wrong.
 
 `StreamParser` finds valid packets after or inside corrupted data, because the search continues one byte after
 an invalid candidate. The computing time and memory of `StreamParser` are limited by the length of the longest
 possible packet.
 
-Packets with other fields have an unknown length, such as packets of satellite navigation or with extension
-of firmware 3. `StreamParser` counts such a packet if the bytes up to the next packet with the same header
-have a valid CRC. The packet shows that the unit sends at the present baud rate.
+The length of packets with unknown fields, for example of satellite navigation or firmware 3, is unknown.
+`StreamParser` counts such a packet if the bytes up to the next packet with the same header have a valid CRC.
+Such a packet shows that the baud rate is correct.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def layout_of(words: Mapping[int, int]) -> OutputLayout:
 
 
 def header_length(group_byte: int) -> int:
-    """Return the length (bytes) of group byte and field words, 0 for an unsupported group byte."""
+    """Return the length (bytes) of group byte and field words, or 0 for an unsupported group byte."""
     if group_byte == 0 or any(group_byte >> bit & 1 and bit not in FIELDS for bit in range(8)):
         return 0
     return 1 + 2 * group_byte.bit_count()
@@ -139,7 +139,7 @@ def header_length(group_byte: int) -> int:
 
 @lru_cache(maxsize=256)
 def layout_of_header(header: bytes) -> OutputLayout | None:
-    """Return the packet layout for a header (group byte and field words), None for an invalid header."""
+    """Return the packet layout for a header (group byte, field words), or None for an invalid header."""
     if not header:
         return None
     bits = [bit for bit in range(8) if header[0] >> bit & 1]
@@ -247,7 +247,7 @@ def build(command: str, *fields: object, checksum: Checksum = "crc16") -> bytes:
 
 
 def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
-    """Return the sentence in a line, None if the line is not a sentence or has a wrong checksum.
+    """Return the sentence in a line, or None if the line is not a sentence or has a wrong checksum.
 
     The placeholder `XX` instead of a checksum is accepted only if `allow_none` is true. A unit never sends
     `XX`.
@@ -279,10 +279,10 @@ def _verify(body: bytes, digits: bytes, allow_none: bool) -> Checksum | None:
 
 
 def measurement(sentence: Sentence) -> Measurement | None:
-    """Return the values of a VNQMR or VNYMR sentence, None for other sentences and for invalid numbers.
+    """Return the values of a VNQMR or VNYMR sentence, or None for other sentences or invalid numbers.
 
     Trailing fields that begin with T or S (count and status, see register 30) are ignored. NaN and infinite
-    values are returned, and the driver checks them.
+    values are returned, because the driver rejects them.
     """
     heads = {"QMR": 4, "YMR": 3}.get(sentence.command)
     if heads is None or len(sentence.fields) < heads + 9:
@@ -298,7 +298,7 @@ def measurement(sentence: Sentence) -> Measurement | None:
 
 
 def error_meaning(sentence: Sentence) -> tuple[int, str] | None:
-    """Return the code and meaning of a `$VNERR` sentence, None for other sentences.
+    """Return the code and meaning of a `$VNERR` sentence, or None for other sentences.
 
     The code is -1 if the sentence does not contain a valid hexadecimal code.
     """
@@ -311,15 +311,15 @@ def error_meaning(sentence: Sentence) -> tuple[int, str] | None:
     return code, ERRORS.get(code, "an error without a published meaning")
 
 
-LONGEST_LINE = 256  # receive buffer of the unit (bytes); its longest answer has about 100 bytes
+LONGEST_LINE = 256  # size of the unit's receive buffer (bytes); its longest answer has about 100 bytes
 
 _START = re.compile(rb"[\xfa$]")
-# A `$` ends a candidate line, so that the line after a truncated line is still found.
+# The patterns exclude `$` within a line, so that the line after a truncated line is found.
 _LINE = re.compile(rb"\$VN[\x20-\x23\x25-\x7e]{0,%d}\r?\n" % (LONGEST_LINE - 5))
 _LINE_BEGUN = re.compile(rb"\$(?:V(?:N[\x20-\x23\x25-\x7e]{0,%d}\r?)?)?" % (LONGEST_LINE - 5))
 
 _FOREIGN_HEADER, _FOREIGN_LONGEST = 4, 600
-"""Compared bytes of the headers of unknown packets, and maximum length (bytes) of an unknown packet."""
+"""Number of header bytes that are compared, and maximum length (bytes), for packets with unknown fields."""
 
 _LONG_AGO_NS = -(1 << 62)
 _FALSE = 0
@@ -334,7 +334,7 @@ class StreamParser:
         packets: number of packets and lines with a valid checksum.
         bad_checksum: number of complete packets and lines with a wrong checksum.
         discarded_bytes: number of bytes outside valid packets and lines.
-        foreign: number of packets among the discarded bytes with unknown fields and a valid checksum.
+        foreign: number of packets with unknown fields and a valid checksum among the discarded bytes.
     """
 
     def __init__(self, byte_ns: float = 0.0, longest: int = 512) -> None:
@@ -342,8 +342,8 @@ class StreamParser:
 
         Args:
             byte_ns: transmission time of one byte on the serial line, ns.
-            longest: maximum length of a packet, bytes; with a small value, noise that resembles the start of
-                a packet delays the next valid packet less.
+            longest: maximum length of a packet, bytes; a small value limits the delay of a valid packet that
+                follows noise which resembles the start of a packet.
         """
         self.byte_ns = byte_ns
         self.bytes_received = 0
@@ -399,7 +399,7 @@ class StreamParser:
         return found
 
     def _discard(self, begin: int, end: int) -> None:
-        """Count the bytes from offset `begin` to `end`, and keep them for the search of unknown packets."""
+        """Count the bytes from offset `begin` to `end`, and keep them for the search for unknown packets."""
         self.discarded_bytes += end - begin
         self._unknown += self._buffer[begin:end]
 
@@ -421,7 +421,7 @@ class StreamParser:
         del unknown[: start if start >= 0 else len(unknown)]
 
     def _span(self, position: int) -> int:
-        """Return the length (bytes) of a packet or line at offset `position`, or _FALSE, or _INCOMPLETE."""
+        """Return the length (bytes) of a packet or line at `position`, or _FALSE (invalid) or _INCOMPLETE."""
         if self._buffer[position] == SYNC:
             return self._packet_span(position)
         line = _LINE.match(self._buffer, position)
