@@ -177,7 +177,7 @@ def next_whole_second(clock: Clock) -> int:
 
 
 def mission_zero(clock: Clock) -> int:
-    """Return mission time zero in real time: the start of the third next slot of the 40 Hz grid."""
+    """Return mission time zero in real time: the start of the third slot from now in the 40 Hz grid."""
     return (clock.now_ns() // _GRID_NS + 3) * _GRID_NS
 
 

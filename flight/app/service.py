@@ -175,10 +175,10 @@ class SeparationInhibit:
 
     Launch providers require this time. The CubeSat Design Specification allows no transmission within 45
     minutes after the deployment. The time with power is counted in a file, so that a restart neither ends the
-    inhibit nor begins it again. Flight and link count separately, each in its own folder.
+    inhibit nor begins it again. Flight and link count the time separately, each in its own folder.
 
-    A damaged or missing file counts as the first power-up, because coils that are off too long are the
-    smaller harm.
+    A damaged or missing file counts as the first power-up, because it does less harm to keep the coils off
+    for too long than to drive them too early.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -219,7 +219,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class EndingSignals:
-    """A context in which a signal ends the flight after the running cycle.
+    """A context manager, within which a signal ends the flight after the running cycle.
 
     A signal during the opening ends the flight at its first cycle; a second signal interrupts the opening. If
     the process ignores SIGHUP, as under nohup, SIGHUP stays ignored.
@@ -371,7 +371,7 @@ class Collector:
 _THROTTLE_NS = 1_000_000_000
 """Shortest time (ns) between events of one kind; a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""Longest time (ns, three periods) since the coil driver's job ran, up to which heartbeats are passed on."""
+"""Time (ns, three periods) without a run of the coil driver's job after which heartbeats are withheld."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,

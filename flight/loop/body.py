@@ -195,10 +195,10 @@ class ReadingFeed(Protocol):
     """Passes to the filter those quantities of a reading that the body uses."""
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
-        """Start the filter from a reading, or apply the reading to a filter that runs."""
+        """Start the filter from a reading, or apply the reading to a running filter."""
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start a filter that has no estimate from a star fix, and return whether it started."""
+        """If the filter has no estimate, start it from a star fix; return whether it started."""
 
 
 class WindowedLaw(Protocol):

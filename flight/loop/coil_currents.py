@@ -1,9 +1,9 @@
 """Prediction of the supply current of healthy and broken coils.
 
-For each hypothesis, which is that all coils are healthy or that one axis has one fault, the supply current is
-predicted from the commands. Each H-bridge has two inputs, A and B. The input A is pulsed for positive
-currents, the input B for negative currents. If an output leg is stuck high, it drives its coil continuously,
-except while the other input is pulsed.
+The supply current is predicted from the commands for each hypothesis: that all coils are healthy, or that one
+axis has one fault. Each H-bridge has two inputs, A and B. The input A is pulsed for positive currents, the
+input B for negative currents. If an output leg is stuck high, it drives its coil continuously, except while
+the other input is pulsed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from knightcube.astro.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """An ADC sample during which the braking did not change, with the current that healthy coils would draw.
+    """An ADC sample during which the braking did not change, with bounds of the current of healthy coils.
 
     Attributes:
         current: measured supply current, A.
@@ -106,7 +106,7 @@ NEWEST = Sampling(0.2, 1.0)
 MEAN = Sampling(0.02, 0.25)
 """Error bounds of the mean of five ADC samples.
 
-An error of 7 % that is common to all readings is included in the gain error.
+An error of 7 % that is common to all readings is part of the gain error instead.
 """
 
 

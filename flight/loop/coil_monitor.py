@@ -303,7 +303,7 @@ class CoilMonitorSettings:
             evidence is discarded.
         persistence: number of consecutive readings that raise a suspicion if they contradict a healthy
             circuit.
-        settle: number of further readings until the averaging window begins after the fault.
+        settle: number of readings after a fault until the averaging window excludes the time before it.
         evidence: number of readings that are needed for a verdict.
         probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
@@ -482,7 +482,7 @@ class CoilMonitor:
 
     @property
     def braked(self) -> Axes:
-        """Indices of the bridges to brake: with a leg stuck high, or under test in the search."""
+        """Indices of the bridges to brake, which have a leg stuck high or are tested in the search."""
         if not self._verdicts:
             return self._leg.brake
         stuck = {axis for axis, verdict in self._verdicts.items() if verdict.fault in _BRAKED}
@@ -777,7 +777,8 @@ class CoilMonitor:
             if waited:
                 self._conclude(*self._compared, now_ns)
             return
-        # The only axis left may be healthy, if the fault has ended or only the motion raised the suspicion.
+        # The only remaining axis may be healthy if the fault has ended or only the motion raised the
+        # suspicion.
         certain = len(axes) == 1 and evidence.rejects_healthy_now(self._known)
         if certain and (len(left) == 1 or waited):
             axis, fault = left[0]

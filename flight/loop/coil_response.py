@@ -55,7 +55,7 @@ from knightcube.gnc.estimation.rigid_body import (
 
 _SAMPLES_NS = 25_000_000
 _NOTED_LATE_NS = 25_000_000
-"""Delay (ns) from the writing of a command to its record, which is one cycle."""
+"""Delay (ns) of one cycle from the sending of a command to its record."""
 
 
 class CoilCommands:
@@ -94,7 +94,7 @@ class CoilCommands:
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
-        """Return the commands (k, n), A, that may be in force between two times, in equal steps."""
+        """Return the commands (k, n), A, that may be in force between two times, sampled in equal steps."""
         later = iter(self._commands)
         _, currents = next(later)
         following = next(later, None)
@@ -230,7 +230,7 @@ class CoilResponse:
             dipoles = np.eye(3) * dipoles
         strongest = float(np.linalg.norm(dipoles, axis=0).max())
         self._per_field = strongest * np.linalg.inv(settings.inertia).T
-        # Row a is the direction of coil a, times its strength relative to that of the strongest coil.
+        # Row a is the axis of coil a, scaled by its dipole relative to that of the strongest coil.
         self._directions: FloatArray = dipoles.T / strongest
         self._count_of_coils = coils = len(self._directions)
         self._free = np.flatnonzero(settings.free)
@@ -603,7 +603,8 @@ class MotionFit(NamedTuple):
         weights: weights (k,) of the error modes.
         possible: whether the gains of all axes are physically possible.
         alone: whether a fault of one axis explains the motion clearly better than that of another axis.
-        is_reversed: whether a coil is reversed, which is also far more likely than healthy coils.
+        is_reversed: whether a reversed coil explains the motion clearly better than another fault, and far
+            better than healthy coils.
     """
 
     gain: FloatArray
@@ -655,7 +656,7 @@ _MOST_CHANGES = 2
 
 
 class CoilCorrection:
-    """Sign and gain of each coil relative to its description, and the reviews that are due.
+    """Sign and gain of each coil relative to its description, and the corrections still to be reviewed.
 
     Attributes:
         factors: dipole (n,) of each coil relative to the described dipole at the same current: 1 for a

@@ -428,7 +428,7 @@ CLOCK_OFF_NS = 1_000_000_000
 
 
 class FlightClock:
-    """Clock of the host whose UTC is that of the GPS receiver while the host's UTC differs from it.
+    """Clock of the host, which gives the GPS receiver's UTC if the host's UTC differs from it.
 
     Attributes:
         host: clock of the host, whose UTC may be wrong.
@@ -456,7 +456,7 @@ class FlightClock:
         return self.host.tickers
 
     def correct(self, utc_ns: int, time_ns: int) -> int:
-        """Accept the UTC (ns) of a monotonic time from the receiver, and return the host's error, ns."""
+        """Accept the receiver's UTC (ns) at a monotonic time, and return the error (ns) of the host's UTC."""
         self._offset_ns = utc_ns - time_ns
         return self.host.utc_ns() - self.host.now_ns() - self._offset_ns
 

@@ -1,6 +1,6 @@
 """One flight from release to end: starts the tasks, runs the rate groups, and switches the coils off.
 
-The devices are opened and closed, and the tasks composed, by `flight.app`.
+The package `flight.app` opens and closes the devices, and assembles the tasks.
 """
 
 from __future__ import annotations

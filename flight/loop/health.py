@@ -12,12 +12,12 @@ performance record stores lateness and execution time of the control cycles in a
 the executive reports skipped time slots and failures as events, and switches the coils off after a failed
 control cycle.
 
-When the work of a flight exceeds its processor, the least important work is reduced first (`Shedding`).
-Control cycles, safety, telemetry and commands are never reduced. All other work is reduced step by step, in
-the order of `LEVELS`: readings of the inertial unit that arrive more often than control cycles, then the
-search for objects, then frames of the star camera, then periodic plans. A plan that is not renewed stays in
-force, and its final attitude is held after its end. Plans for a new target, or after a loss of control, are
-always made.
+When the work of a flight exceeds the processor's capacity, the least important work is reduced first
+(`Shedding`). Control cycles, safety, telemetry and commands are never reduced. All other work is reduced step
+by step, in the order of `LEVELS`: readings of the inertial unit that arrive more often than control cycles,
+then the search for objects, then frames of the star camera, then periodic plans. A plan that is not renewed
+stays in force, and its final attitude is held after its end. Plans for a new target, or after a loss of
+control, are always made.
 
 Overload is recognised by its signs: lost control cycles, frames that arrive while the worker is busy or whose
 processing takes too long, and plans that take too long. Each raise of the level reduces more work. The level
@@ -704,7 +704,7 @@ class Shedding:
         Args:
             signs: signs of overload.
             plans: counter of plans that are late.
-            apply: function that makes navigation and imaging follow a level.
+            apply: function that applies a level to navigation and imaging.
             frames: function that returns the numbers of frames not taken, and of frames that are late.
             services: services of the loop.
         """

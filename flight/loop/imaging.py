@@ -84,8 +84,8 @@ class ImagingSettings:
         fine_rest_ns: minimum time (ns) between exposures while the attitude is fine, the body rotates slowly
             and no object is searched for.
         seeks: function that returns whether the body searches for an object.
-        calm: function of a time and an exposure time that returns the first later time at which no coil
-            switches during the exposure.
+        calm: function of a time and an exposure time that returns the first later start time of an exposure
+            during which no coil is switched.
         late_ns: time (ns) after the end of an exposure from which its frame counts as late.
         max_rate: body rate (rad/s) above which no exposure is made.
         slow_ns: processing time (ns) of a frame above which vision is reported as slow.
@@ -385,7 +385,7 @@ _LEAST_CHANGES = 0.125
 
 
 class RepeatedRows:
-    """Detects rows copied from earlier frames, by the checksums of some rows of the last frames."""
+    """Detects image rows that are copies from earlier frames, by checksums of some rows of each frame."""
 
     def __init__(self) -> None:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
@@ -412,8 +412,8 @@ class ObjectTracks:
     """Tracks objects from frame to frame, and reports and records their tracks.
 
     In frames without identified stars, the tracks refer to the star field of the earlier frames
-    (`knightcube.vision.objects.star_field`). Control and telemetry get the tracks in the axes of the attitude
-    estimate. The error of this estimate is part of the recorded covariances of the directions.
+    (`knightcube.vision.objects.star_field`). Control and telemetry receive the tracks in the axes of the
+    attitude estimate. The error of this estimate is part of the recorded covariances of the directions.
     """
 
     def __init__(self, settings: TrackSettings, body: FlightBody, services: Services) -> None:
@@ -648,7 +648,7 @@ class Imaging:
     def reduce(self, search: bool, frame_every: int) -> None:
         """Search frames for objects only if `search` is true, and make one of `frame_every` exposures.
 
-        No more exposures are left out than the largest age of the newest frame permits.
+        The largest permitted age of the newest frame limits how many exposures are left out.
         """
         self._searches = search
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
@@ -669,7 +669,7 @@ class Imaging:
 
         No exposure is made while the body rotates faster than permitted, or too soon while the battery is
         low. Exposures are less frequent while the attitude is fine and the body rotates slowly. An exposure
-        starts when no coil will switch until its end, so that the body rate is nearly constant.
+        starts when no coil will be switched until its end, so that the body rate is nearly constant.
         """
         speed, rested_ns = self._navigation.speed, cycle.start_ns - self._triggered_ns
         if speed > self._settings.max_rate or rested_ns < self._rest_ns:

@@ -373,7 +373,7 @@ class ModeSettings:
 
 
 class ModeControl:
-    """Owns the mode state machine, and the targets that commands set.
+    """Holds the mode state machine, and the targets that commands set.
 
     The class is longer than 200 lines, because commands, reactions and reached goals all change the same mode
     and target.
@@ -485,7 +485,7 @@ class ModeControl:
             now_ns: time (ns) of the cycle.
             accurate: whether the estimate is accurate enough for driving the coils.
         """
-        # A body that acquires its attitude needs a known rate, but an estimate only for steering.
+        # A body that acquires its attitude needs a known rate; it needs an estimate only for steering.
         measured = estimate is not None and accurate
         if Mode.ACQUIRE in self._modes:
             measured = rate is not None and (measured or estimate is None or self.mode not in STEERING)

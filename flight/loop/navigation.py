@@ -50,7 +50,7 @@ class NavigationSettings:
     """Age limits of the inertial unit's readings.
 
     Attributes:
-        max_age_ns: largest age (ns) of a reading by which the coils are driven.
+        max_age_ns: largest age (ns) of a reading that is used to drive the coils.
         coast_ns: longest propagation (ns) of the estimate without measurements; such an estimate is used for
             telemetry only.
         period_ns: period (ns) of the control cycle, during which a commanded current flows.
@@ -66,7 +66,7 @@ class NavigationSettings:
 _UNSEEN_NS = 600_000_000
 """Largest age (ns) of a PWM error at its detection; the driver reads its outputs back twice a second."""
 _UNSUSPECTED_NS = 800_000_000
-"""Longest time (ns) from a fault to its suspicion, which takes four readings of the current monitor."""
+"""Longest time (ns) from a coil fault until it is suspected, after four readings of the current monitor."""
 STOOD_NS = 200_000_000
 """Stall of the control loop (ns) after which the guardian may have set the coils to zero."""
 
@@ -120,7 +120,7 @@ class CoilKnowledge:
 
 
 class Navigation:
-    """Owns the filter, and monitors the serial line of the inertial unit."""
+    """Holds the filter, and monitors the serial line of the inertial unit."""
 
     def __init__(
         self,
@@ -296,7 +296,7 @@ class Navigation:
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def begin_from(self, attitude: AttitudeMeasurement) -> bool:
-        """Start a filter that has no estimate from an attitude measured with stars.
+        """If the filter has no estimate, start it from an attitude measured with stars.
 
         Return whether the filter started.
         """

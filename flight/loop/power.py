@@ -28,7 +28,8 @@ used."""
 LONGEST_STEP = 5.0
 """Longest time (s) over which one current is integrated, and largest age (s) of a reading."""
 STUCK_FOR, STUCK_RANGE = 10.0, 0.02
-"""Time (s) and range (V) of the other monitor's voltage after which an unchanged reading is stuck.
+"""Time (s), and range (V) of the other monitor's voltage in this time, after which an unchanged reading
+counts as stuck.
 
 Both monitors measure the same voltage, and 0.02 V are five steps of the converter.
 """
@@ -46,7 +47,7 @@ class ChargeEstimate:
         self.charge = math.nan
 
     def update(self, voltage: float, current: float, seconds: float, time_constant: float) -> None:
-        """Use a voltage (V) and a current (A) out of the battery, `seconds` s after the last readings."""
+        """Update the charge from voltage (V) and discharge current (A), `seconds` s after the last update."""
         battery = self._battery
         measured = battery.charge(voltage + battery.resistance * current)
         if math.isnan(self.charge):

@@ -231,11 +231,11 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 class Steering:
     """Steers the body along its path, detumbles it, or keeps the coils at zero.
 
-    Control is lost when no recent reading agrees with the estimate, when without a gyro the estimate becomes
-    too inaccurate or, in detumbling, without a recent reading. The estimate is propagated by the model
+    Control is lost when no recent reading agrees with the estimate, when the estimate becomes too inaccurate
+    without a gyro or, in detumbling, when there is no recent reading. The estimate is propagated by the model
     during a silence of the inertial unit, so that control returns smoothly. The currents are zero within a
     tenth of a second after the last reading. If the planner fails, the body follows its last path and is held
-    at its end (event `holding`). Without a path, the currents are zero.
+    at the end of the path (event `holding`). Without a path, the currents are zero.
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:

@@ -115,10 +115,10 @@ class WorkerProcess:
             [sys.executable, *(["-I"] if sys.flags.isolated else []), "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
-            # A process group of its own protects the worker from Ctrl-C; the control process ends its worker.
-            # The group stays in the session of the control process.
-            # If the control process dies while a worker is stopped, the group is orphaned.
-            # In an orphaned group, the kernel ends a stopped worker by SIGHUP and SIGCONT at any time.
+            # A separate process group protects the worker from Ctrl-C; the control process ends its worker.
+            # The group stays in the session of the control process. If the control process dies while a
+            # worker is stopped, the group is orphaned. In an orphaned group, the kernel ends a stopped worker
+            # by SIGHUP and SIGCONT at any time.
             process_group=0,
         )
 
@@ -291,7 +291,7 @@ class _Kept:
         return results, news
 
     def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
-        """Return failed results for all lost jobs: the running job and the waiting ones."""
+        """Return failed results for all lost jobs: the running job and the waiting jobs."""
         lost = [self.submitted_ns] if self.submitted_ns >= 0 else []
         while self.inbox:
             lost.append(self.inbox.popleft()[1])

@@ -55,7 +55,7 @@ ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
 class UnitAccuracy(Section, frozen=True, kw_only=True):
-    """Largest errors of the calibrated inertial unit, within which the true errors are assumed uniform.
+    """Largest errors of the calibrated inertial unit; the true errors are assumed uniform within them.
 
     `gyro_scale` is the relative error of the scale factor of each gyro, `gyro_alignment` (rad) the
     misalignment of each gyro toward each other axis. `field_matrix` is the error of each element of the
@@ -81,7 +81,7 @@ class UnitCalibration(Section, frozen=True, kw_only=True):
 
 
 class UnitSection(Section, frozen=True, kw_only=True):
-    """The keys of every inertial unit, to which the section of a driver adds its own.
+    """The keys of every inertial unit, to which the section of a driver adds further keys.
 
     The coils are switched off if a reading would become older than `max_age` s before the next reading is
     used.
@@ -111,7 +111,7 @@ class InertialUnitSection(UnitSection, frozen=True, kw_only=True):
 
 
 class Sensor(Section, frozen=True, kw_only=True):
-    """A sensor of an inertial unit that the driver `sensors` composes.
+    """One of the sensors from which the driver `sensors` composes an inertial unit.
 
     The value `part` is `icm20948`, `lis3mdl`, `adis16470`, or `module:class` of a CircuitPython driver. The
     sensor has the I2C `address` on the bus `bus`, by default the bus of the coils, or it is the SPI device
@@ -149,7 +149,7 @@ class SensorsSection(UnitSection, frozen=True, kw_only=True):
 class MagnetometerSection(SensorsSection, frozen=True, kw_only=True):
     """A separate magnetometer, which is read while the inertial unit is silent.
 
-    Without a section `inertial_unit`, it is the only source of readings.
+    Without a section `inertial_unit`, this magnetometer is the only source of readings.
     """
 
     driver: DriverName = "sensors"
@@ -305,7 +305,7 @@ def coil_fields(config: Any) -> FloatArray | None:
 
 
 class PowerMonitorSection(Section, frozen=True, kw_only=True):
-    """An INA219, which measures voltage and current of a supply with the resistance `shunt` (ohm).
+    """An INA219, which measures the voltage of a supply, and its current by the shunt resistor `shunt` (ohm).
 
     The chip is on the I2C bus `bus`, by default the bus of the coils. The chip measures currents up to
     `maximum_current` (A) in both directions.
@@ -579,12 +579,12 @@ class WideCamera(Section, frozen=True, kw_only=True):
     A logarithmic `response` maps `decades` decades of intensity to the counts above `pedestal`; all
     wide-angle cameras must have the same response. The polygons `structure` and the image file
     `structure_file` show where the spacecraft itself is in view. Each polygon is a list of corners (x, y) in
-    px. Pixels above 0 of the file, a PGM or PNG image of the camera's size, show the spacecraft. All cameras
-    are triggered together, with the shortest `period` of the cameras or, while the attitude is known to
-    0.05 deg, with the shortest `fine_period`. With `sun: false`, a camera is not searched for the Sun. The
-    angle `lens_error_deg` is the residual error of the calibrated lens. The angle `mounting_deg` is the
-    largest rotation of a camera about each body axis from its `mounting`; the true rotation is assumed to be
-    uniform within it.
+    px. In `structure_file`, a PGM or PNG image of the camera's size, pixels above 0 show the spacecraft. All
+    cameras are triggered together, with the shortest `period` of the cameras or, while the attitude is known
+    to 0.05 deg, with the shortest `fine_period`. With `sun: false`, the images of a camera are not searched
+    for the Sun. The angle `lens_error_deg` is the residual error of the calibrated lens. The angle
+    `mounting_deg` is the largest rotation of a camera about each body axis from its `mounting`; the true
+    rotation is assumed to be uniform within it.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -613,7 +613,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:
-    """Return the calibrated camera of a section with a lens, otherwise a pinhole of its field of view.
+    """Return the calibrated camera of a section with a lens, or a pinhole camera of its field of view.
 
     Raises LensError for a lens that cannot exist.
     """

@@ -35,7 +35,7 @@ up to a height of 2,840 km, the apogee of the highest orbit that is flown.
 _FIELD = 3.3e-5
 """Typical magnetic field in a low orbit, T."""
 _PRESSURE = 5.0e-6
-"""Expected pressure of air and sunlight on a face at an altitude of 500 km, Pa.
+"""Expected pressure (Pa) by air drag and solar radiation on a face at an altitude of 500 km.
 
 The expected pressure is a tenth of the largest pressure (solar maximum, perpendicular incidence).
 """
@@ -317,7 +317,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         """Return the requested duration of a slew to a distant target, s.
 
         The default is sixteen times the square root of the largest moment of inertia divided by the torque of
-        the mean dipole limit in a typical field, limited to 60 s to 1500 s.
+        the mean dipole limit in a typical field, limited to the range from 60 s to 1500 s.
         """
         if self.pointing.slew is not None:
             return self.pointing.slew

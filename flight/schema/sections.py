@@ -117,7 +117,7 @@ class Detumble(Section, frozen=True, kw_only=True):
 
 
 class Health(Section, frozen=True, kw_only=True):
-    """Limits of the board's resources (`flight.loop.health`), which are checked every `look_period` s.
+    """Limits of the flight computer's resources (`flight.loop.health`), checked every `look_period` s.
 
     The processor load `cpu_share` is relative to one core. The limits `memory` and `disk_free` are in bytes.
     The growth limit `memory_slope`, in bytes per hour, applies after `warm_up` s and over at least

@@ -25,7 +25,7 @@ _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
 
 class _Outlet(io.FileIO):
-    """A file descriptor that discards output once its reader is gone, or after its first error."""
+    """File descriptor that discards all output once the reader has closed it, or after the first error."""
 
     _lost = False
 
@@ -105,7 +105,7 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command, and return the exit status: 0 success, 1 failure, 2 wrong use."""
+    """Run a command, and return the exit status: 0 for success, 1 for a failure, 2 for a usage error."""
     outlast_readers()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # file names may contain bytes that are not text
@@ -143,7 +143,7 @@ def _obey(words: Sequence[str]) -> int:
 
 
 def _typed() -> list[str]:
-    """Return the command-line words that a shell requests to complete, or none in a normal run."""
+    """Return the command-line words that a shell asks to be completed, or none in a normal run."""
     line = os.environ.get("COMP_LINE", "") if "_ARGCOMPLETE" in os.environ else ""
     return line.split()[1:]
 
@@ -197,7 +197,7 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
     others: dict[str, tuple[str, str, str]] = {}
     for found in metadata.entry_points(group=ENTRY_POINTS):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
-            continue  # the package ground is not installed on a board
+            continue  # the package ground is not installed on a flight computer
         table: dict[str, tuple[str, str, str]] = found.load()
         others |= {
             name: (group, purpose, f"{found.module}.{target}")
@@ -207,7 +207,7 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str, str]]:
 
 
 def _complain(message: str, status: int) -> int:
-    """Print an error message, in which control characters cannot control a terminal."""
+    """Print an error message whose control characters are escaped, so that they have no effect."""
     lines = map(shown, message.split("\n"))
     sys.stderr.write("knightcube: " + "\n".join(lines) + "\n")
     return status

@@ -84,7 +84,7 @@ class _JudgedLink:
 
 @dataclass(frozen=True, slots=True)
 class _OpenedLink:
-    """An opened link, and the names of its communication lines, which the log states."""
+    """An opened link, and the names of its communication lines as text for the log."""
 
     station: Station
     names: str
@@ -200,7 +200,7 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
 
 
 def _witness(keys: Path) -> Path:
-    """Return the folder that protects against outdated keys, the witness (`flight.link.security`).
+    """Return the folder of the witness, which reveals outdated keys (`flight.link.security`).
 
     The folder is the second state folder of a service, or otherwise a folder beside the keys.
     """

@@ -1,4 +1,4 @@
-"""A satellite in orbit with two to six coils, built from its configuration, with its packets and texts.
+"""A satellite in orbit with two to six coils, built from its configuration, with its telemetry.
 
 The satellite detumbles with magnetometer and gyro, acquires its attitude with the coils off, and points.
 `ORBIT` builds it.
@@ -269,7 +269,7 @@ class SatelliteEstimation(BodyEstimation):
         coils = self.coil_monitor.correction
         factors = Learned.of(coils.factors, np.diag(coils.deviations**2))
         found = {**learned_of(self.orbit_filter.slow, _utc(self._services)), COIL_FACTORS: factors}
-        # With redundant coils, a matrix learned without an isolated coil is not stored for the next boot.
+        # With redundant coils, a matrix that was learned while a coil was isolated is not stored.
         if self._used.all() or not self._coils.is_redundant:
             self._whole_body = found[BODY]
         elif self._whole_body is not None:
@@ -284,7 +284,7 @@ class SatelliteEstimation(BodyEstimation):
         self._renew_redundant_coils()
 
     def coils_used(self, used: BoolArray) -> None:
-        """Accept which coils (n,) are in use, and reset the learned matrix of redundant coils."""
+        """Accept the flags (n,) of the coils in use, and reset the learned matrix of redundant coils."""
         self._used = used
         self._renew_redundant_coils()
 
@@ -400,7 +400,7 @@ class SatelliteControl(BodyControl):
         self._objects.accept(tracks, now_ns)
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first start time from `from_ns` on at which no coil switches during the exposure."""
+        """Return the first start time from `from_ns` on of an exposure during which no coil is switched."""
         return self._pauses.calm(from_ns, exposure_ns)
 
 
@@ -421,7 +421,7 @@ ORBIT = BodyKind(pointing_job.run, make)
 def _pauses(config: OrbitConfig) -> WindowSchedule:
     """Return the control windows of pointing.
 
-    The pauses are those of detumbling, but the time with current is longer.
+    The pauses are as long as in detumbling, but the coils carry current for a longer time.
     """
     settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
     return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))

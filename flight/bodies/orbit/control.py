@@ -167,7 +167,7 @@ class PointingTracker:
         self._window: tuple[int, object] | None = None
 
     def command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
-        """Return the command of the present control window, which is zero in its pause."""
+        """Return the command of the present control window, which is zero during the window's pause."""
         pauses, now_ns = self._pauses, reference.time_ns
         if now_ns % pauses.period_ns < pauses.settle_ns + pauses.measure_ns:
             return self._nothing

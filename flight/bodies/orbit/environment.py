@@ -110,7 +110,7 @@ class FixSequence:
         self._offered = 1
         self._strength = np.zeros(3)  # sums of squared field deviations, both orbits, and their number
         self._is_refuted = False
-        self._shadowed = np.zeros(2)  # number of fixes at which the Sun shines in the shadow of both orbits
+        self._shadowed = np.zeros(2)  # sunlit fixes at which each orbit predicts shadow
 
     @property
     def confirmed(self) -> bool:
@@ -288,11 +288,11 @@ class EstimatedEnvironment:
         return None if near is None else np.asarray(near.field_at(times)[0])
 
     def field_sigma(self, now_ns: int) -> float:
-        """Return the standard deviation (T per axis) that a field model past its validity adds, usually 0."""
+        """Return the error (T per axis, one sigma) of a field model that is used past its validity, or 0."""
         return extrapolation_sigma(self.julian_date(now_ns))
 
     def _displaced_field(self, near: Ephemeris) -> float:
-        """Return the standard deviation (T per axis) of the field due to the position by old elements."""
+        """Return the field error (T per axis, one sigma) due to the position error of old elements."""
         strength = float(np.linalg.norm(near.field[0]))
         if self._near_sigma <= EXACT:
             return 0.0

@@ -146,8 +146,8 @@ class StepReplay:
     def follow_gyro(self) -> None:
         """Process the last two steps again with unknown dipoles if the gyro contradicts the dipoles.
 
-        The second step is included, because the deviation may have begun within it, where the mean rate shows
-        only half of the deviation.
+        The earlier of the two steps is included, because the deviation may have begun within it, so that its
+        mean rate shows only half of the deviation.
         """
         steps, refused = self.steps, self.refused_gyros > 0
         now_ns = steps[-1].end_ns
@@ -458,7 +458,7 @@ class OrbitFilter:
 
     @property
     def refused(self) -> int:
-        """The number of measurements rejected by their gates; repeated measurements are counted again."""
+        """The number of measurements rejected by their gates, also counted again in repeated steps."""
         return self._free.refused
 
     @property
@@ -483,7 +483,7 @@ class OrbitFilter:
 
     @property
     def residual_dipole(self) -> FloatArray:
-        """The residual dipole (3,), A m^2, in body axes, for the present sunlight."""
+        """The residual dipole (3,), A m^2, in body axes, under the present illumination by the Sun."""
         lit = self._steps[-1].around.sunlit if self._steps else 0.0
         return self._free.residual_dipole(lit)
 
@@ -591,7 +591,7 @@ class OrbitFilter:
             return False
         step = self._steps[place]
         if not (doubted or step.samples or step.before is None) and self.worst_sigma < _MEASURED_SIGMA:
-            # Two attitudes in a row show the rate, which a new start would discard.
+            # Two consecutive attitudes determine the rate, which a new start would discard.
             self.measure_late([attitude], lambda _: None)
             return True
         self.restarts += self._free.started

@@ -204,7 +204,7 @@ class PointingPaths:
         return self.sample(now_ns) is not None
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return False, because the coils are at zero after the end of a path."""
+        """Return False, because no attitude is held after the end of a path: the coils are then at zero."""
         return False
 
     def release(self) -> None:

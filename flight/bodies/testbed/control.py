@@ -16,8 +16,8 @@ Earth-pointing satellite, in a field that rotates once per revolution and varies
 produces only the two field components normal to the thread, multiplied by `scale`. The component along the
 thread would cause no torque about the thread.
 
-The field is predicted by the World Magnetic Model along the orbit of the two-line elements, by UTC, in the
-cage's control computer and in the flight software alike. The coil on body x has no torque while the field is
+Both the cage's control computer and the flight software predict the field as a function of UTC, by the World
+Magnetic Model along the orbit of the two-line elements. The coil on body x has no torque while the field is
 parallel to its axis, so the coils on x and z share the torque about the thread in the way that needs the
 least current.
 """
