@@ -1,4 +1,4 @@
-"""Answers to commands in flight, for several tests."""
+"""Replies to commands during a simulated flight, for several tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.flights import Rigged, fly
 
 
 class Script:
-    """A command channel that delivers given datagrams at given times and stores the answers."""
+    """A command channel that delivers given datagrams at given times and stores the replies."""
 
     name = "socket"
 
@@ -41,7 +41,7 @@ class Script:
 
 
 def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
-    """Run a simulation with datagrams at mission times, s."""
+    """Run a simulation that receives command datagrams at given mission times (s)."""
     channel = Script()
 
     def prepare(rigged: Rigged) -> None:
@@ -51,5 +51,6 @@ def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
         for at, data in script:
             rigged.at(at, partial(channel.say, data))
 
-    far = {"at": 1e6, "mode": "safe"}  # timed commands, so that the rate group of commands runs
+    # A timed command far in the future makes the rate group of commands run.
+    far = {"at": 1e6, "mode": "safe"}
     return fly(commanded(4.0, far), folder, prepare), channel

@@ -1,4 +1,4 @@
-"""Runs through the modes: configurations with timed commands, and the entered modes."""
+"""Simulated flights through the modes: configurations with timed commands, and the entered modes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.flights import demo_config, demo_world
 
 CYCLE = 0.025
 BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}
-"""Mode settings with short timeouts, s."""
+"""Mode settings with short timeouts (s)."""
 
 
 def commanded(
@@ -32,17 +32,17 @@ def commanded(
 
 
 def path_of_modes(run: Run) -> list[tuple[Mode, str]]:
-    """Return the entered modes with their triggers."""
+    """Return the modes that a run entered, each with its trigger."""
     return [(Mode(int(row["mode"])), to_text(row["trigger"])) for row in run["mode"]]
 
 
 def modes_of(run: Run) -> list[Mode]:
-    """Return the entered modes."""
+    """Return the modes that a run entered."""
     return [mode for mode, _ in path_of_modes(run)]
 
 
 def entered(run: Run, mode: Mode, occurrence: int = -1) -> float:
-    """Return the mission time (s) at which a mode was entered, by default the last time."""
+    """Return the mission time (s) at which a run entered a mode, by default for the last time."""
     return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][occurrence]) * 1e-9
 
 
@@ -54,10 +54,10 @@ def currents(run: Run, since: float, until: float) -> FloatArray:
 
 
 def true_angle(run: Run) -> FloatArray:
-    """Return theta of the truth (n,), rad."""
+    """Return the true angle theta (n,), rad."""
     return np.asarray(2.0 * np.arcsin(run["truth"]["quaternion"][:, 1]))
 
 
 def released(q2: float, rate: float) -> Simulation:
-    """Return the demonstration's world with another release: q2 and rate, rad/s."""
+    """Return the demonstration's world, in which the body is released at `q2` with `rate` (rad/s)."""
     return configuration.replace(demo_world(), release=Release(q2=q2, rate=rate))

@@ -41,11 +41,11 @@ def speed(run: Run) -> FloatArray:
 
 
 NEAR_REST = 0.00524
-"""Initial rate (rad/s) of 0.3 deg/s, below the end of detumbling."""
+"""Initial rate (rad/s), 0.3 deg/s, below the rate at which detumbling ends."""
 
 
 DURATION, ACQUIRED = 62.0, 28.0
-"""Duration (s) of the run, and latest time (s) of a fine attitude; the frame at 17 s shows no motion."""
+"""Duration (s) of the run, and latest time (s) by which a fine attitude must be available."""
 
 
 GYRO_BIAS, FIELD_BIAS = (4e-4, -5e-4, 3e-4), (2e-7, -1e-7, 1.5e-7)

@@ -1,4 +1,4 @@
-"""Tests of a slew in the cage with the field almost along body x, where coil x makes no useful torque."""
+"""Tests of a slew in the coil cage with the field almost along body x, where coil x has no useful torque."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _cage() -> tuple[Config, Simulation]:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return the first 40 s: released at q2 = 0.2 with -0.1 rad/s, to -0.3."""
+    """Return the first 40 s of a slew from q2 = 0.2, with a release rate of -0.1 rad/s, to q2 = -0.3."""
     config, section = _cage()
     return fly(config, tmp_path_factory.mktemp("cage"), section=section)
 
@@ -43,10 +43,10 @@ def test_the_slew_ends_where_it_should_by_both_coils(flown: Run) -> None:
 
 
 def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) -> None:
-    """67 deg from -z and 0.225 mT at the start, by the table of `OrbitField`; the body held at 23 deg."""
+    """By the table of `OrbitField`, the initial field, 0.225 mT, is 67 deg from -z. The body is at 23 deg."""
     field = flown["imu"]["field"][0].astype(float)
     assert np.hypot(field[0], field[2]) == pytest.approx(2.25e-4, rel=0.05)
-    # In body axes rotated by +angle, the field rotates by the same angle.
+    # In the axes of a body rotated by +angle, the field direction rotates by the same angle.
     towards = np.degrees(np.arctan2(field[0], -field[2]))
     assert towards == pytest.approx(67.0 + np.degrees(2.0 * np.arcsin(0.2)), abs=3.0)
 

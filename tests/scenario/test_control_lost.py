@@ -1,8 +1,8 @@
 """Tests that the coils are at zero within 0.1 s of a loss of control, and that control recovers.
 
-Control is lost as soon as no reading arrives, no complete reading, or no reading that agrees with the
-estimate. Detumbling, which uses only the magnetometer, is lost as soon as no reading arrives. The current of
-the simulated coil circuit is checked every millisecond after the fault.
+Control is lost as soon as readings stop, are incomplete, or contradict the estimate. Control by detumbling,
+which uses only the magnetometer, is lost as soon as readings stop. The current of the simulated coil circuit
+is checked every millisecond after the fault.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SILENT_AT = 3.0
 WITHIN = 0.1
 CYCLE = 0.025
 ZERO = 1e-3
-"""A."""
+"""Largest current (A) that counts as zero."""
 
 Break = Callable[[Rigged], None]
 
@@ -47,7 +47,7 @@ def in_the_unit(alter: Callable[[Vn100Sample], Vn100Sample] | None) -> Break:
 
 
 def elsewhere(seen: Vn100Sample) -> Vn100Sample:
-    """Return a sample that contradicts any estimate."""
+    """Return a sensor sample that contradicts any estimate."""
     turn = from_rotation_vector(np.array([0.0, 0.2, 0.0]))
     return replace(seen, quaternion=multiply(turn, seen.quaternion), rate=seen.rate + 0.1)
 
@@ -55,7 +55,7 @@ def elsewhere(seen: Vn100Sample) -> Vn100Sample:
 def shifted(seen: Vn100Sample, by: float) -> Vn100Sample:
     """Return a sample with `by` added to rate (rad/s) and field.
 
-    A missing rate alone does not end control.
+    The field is altered too, because a missing rate alone does not end control.
     """
     return replace(seen, rate=seen.rate + by, mag=seen.mag + by)
 
@@ -68,7 +68,7 @@ LOSSES: dict[str, tuple[Break, Break]] = {
     "out of range": (in_the_unit(lambda seen: shifted(seen, 1e3)), in_the_unit(None)),
     "refused": (in_the_unit(elsewhere), in_the_unit(None)),
 }
-"""Start and end of the loss of control."""
+"""Functions that start and end a loss of control, by the name of its cause."""
 
 
 def slewing(duration: float) -> TestbedConfig:
@@ -145,7 +145,7 @@ def test_a_hold_that_is_declared_impossible_ends_at_once(tmp_path: Path) -> None
 
 
 def test_with_the_planner_gone_and_no_readings_nothing_is_flown_to_its_end(tmp_path: Path) -> None:
-    """A running path is tracked with the readings; without readings no coil is driven."""
+    """A planned path is tracked only while readings arrive; without readings no coil is driven."""
     run = fly(thesis_config(6.0), tmp_path, silence, planner_latency=0.9)
     assert run["plan"]["accepted"].tolist() == [1]
     assert currents(run, SILENT_AT - 0.5, SILENT_AT).max() > ZERO
@@ -164,9 +164,9 @@ def test_with_the_planner_gone_and_no_path_the_coils_stay_at_zero(tmp_path: Path
 def test_the_demonstration_is_completed_within_its_limits_after_five_seconds_without_the_unit(
     tmp_path: Path,
 ) -> None:
-    """The loss comes in the middle of a step, the worst case.
+    """Control is lost in the middle of a step, which is the worst case.
 
-    Sease 2013, Table 5.3, for the step after it.
+    The limits of Sease 2013, Table 5.3, apply to the next step.
     """
     config = demo_config(130.0, camera=False)
     steps = (Step(at=0.0, q2=-0.3), Step(at=65.0, q2=-0.2))

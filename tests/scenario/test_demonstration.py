@@ -22,11 +22,11 @@ from tests.support.ideal_power import clairvoyant_power
 ROOT = CONFIG.parents[1]
 PIXELS_PER_RAD = 2904.0
 LEAST_STREAK = 4.0
-"""Longest streak (px) without a rate; the estimator needs 3 px."""
+"""Streak length (px) above which a frame must give a rate; the estimator needs 3 px."""
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run a command of `knightcube` in this process and return its output."""
+    """Run a `knightcube` command in this process, and return its output."""
     assert main([str(word) for word in arguments]) == 0
     return capsys.readouterr().out
 
@@ -59,7 +59,7 @@ def test_it_is_flown_whole_with_every_cycle_and_no_alarm(demonstration: Run) -> 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any]) -> None:
-    """Sease 2013, Table 5.3: 4.5 deg, 20 %, 8 s, 30 s, at less than 0.10 W from the supply on average."""
+    """Limits of Sease 2013, Table 5.3: 4.5 deg, 20 %, 8 s and 30 s, with a mean supply power below 0.10 W."""
     assert summary["attitude_source"] == "truth"
     steps, planner = summary["steps"], summary["planner"]
     assert planner["plans"] >= 140
@@ -75,7 +75,10 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any])
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any]) -> None:
-    """On the true attitude with all noise; R I^2 is compared with the optimum for the true plant."""
+    """Errors are those of the true attitude with all noise.
+
+    R I^2 is compared with the true plant's optimum.
+    """
     steps = summary["steps"]
     assert max(step["steady_state_deg"] for step in steps) <= 0.05
     assert max(step["overshoot_percent"] for step in steps) <= 0.5
@@ -96,7 +99,7 @@ def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
-    """Fraction of angle and rate errors within 3 sigma, and their rms relative to sigma, in 28,000 cycles."""
+    """Check the fraction of angle and rate errors within 3 sigma, and rms / sigma, in 28,000 cycles."""
     run = demonstration
     control, truth = run["control"][200:], run["truth"][200:28_000]
     angle = 2.0 * np.arcsin(truth["quaternion"][:, 1])
@@ -111,14 +114,14 @@ def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: Run) -> None:
-    """All 14 moving frames give a rate, six of them of exposures that begin at a step, from rest."""
+    """All 14 frames exposed in motion give a rate; six of the exposures begin at rest, with a step."""
     _assert_streaks_right(demonstration, 14)
 
 
 def _assert_streaks_right(run: Run, moving: int) -> None:
-    """Assert that each moving frame gives an accepted rate within 1 % of the truth and with a valid sigma.
+    """Assert that each frame exposed in motion gives an accepted rate within 1 % of the truth, and its sigma.
 
-    A chi-square per degree of freedom exceeds 2.1 (14 degrees) or 2.7 (6 degrees) with 1 % probability.
+    A chi-square per degree of freedom exceeds 2.1 (14 degrees of freedom) or 2.7 (6) with 1 % probability.
     """
     truth_time = run["truth"]["time_ns"]
     angle = 2.0 * np.arcsin(run["truth"]["quaternion"][:, 1])
@@ -139,7 +142,7 @@ def _assert_streaks_right(run: Run, moving: int) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
-    """The frames are off the usual grid: the body is at rest for a part of the exposure, then accelerates."""
+    """The steps begin within exposures: the body is at rest for a part of them, and then accelerates."""
     config = demo_config(44.0)
     steps = tuple(
         configuration.replace(config.steps[0], at=at, q2=q2)
@@ -162,7 +165,7 @@ def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, Any]) -> None:
-    """The same current flows at 5 V at the bus and 3.4 V at the coils; the monitor is read once a second."""
+    """The same current flows at 5 V (bus) and 3.4 V (coils). The bus monitor is read once a second."""
     power = summary["power"]
     assert power["bus_average_w"] == pytest.approx(power["supply_average_w"] * 5.0 / 3.4, rel=0.05)
 
@@ -170,7 +173,7 @@ def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_readme_states_the_power_that_is_measured(summary: dict[str, Any]) -> None:
-    """Mean powers (mW) at the coils and at the bus, and R I^2."""
+    """The README's mean powers (mW) at the coils, at the bus and as R I^2 must be the measured ones."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     row = re.search(
         r"^\| average power from the supply.*\| 0\.10 W \| (.+) mW; (.+) mW \|$", text, re.MULTILINE

@@ -1,4 +1,4 @@
-"""Tests that each way of ending a run leaves the coils at zero, which `tests.support.flights.fly` checks."""
+"""Tests that the coils are at zero however a run ends, which `tests.support.flights.fly` checks."""
 
 from __future__ import annotations
 

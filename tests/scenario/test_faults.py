@@ -1,4 +1,4 @@
-"""Tests that any device fault leaves the body controlled or the coils at zero, with an event in the log."""
+"""Tests that after any device fault the body is controlled or the coils are at zero, with a logged event."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tests.scenario.mode_flights import released
 from tests.support.flights import Rigged, config_for, demo_config, demo_world, event_names, fly
 
 BEGIN, END, DURATION, LONG = 2.0, 5.0, 8.0, 12.0
-"""Begin and end (s) of a fault; duration (s) of a flight, and of one that returns to its target."""
+"""Start and end (s) of a fault; duration (s) of a flight, and of a flight that returns to its target."""
 AT_TARGET = released(-0.3, 0.0)
-"""World in which the body is at rest at its target, which the thread makes it leave by 6 deg in 6 s."""
+"""World in which the body starts at rest at its target; the thread alone would rotate it by 6 deg in 6 s."""
 SHAM = 0.5
-"""Begin (s) of a camera fault, between the first frame and the second."""
+"""Start (s) of a camera fault, between the first and the second frame."""
 WITHIN = 0.1
 """Longest time (s) from the loss of control until the coils are at zero."""
 
@@ -35,7 +35,7 @@ def true_current(run: Run, since: float, until: float) -> FloatArray:
 
 
 def assert_whole(run: Run, duration: float = DURATION) -> None:
-    """All written packets are in the log, in order, to the end of the run."""
+    """Assert that all written packets are in the log, in order, up to the end of the run."""
     for log in run.logs.values():
         assert log.intact
     assert len(run["control"]) == round(duration / 0.025)
@@ -43,7 +43,7 @@ def assert_whole(run: Run, duration: float = DURATION) -> None:
 
 
 def line(faults: LineFaults) -> Callable[[Rigged], None]:
-    """Return the fault that disturbs the VN-100's line between BEGIN and END."""
+    """Return the function that disturbs the VN-100's serial line between BEGIN and END."""
 
     def prepare(rigged: Rigged) -> None:
         wire = rigged.lock.line.to_host
@@ -134,7 +134,7 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
         wire = rigged.lock.line.to_host
         rigged.at(BEGIN, lambda: setattr(wire, "faults", LineFaults(silent=True)))
         for k in range(100):
-            # Line noise needs no sender, so that noise arrives although the VN-100's bytes are lost.
+            # Noise on the line needs no sender, so it arrives although the VN-100's bytes are lost.
             def spark(k: int = k) -> None:
                 wire.faults = SOUND
                 wire.noise(40, rigged.lock.clock.now_ns(), 115200)
@@ -277,7 +277,7 @@ def test_a_frame_that_comes_late_is_not_accepted_as_fresh(tmp_path: Path, max_ag
 
 
 def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -> None:
-    """A second's stall: 40 slots slip, one event, no burst, and the coils have decayed meanwhile."""
+    """The loop stalls for 1 s: 40 slots are lost with one event and not made up; the currents decay."""
 
     def prepare(rigged: Rigged) -> None:
         camera, clock = rigged.lock.hardware.camera, rigged.lock.clock

@@ -1,4 +1,4 @@
-"""Tests of health in flight: watchdog, guardian heartbeat, streams, resources, and requested restarts."""
+"""Tests of health monitoring in flight: watchdog, guardian heartbeat, device streams, resources, restarts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SECOND = 1_000_000_000
 
 
 class Signs:
-    """Records the mission times (s) of the heartbeats of a flight."""
+    """Recorder of the mission times (s) of a flight's heartbeats."""
 
     def __init__(self) -> None:
         self.fed: list[float] = []
@@ -37,7 +37,7 @@ class Signs:
 
 
 def failing(rigged: Rigged, since: float, until: float) -> None:
-    """Let the control task raise an exception between two mission times."""
+    """Make the control task raise an exception in each cycle between two mission times (s)."""
     host = rigged.lock.line.host
     receive = host.receive
 

@@ -1,4 +1,4 @@
-"""Runs the `make` targets of runs in short form, with the commands of their recipes."""
+"""Tests that the `make` targets that start a flight work, with the commands of their recipes shortened."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flight.app.cli import main
 ROOT = Path(__file__).resolve().parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text()
 SECONDS = {"demo": 3, "cage": 3, "orbit": 3, "orbit-3u": 3, "object": 40}
-"""Shortened duration of each `make` target; the object enters the field of view after half a minute."""
+"""Shortened duration (s) of each `make` target; objects enter the field of view only after half a minute."""
 
 
 def commands_of(target: str) -> list[str]:

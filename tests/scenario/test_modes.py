@@ -109,14 +109,14 @@ def test_a_slew_that_does_not_arrive_becomes_a_hold(tmp_path: Path) -> None:
 
 
 def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
-    """The body detumbles from 0.5 rad/s by coils x and z; the field is measured while they are off."""
+    """The body detumbles from 0.5 rad/s with coils x and z; the field is measured while the coils are off."""
     run = fly(commanded(11.0, initial="detumble"), tmp_path, section=released(-0.68, 0.5))
     assert modes_of(run) == [Mode.BOOT, Mode.DETUMBLE]
     truth = run["truth"]
     time = truth["time_ns"] * 1e-9
     rate = truth["rate"][:, 1]
-    # One coil (0.096 A m^2 in 0.45 mT, on for 0.6 of the time) removes 0.025 rad/s per second, two coils 1.4
-    # times that.
+    # One coil (0.096 A m^2 in 0.45 mT, on for 0.6 of the time) reduces the rate by 0.025 rad/s per second,
+    # and two coils by 1.4 times that.
     assert rate[time > 10.9].max() < 0.2
     windows = np.interp(np.arange(0.5, 11.0, 0.25), time, rate)
     assert np.diff(windows).max() < 2e-3
@@ -182,7 +182,7 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
 def test_what_the_demonstration_is_on_its_way_to_and_a_target_that_moves_are_not_impossible_to_hold(
     tmp_path: Path,
 ) -> None:
-    """The error is 0.8 rad for longer than the timeout of a hold; the last target is 0.68 rad away."""
+    """For longer than a hold's timeout the error is 0.8 rad; the last target is at a distance of 0.68 rad."""
     config = configuration.replace(commanded(27.0), steps=(Step(at=0.0, q2=-0.2, rate=0.04),))
     run = fly(config, tmp_path)
     assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO]
@@ -241,7 +241,7 @@ def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
 def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
     tmp_path: Path, crashes: int, mode: Mode
 ) -> None:
-    """The stored state of each killed boot still says that it runs."""
+    """The stored state of each killed boot still states that the boot is running."""
     config = commanded(1.0)
     state = tmp_path / "state"
     for _ in range(crashes):
@@ -255,7 +255,7 @@ def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
 
 
 def keeper_of(folder: Path) -> StateKeeper:
-    """Return the state of a started boot in `folder`."""
+    """Return the state keeper of a boot that has started in `folder`."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
     return StateKeeper(

@@ -1,4 +1,4 @@
-"""Tests that no telemetry number ends a run: counters wrap, and values out of range are reported."""
+"""Tests that no telemetry value can end a run: counters wrap around, and values out of range are reported."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NEAR = (1 << 32) - 30
 FEW_LEFT = (1 << 32) - 3
 """Initial value of slower counters that exceed 32 bits during the run."""
 SLEWS = 64_535
-"""Initial number of commanded slews, at the end of its range."""
+"""Initial number of commanded slews, close to the end of its 16-bit range."""
 
 _OF_OBJECTS = {"sightings", "track"}
 """Packets of a flight with objects in its field of view."""
@@ -44,7 +44,7 @@ def whole(packet: Packet) -> list[Field]:
 
 
 def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
-    """Write each record again for each integer field, with a value beyond the field's range."""
+    """Make the log write each record once more per integer field, with that field beyond its range."""
     driven: Driven = {}
     for name in ("record", "time"):
         plain = getattr(Recorder, name)
@@ -66,7 +66,7 @@ def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
 
 
 def assert_survived(run: Run, driven: Driven, written: set[str]) -> None:
-    """No value out of range ended a task, and all such values were counted and reported."""
+    """Assert that no value out of range ended a task, and that all such values were counted and reported."""
     due = {(p.name, f.name): f.wraps for p in PACKETS if p.name in written for f in whole(p)}
     assert {key: kept for key, kept in driven.items() if key[0] in written} == due
     assert "task-failed" not in event_names(run)
@@ -121,7 +121,7 @@ def test_every_integer_of_an_orbit_may_pass_its_end(tmp_path: Path, monkeypatch:
 def test_counts_of_ten_years_neither_end_the_flight_nor_its_slews(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In three seconds each count passes 32 bits, and the commanded slew gets the number 65,535 or more."""
+    """In three seconds each counter exceeds 32 bits, and slew numbers reach 65,535 or more."""
     begin = RateGroup.begin
 
     def late(group: RateGroup, epoch_ns: int) -> None:

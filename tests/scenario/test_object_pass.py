@@ -1,7 +1,7 @@
 """Tests that a KnightCube finds an object in its frames, follows it, and keeps it while the camera is blind.
 
-The flight of `config/orbit_object_1u.yaml` has rendered frames, and runs vision, track, planner and coils.
-The true motion of the object is integrated in this module.
+The flight of `config/orbit_object_1u.yaml` renders frames, and runs image processing, tracking, planner and
+coils. The true motion of the object is integrated in this module.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def _shown(run: Run, times: FloatArray) -> FloatArray:
-    """Return the apparent directions (n, 3) of the object, like those of stars, at mission times (n,), s."""
+    """Return the object's apparent directions (n, 3), corrected like those of stars, at times (n,), s."""
     section = configuration.simulation_section(CONFIG.read_text(encoding="utf-8"), CONFIG.name, Simulation)
     assert section is not None
     start = section.objects[0].state
@@ -57,7 +57,7 @@ def _shown(run: Run, times: FloatArray) -> FloatArray:
     flown = solve_ivp(flow, span, first, "DOP853", rtol=1e-11, atol=1e-4, dense_output=True).sol
     state = flown(times + late).T
     way = state[:, :3] - own
-    # The light left the object earlier, and the camera moves with the Earth around the Sun.
+    # The directions account for light time, and for the Earth's motion around the Sun (aberration).
     moved = state[:, 3:] + earth_velocity(begun)
     way = way - np.linalg.norm(way, axis=1, keepdims=True) / SPEED_OF_LIGHT * moved
     return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
@@ -89,7 +89,7 @@ def test_it_is_kept_in_the_field_and_followed_while_the_camera_is_off(flown: Run
     blind = (times[after] > BLIND) & (times[after] < BLIND + GAP)
     assert off[blind].max() < 4.0
     assert off[-1] < 4.0
-    # The body rotates with the object.
+    # The body must rotate with the object while the camera is blind.
     turn = np.degrees(np.linalg.norm(truth["rate"][after][blind], axis=1))
     assert turn.min() > 0.3
 

@@ -82,7 +82,7 @@ def test_the_measured_track_is_read_back_from_its_message(tracked: Run, tmp_path
 
 
 def _nearest_line(segment: str, zero: datetime) -> int:
-    """Return the index of the object of a segment; all data of the segment must belong to it."""
+    """Return the index of the object to which a segment of the message belongs, with all of its data."""
     words = [row.split(" = ") for row in segment.splitlines() if " = " in row]
     header = {word[0]: word[1] for word in words if len(word[1].split()) == 1}
     assert (header["ANGLE_TYPE"], header["REFERENCE_FRAME"], header["TIME_SYSTEM"]) == (
@@ -105,7 +105,7 @@ def _nearest_line(segment: str, zero: datetime) -> int:
 
 
 def test_the_message_is_read_by_a_reader_of_other_authors(tracked: Run, tmp_path: Path) -> None:
-    """`ccsds-ndm` builds its objects from the schema of the standard, which refuses what is not in it."""
+    """`ccsds-ndm` builds its objects from the standard's schema, and refuses content outside the schema."""
     reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
     (path,) = write_tracking_data(tracked, tmp_path / "track.tdm")
     segments = reader.from_path(path).body.segment

@@ -51,7 +51,7 @@ def test_two_objects_are_tracked_through_a_slew_with_honest_claims(tmp_path: Pat
         claim = np.sqrt(0.5 * track["covariance"][:, :3].sum(axis=1))
         assert (away[own] < 3.5 * claim).all()
         assert claim.max() < 4.0 * _PIXEL, "the estimated attitude is known to some pixels"
-        # The rate is measured relative to the stars, so that it is free of the attitude error.
+        # The object's rate is measured relative to the stars, so the attitude error does not affect it.
         rate = np.degrees(np.linalg.norm(track["rate"], axis=1))
         sigma = np.degrees(np.sqrt(0.5 * track["rate_covariance"][:, :3].sum(axis=1)))
         assert (np.abs(rate - _LINES[own].rate_deg) < 3.5 * sigma).all()
@@ -75,7 +75,7 @@ def test_a_damaged_sky_index_leaves_detection_by_motion(
 
 @pytest.mark.slow
 def test_a_satellite_follows_an_object_without_a_star_catalogue(tmp_path: Path) -> None:
-    """A KnightCube with a coarse attitude turns with an object that passes at 0.4 deg/s."""
+    """A KnightCube with a coarse attitude rotates with an object that passes at 0.4 deg/s."""
     path, seconds = FOLDER / "orbit_object_1u.yaml", 75.0
     config = as_orbit(configuration.load(path))
     assert config.camera is not None

@@ -1,4 +1,4 @@
-"""Tests that a satellite in orbit detumbles by magnetometer, rests, and detumbles again."""
+"""Tests that a satellite in orbit detumbles by magnetometer, ends detumbling, and detumbles again."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from tests.scenario.orbit_flights import ORBIT, orbit_config, speed, world
 from tests.support.flights import event_names, fly
 
 SPEED, SLOW = 0.1745, 0.1
-"""Rates (rad/s) at the release and at the end of detumbling."""
+"""Body rates (rad/s) at the release and at the end of detumbling."""
 SILENT, MUTE = 20.0, 1.0
-"""Start and duration (s) of the silence of the IMU."""
+"""Start and duration (s) of the interval in which the IMU is silent."""
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Run from 10 deg/s with a silent IMU during detumbling; a low limit ends the rest at once."""
+    """Run a flight from 10 deg/s with a silent IMU during detumbling; a low limit soon starts it again."""
     config = orbit_config(70.0, tumble_rate=0.01)
     section = configuration.replace(config.detumble, low_rate=SLOW, low_for=3.0)
     timeline = (CommandStep(at=1.0, mode="hold"), CommandStep(at=2.0, slew=0.1))
@@ -71,7 +71,7 @@ def test_the_coils_are_at_zero_while_the_unit_is_silent(flown: Run) -> None:
 
 
 def test_the_coils_pause_while_the_magnetometer_measures(flown: Run) -> None:
-    """The magnetometer is read in the last 0.1 s of each pause of 0.2 s, after the decay of the current."""
+    """The magnetometer is read in the last 0.1 s of each coil pause of 0.2 s, after the current's decay."""
     time = flown["truth"]["time_ns"] * 1e-9
     began = entered(flown, Mode.DETUMBLE, 0)
     phase = (time - began) % 4.0

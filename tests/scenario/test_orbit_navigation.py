@@ -24,7 +24,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def settled(flown: Run) -> AttitudeErrors:
-    """Return the errors from some frames after the acquisition on."""
+    """Return the attitude errors, starting some frames after the acquisition."""
     found = attitude_errors(flown)
     later = found.times > ACQUIRED
     return AttitudeErrors(found.times[later], found.error[later], found.sigma[later])
@@ -65,7 +65,7 @@ def test_it_learns_the_biases_of_the_inertial_unit(flown: Run) -> None:
 
 
 def flown_bias(run: Run) -> np.ndarray:
-    """Return the mean gyro error: the configured bias plus the random bias of the IMU."""
+    """Return the IMU's mean gyro error (3,): its configured bias plus its random bias."""
     imu, truth = run["imu"], run["truth"]
     rates = [
         np.interp(imu["sample_time_ns"], truth["time_ns"], truth["rate"][:, axis].astype(float))
@@ -88,7 +88,7 @@ def test_the_report_shows_how_well_the_attitude_was_known(flown: Run, tmp_path: 
 
 @pytest.mark.parametrize("days", [3.0, -5.0])
 def test_a_wall_clock_that_is_days_off_is_corrected_by_the_first_fix(days: float, tmp_path: Path) -> None:
-    """The run packet is recorded again with the receiver's UTC."""
+    """The `run` packet is recorded a second time with the UTC of the GPS receiver."""
     quiet = world(NEAR_REST, FaultEntry(fault=f"clock: stepped (by={86_400.0 * days})"))
     receiver = configuration.replace(quiet.orbit_devices, gps_start=3.0)
     config = configuration.replace(orbit_config(6.0), camera=None)

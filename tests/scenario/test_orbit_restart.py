@@ -1,4 +1,4 @@
-"""Tests that a killed satellite process restarts with the parameters that its filter had learned."""
+"""Tests that a killed flight process restarts with the parameters that its filter had estimated."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _first_error(run: Run) -> float:
 
 
 def test_the_gyro_bias_is_known_at_once_after_a_kill(tmp_path: Path) -> None:
-    """A kill leaves the files that are on the disk at that instant."""
+    """After a kill, only the files that are on the disk at that instant remain."""
     disk, left = tmp_path / "disk", tmp_path / "left"
 
     def kill(rigged: Rigged) -> None:
@@ -58,7 +58,7 @@ def test_the_gyro_bias_is_known_at_once_after_a_kill(tmp_path: Path) -> None:
     assert "unclean-shutdown" in event_names(again)
     assert "learned-refused" not in event_names(again)
     assert np.isfinite(again["navigation"]["gyro_bias"][-1]).all()
-    # The optical axis of the uncalibrated camera, described to 2 px, is also known at once.
+    # The optical axis of the uncalibrated camera, configured to within 2 px, is also known at once.
     axis, known = first["lens"]["centre"][-1] - 255.5, first["lens"]["sigma"][-1, 1:3]
     assert len(first["lens"]) > 3
     assert np.all(np.abs(axis) < 5.0 * known)

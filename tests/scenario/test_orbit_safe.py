@@ -1,4 +1,4 @@
-"""Tests that a satellite in SAFE detumbles and then points to the Sun by strings, gyro and field."""
+"""Tests that a satellite in SAFE detumbles and then points to the Sun by solar strings, gyro and field."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.flights import event_names, fly
 
 SPEED, SLOW = 0.05, 0.042
 DURATION = 45.0
-"""Times (s): detumbling starts after 5 s, and the body is slow after 15 s."""
+"""Duration (s) of the flight, in which detumbling starts after 5 s and the body is slow after 15 s."""
 
 
 @pytest.fixture(scope="module")

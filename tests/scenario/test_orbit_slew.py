@@ -22,8 +22,11 @@ from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
 BEGIN, SLEW, AFTER, TURN = 20.0, 150.0, 15.0, np.radians([20.0, 20.0, -10.0])
-"""Begin and duration (s) of the slew, time (s) after it, and its rotation vector (rad). The rotation about x,
-along the field, is one that the field's own rotation permits at 0.7 deg/s; a path may rotate at 0.8 deg/s."""
+"""Begin and duration (s) of the slew, time (s) after it, and its rotation vector (rad).
+
+The coils can cause the rotation about x, along the field, only because the field rotates; it reaches 0.7
+deg/s of the 0.8 deg/s that a path may have.
+"""
 BROKEN = 22.0
 """Time (s) at which the coils x and z break. The remaining coil causes no torque about its own axis y, about
 which the slew rotates most."""
@@ -65,18 +68,18 @@ def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
     config, section = slewing(105.0, *faults)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pointing_law, "DAMPING_TIMEOUT", PATIENCE)
-        # No slew is planned for the only coil that is not isolated, so the faults stay undetected.
+        # The coil monitor is disabled, because no slew is planned with a single remaining coil.
         patch.setattr(CoilMonitor, "available", property(lambda _: np.ones(3, dtype=bool)))
         return fly(config, tmp_path_factory.mktemp("crippled"), section=section)
 
 
 def at(run: Run, name: str) -> list[float]:
-    """Return the times, s, of an event."""
+    """Return the mission times (s) of all events of one name."""
     return [float(event["time_ns"]) * 1e-9 for event in run["event"] if to_text(event["name"]) == name]
 
 
 def part(run: Run, since: float, until: float) -> Any:
-    """Return the attitude packets of an interval."""
+    """Return the attitude packets of an interval of mission time (s)."""
     packets = run["attitude"]
     times = packets["time_ns"] * 1e-9
     return packets[(times >= since) & (times < until)]

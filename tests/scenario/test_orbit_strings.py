@@ -13,7 +13,7 @@ from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import fly
 
 DEAD = 6.0
-"""Time (s) from which a string gives no current."""
+"""Time (s) from which one solar string gives no current."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Runs with devices other than those of the thesis: their drivers with emulated chips.
+"""Tests of simulated flights with devices other than those of the thesis: drivers on emulated chips.
 
 The sensors of the first flight are read by CircuitPython's own drivers (extra `circuitpython`).
 """
@@ -62,7 +62,7 @@ duration: {duration}
 
 
 def flown(text: str, folder: Path, *expected: str, fault: str = "") -> Run:
-    """Fly a configuration in lock-step, and return its logs; only the `expected` faults may be noticed."""
+    """Fly a configuration in lock-step, and return its logs; only `expected` fault events may occur."""
     path = folder / "config.yaml"
     path.write_text(text, encoding="utf-8")
     result = fly(RunRequest(path, folder / "run", faults=(fault,) if fault else ()))
@@ -80,7 +80,7 @@ def test_a_testbed_flies_on_circuitpython_drivers_and_bridges_with_an_i2c_interf
     late = truth["quaternion"][-80:, 1]
     assert np.abs(late + 0.1).max() < 0.01, "q2 of the last 2 s"
     assert len(run["imu"]) == pytest.approx(13 * 40, abs=2)
-    # Each reading agrees with the truth at its time: axes, scales and time stamps are right.
+    # Each reading agrees with the truth at its time, so axes, scales and time stamps are correct.
     times = run["imu"]["sample_time_ns"] * 1e-9
     for field, axis, bound in (("rate", 1, 0.008), ("quaternion", 1, 0.006)):
         true = np.interp(times, truth["time_ns"] * 1e-9, truth[field][:, axis])
@@ -104,7 +104,7 @@ def test_a_satellite_flies_with_a_sensor_on_spi_and_a_receiver_with_nmea_sentenc
 def test_a_magnetometer_of_its_own_carries_the_testbed_while_the_inertial_unit_is_off(
     tmp_path: Path,
 ) -> None:
-    """Without a camera, the coils rest now and then, so that the magnetometer is undisturbed."""
+    """Without a camera, the coils pause at intervals, so that the magnetometer is undisturbed."""
     pytest.importorskip("adafruit_lis3mdl")
     text = MAGNETOMETER.format(name="step_demo", duration=13.0)
     text = text.replace("wide_cameras: []\nsolar_strings: none\n", "steps: [{at: 0.0, q2: -0.1}]\n")

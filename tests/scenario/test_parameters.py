@@ -19,7 +19,7 @@ SPINS = "tumbling"
 
 
 def configured() -> dict[str, float]:
-    """Return the table of the configuration."""
+    """Return the parameter table of the configuration."""
     config = commanded(4.0)
     sections = {"modes": config.modes, "health": config.health}
     return {
@@ -28,7 +28,7 @@ def configured() -> dict[str, float]:
 
 
 def load(changes: dict[str, float], replaced: int | None = None) -> bytes:
-    """Return the packet that changes the configuration's table."""
+    """Return the command packet that changes the configuration's parameter table."""
     before = configured()
     crc = crc_of(list(before.values())) if replaced is None else replaced
     return CommandPacker().pack(LoadParameters(crc, tuple({**before, **changes}.values())), 5)
@@ -66,7 +66,7 @@ def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
 
 
 def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
-    """The configured value, used without a loaded table, is also within the bounds."""
+    """The configured value, which applies without a loaded table, is also within the command's bounds."""
     config = commanded(4.0)
     for (key, value), field in zip(configured().items(), PARAMETER_FIELDS, strict=True):
         assert field.valid is not None

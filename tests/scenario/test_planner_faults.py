@@ -1,4 +1,4 @@
-"""Tests that an invalid plan is not used: the last valid plan continues, and its end is held."""
+"""Tests that an invalid plan is not used: the last valid plan continues, and then its end point is held."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tests.support.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 17.5
 GOOD_PLANS = 2
-"""The second plan is made at 5 s and ends at 15 s."""
+"""Number of valid plans; the second is made at 5 s and ends at 15 s."""
 
 Spoil = Callable[[PlanJob, StepPlan], StepPlan]
 
 
 def use_planner(monkeypatch: pytest.MonkeyPatch, plan: Callable[[PlanJob], StepPlan]) -> None:
-    """Give the testbed another planner."""
+    """Replace the testbed's planner by the function `plan`."""
     monkeypatch.setattr(testbed, "TESTBED", replace(testbed.TESTBED, plan=plan))
 
 
@@ -137,7 +137,7 @@ def test_a_planner_that_is_just_in_time_is_flown(tmp_path: Path) -> None:
 
 
 def test_an_infeasible_step_is_stretched_reported_and_flown(tmp_path: Path) -> None:
-    """From +0.3 back to -0.3 at rest needs more than 10 s under 0.148 A."""
+    """A slew from q2 = +0.3 to rest at -0.3 needs more than 10 s with at most 0.148 A."""
     steps = (Step(at=0.0, q2=0.3), Step(at=14.0, q2=-0.3))
     run = fly(configuration.replace(demo_config(34.0, camera=False), steps=steps), tmp_path)
     assert "plan-stretched" in event_names(run)

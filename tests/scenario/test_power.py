@@ -1,4 +1,4 @@
-"""Tests of loads that the loop sheds for a much too small battery, and restores after sunrise."""
+"""Tests that the flight sheds loads when a much too small battery is low, and restores them after sunrise."""
 
 from __future__ import annotations
 

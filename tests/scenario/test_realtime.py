@@ -1,4 +1,4 @@
-"""Tests in real time: the loop on the machine's clock, with devices and workers in separate processes."""
+"""Tests of flights in real time on the machine's clock, with devices and workers in separate processes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_planner_and_vision_worked_beside_the_loop(flown: Run) -> None:
     assert outcomes == {("planner", "done"), ("vision", "done")}
     plans = flown["plan"]
     assert plans["accepted"][-1]
-    # A busy machine may be late with a plan, which is reported and not flown.
+    # On a busy machine a plan may be late; it is then reported and not flown.
     assert all(status.startswith(b"the plan is late") for status in plans["status"][plans["accepted"] == 0])
     assert to_text(flown["streak"]["status"][0]) == "rate"
 

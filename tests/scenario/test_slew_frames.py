@@ -1,4 +1,4 @@
-"""Tests of frames during a slew: streak lengths are suitable, no coil step falls within an exposure."""
+"""Tests that frames during a slew have suitable streak lengths, and no coil step within their exposure."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SEED = 3
 ABOUT = np.array([1.0, 0.0, 0.0])
 """Body axis of the slew: across the boresight, which is along -y."""
 STREAKS = 1.1
-"""Star motion (px) in the usual exposure above which stars must be streaked."""
+"""Star motion (px) during the default exposure above which stars must be streaks."""
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Fly the first minute and a half of a slew of a 3U, a frame every 5 s."""
+    """Return the first 85 s of a 3U's slew with a frame every 5 s."""
     config, world = slew_frames.flight("orbit", SEED, ABOUT)
     first, second = config.targets
     config = configuration.replace(
@@ -63,20 +63,22 @@ def test_streaks_of_a_slew_are_long_enough_to_tell_the_rate_and_no_longer(flown:
 def test_no_step_of_the_coils_falls_into_an_exposure_of_a_slew(flown: Run) -> None:
     packets = flown["attitude"]
     changed = np.abs(np.diff(packets["dipole"], axis=0)).max(axis=1) > 0.0
-    after = packets["time_ns"].astype(np.int64)[1:][changed]  # first packets after target steps
+    # First packets after steps of the commanded dipole.
+    after = packets["time_ns"].astype(np.int64)[1:][changed]
     frames = flown["streak"][flown["streak"]["exposure_start_ns"] > (BEGIN + 2.0) * 1e9]
     assert len(after) > 30
     for frame in frames:
         begin = int(frame["exposure_start_ns"])
         end = begin + round(float(frame["exposure"]) * 1e9)
-        # An exposure may end with the step: a packet of that moment has the new dipole.
+        # An exposure may end at the step, and a packet of that moment already has the new dipole.
         assert not ((after - 100_000_000 >= begin) & (after < end)).any()
 
 
 def test_their_rates_and_attitudes_enter_the_estimate(flown: Run) -> None:
     streaked, _ = _streaked(flown)
     frames, stars = flown["streak"][streaked], flown["stars"]
-    # One or two of ten crowded frames with streaks of 7 to 8 px have bright areas without a common motion.
+    # One or two of ten crowded frames with streaks of 7 to 8 px give no rate, because overlapping streaks
+    # have no common motion.
     assert np.mean([to_text(status) == "rate" for status in frames["status"]]) >= 0.8
     assert np.all(frames["accepted"][[to_text(status) == "rate" for status in frames["status"]]] == 1)
     of_streaks = np.isin(stars["sequence"], frames["sequence"])

@@ -15,8 +15,8 @@ from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 _LOST, _TRACKED = 0, 1
-# Bounds of the normalised square with three degrees of freedom: exceeded by chance once in 1e5; four times
-# that for 300 px.
+# Bound of the normalised squared error with three degrees of freedom, exceeded by chance once in 1e5 frames.
+# For streaks of 300 px it is four times as large.
 _MOST_MISMATCH = 4.0 * 25.9
 
 
@@ -39,13 +39,13 @@ def mismatch(run: Run) -> FloatArray:
 
 
 def assert_solved(run: Run) -> None:
-    """Each attitude comes from identified stars, and its error agrees with its covariance."""
+    """Assert that each attitude comes from identified stars, and its error agrees with its covariance."""
     assert set(run["stars"]["status"].tolist()) == {b"solved"}
     assert mismatch(run).max() < _MOST_MISMATCH
 
 
 def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
-    """Make the IMU silent between two mission times, or from before the run if no times are given."""
+    """Make the IMU silent between two mission times (s), by default from before the run to its end."""
     wire = rigged.lock.line.to_host
 
     def silence() -> None:
@@ -63,7 +63,7 @@ def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
 
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Run the first 30 s: release at 0.1 rad/s, streaks of 300 px, and rest at the first target."""
+    """Return a flight of 30 s: release at 0.1 rad/s, streaks of 300 px, and rest at the first target."""
     return fly(demo_config(30.0), tmp_path_factory.mktemp("stars"))
 
 
@@ -82,9 +82,9 @@ def test_every_frame_of_the_demonstration_gives_an_attitude_that_the_estimate_ta
 
 
 def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstration: Run) -> None:
-    """The normalised mean square is checked.
+    """The mean normalised squared error has an upper bound.
 
-    About the thread, the only excited axis, also against a lower bound.
+    About the thread, the only axis that rotates, it also has a lower bound.
     """
     error, covariance = errors(demonstration)
     about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])
@@ -103,11 +103,11 @@ def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: 
 
 
 def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_tracked(tmp_path: Path) -> None:
-    """After ten seconds without frames and IMU, the model cannot predict the camera's attitude.
+    """After ten seconds without frames and IMU, the filter's model cannot predict the camera's attitude.
 
-    The body, which has swung freely, returns with the full torque of the coil. The IMU resumes early enough
-    that the rate changes by less than half in the next exposure of one second. A larger rate change is beyond
-    the motion fit.
+    The body has then swung freely, and is rotated back with the full torque of the coil. The IMU resumes
+    early enough that the rate changes by less than half in the next exposure of one second. A larger rate
+    change is beyond the motion fit.
     """
 
     def prepare(rigged: Rigged) -> None:

@@ -1,4 +1,4 @@
-"""Tests of guidance to a target: with a goal time, a cost of time, a moving target, or by a step."""
+"""Tests of guidance to a target: with a goal time, with a time cost, to a moving target, and as a step."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> Tes
 
 
 def true_angle(run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the mission times, s, and the true rotation about the thread, rad."""
+    """Return the mission times (n,), s, and the true rotation angles (n,), rad, about the thread."""
     truth = run["truth"]
     return truth["time_ns"] * 1e-9, 2.0 * np.arcsin(truth["quaternion"][:, 1])
 
@@ -46,7 +46,7 @@ def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
 
 
 def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None:
-    """A doubled time cost shortens the horizon by the fourth root of two.
+    """A doubled time cost shortens the slew's duration by the fourth root of two.
 
     Later plans keep the first goal time.
     """

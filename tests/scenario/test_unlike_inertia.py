@@ -37,7 +37,7 @@ def _flown(folder: Path, duration: float, fault: str) -> Run:
 
 
 def test_moments_two_percent_off_isolate_no_healthy_coil(tmp_path: Path) -> None:
-    """With the assumed inertia alone, coils y and z of this flight would seem reversed, at 48 and 88 s."""
+    """If the configured inertia were trusted, coils y and z would seem reversed, at 48 and 88 s."""
     found = coil_judgement(_flown(tmp_path, 95.0, ""), "")
     assert found["healthy_isolated"] == []
     assert found["healthy_suspected"] == found["healthy_corrected"] == []
@@ -66,7 +66,7 @@ def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: 
 
 
 def test_a_sign_found_before_a_restart_is_used_from_the_start(tmp_path: Path) -> None:
-    """The stored matrix of the coils refers to corrected dipoles, so that the correction is stored too."""
+    """The stored gain matrix of the coils refers to corrected dipoles, so the correction is stored too."""
     config, world = configured("orbit_3u")
     state = replace(config.state, folder=str(tmp_path / "state"), period=1.0)
     config = replace(without_cameras(config, 20.0), state=state)

@@ -12,7 +12,7 @@ _NOT_STUDIES = {"__main__", "checks"}
 
 
 def names() -> list[str]:
-    """Return the names of the studies: modules and packages of this folder that can be run."""
+    """Return the names of the studies: the executable modules and packages of this folder."""
     return [
         found.name
         for found in pkgutil.iter_modules([str(_FOLDER)])
@@ -26,7 +26,7 @@ def names() -> list[str]:
 
 
 def main() -> int:
-    """Run the study named first on the command line with the rest of the line."""
+    """Run the study that the first argument names, with the remaining arguments."""
     if sys.argv[1:2] in (["-h"], ["--help"]):
         print(f"usage: python -m tests.studies NAME [arguments]\n\nstudies: {', '.join(names())}")  # noqa: T201
         print("\n`python -m tests.studies NAME --help` shows the arguments of a study.")  # noqa: T201 - a command

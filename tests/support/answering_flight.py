@@ -1,4 +1,4 @@
-"""A socket that answers commands as a flight does."""
+"""A command socket that replies as the flight software does."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from flight.link.telemetry.packets import Packer
 
 
 def answer(obeyed: bool) -> bytes:
-    """Return a flight's answer to a command."""
+    """Return the reply packet of the flight software to a command, which it obeyed or refused."""
     fields = dict.fromkeys((field.name for field in COMMAND.fields), 0)
     texts = {field.name: "as commanded" for field in COMMAND.fields if field.kind.startswith("S")}
     return Packer().pack(COMMAND, 5, {**fields, **texts, "obeyed": int(obeyed), "mode": int(Mode.HOLD)})
 
 
 class Listener:
-    """A flight's command socket that gives replies in order and repeats the last one."""
+    """A command socket that sends prepared replies in order and then repeats the last one."""
 
     def __init__(self, path: Path) -> None:
         self._reply = [answer(True)]
@@ -32,12 +32,12 @@ class Listener:
         weakref.finalize(self, self._line.shutdown, socket.SHUT_RDWR)
 
     def will_say(self, *replies: bytes) -> None:
-        """Set the replies from now on; the last one is repeated."""
+        """Set the replies to the next commands; the last reply is repeated."""
         self._reply[:] = replies
 
 
 def _listen(line: socket.socket, reply: list[bytes]) -> None:
-    """Answer until the socket is shut down."""
+    """Reply to each datagram until the socket is shut down."""
     while True:
         _, sender = line.recvfrom(LONGEST)
         if not sender:

@@ -1,4 +1,4 @@
-"""Errors of attitudes and rates in the measures of the thesis (Sease 3.28, 3.29)."""
+"""Errors of attitudes and rates as the thesis defines them (Sease 3.28, 3.29)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ def field_fraction(rate: FloatArray, exposure: float, field_of_view: float) -> f
 
 
 def error_in_pixels(angle: float, resolution: int, field_of_view: float) -> float:
-    """Return an angular error in rad as px, for a camera of `resolution` px across its field, rad (3.29)."""
+    """Return an angular error (rad) in px, for a camera with `resolution` px across its field, rad (3.29)."""
     return angle * resolution / field_of_view
 
 
 def attitude_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
     """Return the total error and the error across the boresight (rad) of an attitude (4,).
 
-    The total error is the rotation angle from truth to estimate. The error across is the angle between the
-    two boresights. It excludes the rotation about the boresight, which is about ten times less accurate in a
-    narrow field.
+    The total error is the rotation angle from truth to estimate. The error across the boresight is the angle
+    between the true and the estimated boresight. It excludes the rotation about the boresight, which is about
+    ten times less accurate in a narrow field.
     """
     difference = multiply(estimate, conjugate(truth))
     boresight = attitude_matrix(difference)[:, 2]

@@ -1,4 +1,4 @@
-"""Calls into the operating system that the thread of the control loop makes in flight.
+"""Lists the system calls that the control loop's thread makes during a flight.
 
 `python -m tests.support.blocking_calls CONFIG OUT DEVICES` flies on emulated devices in real time. It prints,
 as a JSON list, the product function and the name of every call of a C function that may block. Methods of
@@ -27,11 +27,11 @@ MODULES = frozenset(
 """Modules of C functions, and of the types of C methods, that may enter the operating system and wait."""
 HARMLESS = frozenset({"monotonic_ns", "monotonic", "time_ns", "time", "perf_counter", "perf_counter_ns"})
 FIRST, LAST = 40, 200
-"""Slots of the control cycles between which calls count."""
+"""First and last control cycle of the interval in which calls are recorded."""
 
 
 class BlockingCalls:
-    """Collects the calls that may block in the thread in which it is started."""
+    """Recorder of the calls that may block, in the thread that starts it."""
 
     def __init__(self) -> None:
         self.found: set[tuple[str, str]] = set()
@@ -61,7 +61,7 @@ class BlockingCalls:
 
 
 def _caller(frame: FrameType | None) -> str:
-    """Return the nearest function of the product on the stack."""
+    """Return the innermost function on the stack that belongs to the flight software."""
     while frame is not None:
         path = frame.f_code.co_filename.removeprefix(f"{ROOT}/")
         if path.startswith(("flight/", "hal/", "knightcube/")):
@@ -71,7 +71,7 @@ def _caller(frame: FrameType | None) -> str:
 
 
 def run(words: Sequence[str]) -> int:
-    """Fly, and print the calls."""
+    """Run a flight, and print the calls that may block."""
     config, out, devices = words
     calls, fly = BlockingCalls(), ControlCycle.run
 

@@ -1,4 +1,4 @@
-"""Debian's Chromium controlled by playwright, which counts errors of the page and its requests."""
+"""Debian's Chromium controlled by playwright, with a record of the page's errors and requests."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ HOST = "127.0.0.1"
 
 @dataclass  # without slots, because playwright sets attributes on objects whose methods it calls
 class Page:
-    """An open page.
+    """A page of the console in the browser.
 
-    `complaints` are console messages; `strangers` are requested addresses beyond loopback.
+    `complaints` are errors and warnings of the browser's console; `strangers` are requested addresses beyond
+    loopback.
     """
 
     page: Any
@@ -57,7 +58,7 @@ class Page:
 
     @property
     def shown(self) -> tuple[float, str]:
-        """Time (s) that the page shows, and the values of all packets at that time."""
+        """Time (s) that the page shows, and the packet values that it shows for that time."""
         self.page.evaluate("document.getElementById('all').open = true")
         self.page.wait_for_timeout(300)
         both = "[document.body.dataset.time, document.getElementById('packets').textContent]"
@@ -65,13 +66,13 @@ class Page:
         return float(time), values
 
     def fill(self, name: str, **values: str) -> None:
-        """Choose a command and fill its form, by the names of the inputs."""
+        """Choose a command, and fill in its form; the values are given by the names of the inputs."""
         self.page.select_option("#which", name)
         for label, value in values.items():
             self.fill_one(label, value)
 
     def fill_one(self, label: str, value: str) -> None:
-        """Fill one visible input of the chosen command."""
+        """Fill in one visible input of the chosen command's form."""
         place = self.page.locator(f"#inputs label:visible:has-text('{label}')").first
         if place.locator("select").count():
             place.locator("select").select_option(label=value)
@@ -79,7 +80,7 @@ class Page:
             place.locator("input").fill(value)
 
     def command(self, name: str, **values: str) -> str:
-        """Fill a command's form, confirm, and return the answer that the page shows."""
+        """Fill in and confirm a command's form, and return the reply that the page shows."""
         self.fill(name, **values)
         self.page.click("#send-form")
         self.page.wait_for_selector("#confirm[open]")
@@ -89,7 +90,7 @@ class Page:
 
 
 def missing() -> str:
-    """Return the missing packages of a browser, or an empty text."""
+    """Return the names of missing packages that the browser tests need, or an empty text."""
     try:
         import playwright.sync_api  # noqa: F401, PLC0415 - an extra of the tests
     except ModuleNotFoundError:
@@ -142,7 +143,7 @@ def browsing(*arguments: str) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def another_origin(text: str = "<!doctype html><title>another page</title>") -> Iterator[str]:
-    """Serve a page of another origin on loopback, and yield its address."""
+    """Serve a page with another origin (port) on loopback, and yield its address."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

@@ -1,4 +1,4 @@
-"""Centroid errors of simulated stars and their Cramer-Rao bound."""
+"""Centroid errors of simulated stars, and the Cramer-Rao bound of such errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MATCHED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of the table; errors are in px along one axis."""
+    """One row of the table of centroid errors, which are in px along one axis."""
 
     found: int
     stars: int
@@ -80,7 +80,7 @@ def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) ->
 
 
 def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: int, seed: int) -> Row:
-    """Return the errors over `frames` frames of stars of `magnitude`."""
+    """Return the centroid errors of stars of `magnitude` over a number of simulated frames."""
     settings = DetectionSettings(method=method)
     bounds: list[FloatArray] = []
     errors, nees, total = [], [], 0
@@ -107,7 +107,7 @@ def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: i
 
 
 def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the indices (k,) of the detected stars and of their detections."""
+    """Return the indices (k,) of the detected true stars, and the indices (k,) of their detections."""
     if not len(found):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     apart = np.linalg.norm(places[:, None] - found.points, axis=-1)

@@ -1,8 +1,9 @@
 """Independent optimum of a single-axis slew by direct collocation and an interior-point solver.
 
-It is independent of the planner. The states are theta and omega, not q2. The discretisation is the
-trapezoidal rule on some hundreds of intervals, not a polynomial. The solver is a primal-dual interior-point
-method on the banded optimality system, not SLSQP. The error is of second order in the step.
+It is independent of the planner. Its states are theta and omega, whereas the planner uses q2. It discretises
+by the trapezoidal rule on some hundreds of intervals, the planner by a polynomial. Its solver is a
+primal-dual interior-point method on the banded optimality system, the planner's is SLSQP. The discretisation
+error is of second order in the step.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from knightcube.astro.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Slew:
-    """A slew between two moving states (rad, rad/s), with the plant in SI and its disturbance in rad/s^2."""
+    """A slew between two states (rad, rad/s), with plant parameters in SI, and a disturbance in rad/s^2."""
 
     start_angle: float
     start_rate: float
@@ -43,7 +44,7 @@ class Optimum:
 
 
 def solve(slew: Slew, intervals: int = 400, tolerance: float = 1e-9, iterations: int = 80) -> Optimum | None:
-    """Return the optimum, or None if the iteration fails, as without a trajectory within the limit."""
+    """Return the optimum; None if the iteration fails, for instance because the slew is infeasible."""
     point = _InteriorPoint(slew, intervals)
     for _ in range(iterations):
         if point.residual() < tolerance and point.barrier <= 1e-9:
@@ -55,10 +56,10 @@ def solve(slew: Slew, intervals: int = 400, tolerance: float = 1e-9, iterations:
 
 
 class _InteriorPoint:
-    """Minimisation of sum w u^2 with |u| <= 1 and trapezoidal defects; u is the current over its limit.
+    """Minimisation of sum w u^2 for |u| <= 1 and zero trapezoidal defects, where u is current / limit.
 
-    The unknowns are ordered along the grid: theta, omega, u, then the two multipliers of the next interval.
-    This makes the Newton matrix banded with four diagonals on either side.
+    The unknowns are ordered by grid point: theta, omega, u, and the two multipliers of the following
+    interval. This makes the Newton matrix banded with four diagonals on either side.
     """
 
     def __init__(self, slew: Slew, intervals: int) -> None:
@@ -71,7 +72,7 @@ class _InteriorPoint:
         self.weights = np.full(self.n, self.h)
         self.weights[[0, -1]] *= 0.5
         time = np.linspace(0.0, slew.horizon, self.n)
-        # The first guess is a cubic in theta that has the boundary states; no step changes them.
+        # The first guess of theta is a cubic that satisfies the boundary states, which no step changes.
         change = np.array(
             [
                 slew.end_angle - slew.start_angle - slew.start_rate * slew.horizon,
@@ -104,9 +105,9 @@ class _InteriorPoint:
         return np.stack([first, second], axis=1)
 
     def _gradient(self) -> FloatArray:
-        """Return the Lagrangian's gradient (n, 3) by theta, omega and u, without the bounds' multipliers."""
+        """Return the Lagrangian's gradient (n, 3) in theta, omega and u, without the terms of the bounds."""
         cos, sin = np.cos(self.theta), np.sin(self.theta)
-        difference = np.zeros((self.n, 2))  # difference of the multipliers, from d(x_(k+1) - x_k)
+        difference = np.zeros((self.n, 2))  # derivative of the terms x_(k+1) - x_k times their multipliers
         difference[1:] += self.multipliers
         difference[:-1] -= self.multipliers
         mean = self._neighbour_sum() * (0.5 * self.h)
@@ -160,7 +161,7 @@ class _InteriorPoint:
         band = np.zeros((9, self.n, 5))
 
         def put(row: int, column: int, values: FloatArray | float, ahead: int = 0) -> None:
-            """Set entry (row of point k, column of point k + ahead) for all k that have one."""
+            """Set the entry (row of point k, column of point k + ahead) for every k for which it exists."""
             stop = self.n - ahead
             band[4 + row - column - 5 * ahead, ahead : ahead + stop, column] = np.broadcast_to(
                 values, self.n
@@ -181,7 +182,7 @@ class _InteriorPoint:
         last = np.ones(self.n)
         # the last point has no interval after it, so its multiplier rows are those of the unit matrix
         last[-1] = 0.0
-        # Derivatives of the defects of interval k by the states of point k, and by those of point k + 1.
+        # Derivatives of the defects of interval k with respect to the states of points k and k + 1.
         put(3, 0, -last)
         put(3, 1, -half * last)
         put(4, 0, -by_theta * last)
@@ -194,7 +195,8 @@ class _InteriorPoint:
         put(4, 0, -by_theta[np.r_[1 : self.n, 0]], 1)
         put(4, 1, 1.0 + drag, 1)
         put(4, 2, -by_u[np.r_[1 : self.n, 0]], 1)
-        # Transposes: derivatives of the state rows by the multipliers of the interval after and before.
+        # Transposes: derivatives of the state rows with respect to the multipliers of the next and the
+        # previous interval.
         first = inner * last
         put(0, 3, -first)
         put(0, 4, -by_theta * first)
@@ -209,12 +211,12 @@ class _InteriorPoint:
         return band.reshape(9, 5 * self.n)
 
     def _put_before(self, band: FloatArray, row: int, column: int, values: FloatArray) -> None:
-        """Set entry (row of point k, column of point k - 1) for k >= 1."""
+        """Set the entry (row of point k, column of point k - 1) for each k >= 1."""
         band[4 + row - column + 5, :-1, column] = values[1:]
 
 
 def _reach(distance: FloatArray, change: FloatArray) -> float:
-    """Return the largest step <= 1 that keeps distance + step * change above half a percent of distance."""
+    """Return the largest step <= 1 for which distance + step * change is at least 0.5 % of distance."""
     shrinking = change < 0
     if not shrinking.any():
         return 1.0

@@ -1,4 +1,4 @@
-"""Arguments of a command as text, for the comparison with the published ones."""
+"""Command-line arguments of a program as text, for the comparison with their published list."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def arguments_of(target: str) -> list[str]:
-    """Return one line for each argument of the command that MODULE:FUNCTION configures."""
+    """Return one line for each argument of the program whose parser `target` (MODULE:FUNCTION) configures."""
     module, _, function = target.partition(":")
     parser = argparse.ArgumentParser()
     getattr(importlib.import_module(module), function)(parser)

@@ -1,4 +1,4 @@
-"""Comparison of the forms of a function that numba compiles."""
+"""Comparison of the numpy, loop and compiled forms of a function."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def assert_forms_agree(
 ) -> None:
     """Call all forms of a function with copies of the arguments; compare results and changed arguments.
 
-    Arrays must agree to the `relative` tolerance of each value and of the largest one. With `interpreted` the
-    loop form is also called without compilation, because Python checks every index and machine code does not.
+    Array values must agree within `relative` times the value or the array's largest value. With `interpreted`
+    the loop form is also called without compilation, because Python checks every index and the compiled form
+    does not.
     """
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     forms = [hot.numpy_form, hot.compiled_form(), *([hot.loop_form] if interpreted else [])]

@@ -25,7 +25,7 @@ DIPOLE = 80 * 0.0081
 TESTBED_FIELD: FloatArray = np.array([0.0, 0.0, -4.5e-4])
 ORBIT_FIELD = 4.5e-5
 FIELD_TURN = 2.2e-3
-"""Rate (rad/s) of the field's direction in a low polar orbit: two rotations per orbit."""
+"""Rotation rate (rad/s) of the field's direction in a low polar orbit: two rotations per orbit."""
 CURRENT_BOUND = 3.5e-3
 GAIN_SIGMA = 0.1
 """Standard deviation of the coils' torque relative to its nominal value."""
@@ -35,7 +35,7 @@ MOST_STIFFNESS, MOST_DAMPING = 2e-5, 4e-6
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """Random walk of torque over inertia: initial value (rad/s^2), and growth (rad/s^2 per sqrt(s))."""
+    """Random walk of torque / inertia: initial sigma (rad/s^2) and growth (rad/s^2 per sqrt(s))."""
 
     start: float
     walk: float
@@ -63,7 +63,7 @@ DRAG = Push(1e-4, 1e-5)
 
 
 class World(Protocol):
-    """Interface of a true world."""
+    """Interface of a simulated true world."""
 
     suspended: bool
     attitude: FloatArray
@@ -164,7 +164,7 @@ class FreeWorld:
         self._currents = _actual(currents, self._rng)
 
     def advance(self, span_ns: int) -> None:
-        """Integrate by one Runge-Kutta step, and then update the random walk of the torque."""
+        """Integrate the motion by one Runge-Kutta step, and then update the random walk of the torque."""
         dt = span_ns * 1e-9
         field = self.field()
         x = np.concatenate([self.attitude, self.rate])
@@ -178,7 +178,10 @@ class FreeWorld:
         self._time += dt
 
     def _flow(self, x: FloatArray, field: FloatArray) -> FloatArray:
-        """Return d(q, w)/dt by q' = Omega(w) q / 2 and Euler's equation; Rodrigues' formula rotates B."""
+        """Return d(q, w)/dt by q' = Omega(w) q / 2 and Euler's equation.
+
+        The field is rotated by Rodrigues' formula.
+        """
         vector, scalar, rate = x[:3], x[3], x[4:]
         q_dot = 0.5 * np.append(scalar * rate - cross_product(rate, vector), -rate @ vector)
         field_body = (
@@ -199,6 +202,6 @@ def _actual(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def band(degrees: int, share: float = 0.95) -> tuple[float, float]:
-    """Return the limits of the central `share` of a chi-square, divided by its degrees of freedom."""
+    """Return the limits that contain the central fraction `share` of chi-square / degrees of freedom."""
     tail = 0.5 * (1.0 - share)
     return float(chi2.ppf(tail, degrees)) / degrees, float(chi2.isf(tail, degrees)) / degrees

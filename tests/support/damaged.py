@@ -1,6 +1,6 @@
-"""Damage to bytes, drawn by hypothesis, for tests of readers of files and of lines.
+"""Random damage to bytes, drawn by hypothesis, for tests of the readers of files and of serial lines.
 
-A test gets `chances` from `given` and passes it on: `@given(chances()) def test(chance): offer(chance, ...)`.
+A test draws a random generator and passes it on: `@given(chances()) def test(chance): offer(chance, ...)`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def chances() -> st.SearchStrategy[Random]:
 
 
 def damage(chance: Random, data: bytes) -> bytes:
-    """Return bytes with one damage: flipped, overwritten, lost, doubled, inserted, zeroed or cut bytes."""
+    """Return a copy with some bytes flipped, overwritten, lost, doubled, inserted, zeroed or cut off."""
     if not data:
         return chance.randbytes(chance.randint(1, 8))
     start = chance.randrange(len(data))
@@ -63,7 +63,7 @@ def offer(
     refusals: tuple[type[Exception], ...] = (),
     reseal: Callable[[bytes], bytes] | None = None,
 ) -> None:
-    """Call a reader with an example, damaged or undamaged.
+    """Call a reader with a damaged or undamaged example, and check the result or the refusal.
 
     Args:
         chance: random generator from `chances`.
@@ -95,7 +95,7 @@ def assert_one_line(error: Exception) -> None:
 
 
 def fill(folder: Path, files: Files) -> Path:
-    """Write files over earlier ones of the same names, and return the folder."""
+    """Write files into a folder, replacing earlier files of the same names, and return the folder."""
     for name, data in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
@@ -103,6 +103,6 @@ def fill(folder: Path, files: Files) -> Path:
 
 
 def line_and_crc(data: bytes) -> bytes:
-    """Return the first line of a copy with a correct checksum."""
+    """Return the first line of the data with a correct checksum."""
     line = data.rpartition(b"\n")[0].partition(b"\n")[0] + b"\n"
     return line + b"%08x\n" % zlib.crc32(line)

@@ -1,4 +1,4 @@
-"""True nadir, Sun direction and limb of a scene, and ideal counts."""
+"""True nadir, Sun direction and limb of a simulated scene, and its noise-free pixel counts."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def limb_directions(
 ) -> tuple[FloatArray, FloatArray]:
     """Return unit vectors (count, 3), camera axes, around the limb, and the solar cosines (count,) there.
 
-    The lines of sight touch the ellipsoid that is `height` m above that of WGS 84. In axes in which this
-    ellipsoid is the unit sphere, the tangent points are a circle in the plane q p = 1, where p is the
-    camera's position. Raises ValueError if the camera is inside the ellipsoid.
+    The lines of sight touch the ellipsoid that is `height` m above that of WGS 84. If the axes are scaled so
+    that this ellipsoid is the unit sphere, the tangent points q form a circle in the plane q p = 1, where p
+    is the camera's position. Raises ValueError if the camera is inside the ellipsoid.
     """
     axes = semi_axes(height)
     origin = scene.in_earth(scene.position) / axes
@@ -69,7 +69,7 @@ def limb_directions(
 def limb_truth(
     scene: EarthScene, model: EarthCameraModel, count: int = 3600, height: float | None = None
 ) -> LimbTruth:
-    """Return those of `count` points around the limb that are on the detector.
+    """Return the limb points that are on the detector, out of `count` points around the whole limb.
 
     `height` (m) above the ellipsoid is by default the atmosphere's apparent limb height.
     """
@@ -82,7 +82,7 @@ def limb_truth(
 
 
 def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
-    """Return the unrounded counts (...) of `radiance` (...) of a pixel without noise and defect."""
+    """Return the unrounded counts (...) that `radiance` (...) causes in a pixel without noise or defect."""
     light = np.asarray(radiance, dtype=float)
     if model.response == "logarithmic":
         counts = model.pedestal + model.counts_per_decade * np.log10(1.0 + light / model.darkest)
@@ -92,7 +92,7 @@ def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
 
 
 def radiance_of(model: EarthCameraModel, counts: FloatArray) -> FloatArray:
-    """Return the radiance (...) that causes `counts` (...) in a pixel without noise and defect."""
+    """Return the radiance (...) that causes `counts` (...) in a pixel without noise or defect."""
     above = np.asarray(counts, dtype=float) - model.pedestal
     if model.response == "logarithmic":
         return np.asarray(model.darkest * (10.0 ** (above / model.counts_per_decade) - 1.0))

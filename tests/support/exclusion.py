@@ -2,7 +2,7 @@
 
 The boresight is the camera's +z axis, and the field is a cone around it. With half the field of view as half
 angle (the thesis's choice), a corner of the frame may still contain the Sun or the limb. With half the
-diagonal it may not. Vectors are in ICRS, geocentric positions in m.
+diagonal as half angle, no corner may contain them. Vectors are in ICRS, geocentric positions in m.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def sun_in_field(
 ) -> BoolArray:
     """Return whether the Sun is within `half_angle` + `buffer` (rad) of each `boresight` (m, 3) (2.16, 2.17).
 
-    `position` (m, 3) is the camera's and `sun` (m, 3) the Sun's. `buffer` accounts for stray light past the
-    baffle.
+    `position` (m, 3) is the camera's position, and `sun` (m, 3) the Sun's. `buffer` accounts for stray light
+    past the baffle.
     """
     to_sun = np.asarray(sun) - position
     return _within(boresight, to_sun, SUN_RADIUS, half_angle + buffer)
@@ -43,7 +43,7 @@ def earth_in_field(
 def in_field(
     camera: Pinhole, attitudes: FloatArray, directions: FloatArray, margin: float = 0.0
 ) -> BoolArray:
-    """Return which `directions` (m, 3), ICRS, are within `margin` px of the detector."""
+    """Return which `directions` (m, 3), ICRS, are imaged on the detector or up to `margin` px outside it."""
     seen = (quaternion.attitude_matrix(attitudes) @ directions[..., None])[..., 0]
     return camera.contains(camera.project(seen), margin)
 

@@ -1,4 +1,4 @@
-"""Figures of the benchmark `executive` from the logs of a flight and samples of its processes."""
+"""Results of the benchmark `executive`, computed from the logs of a flight and samples of its processes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ PERIOD_NS = 25_000_000
 """Period (ns) of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.flight`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
-"""Start (s of flight) and shortest duration (s) of the fit of the memory slope.
+"""Time of flight (s) at which the fit of the memory slope starts, and shortest duration (s) of the fit.
 
-Before, windows of minutes fill, and pages of libraries and of the sky index are touched for the first time.
+Before that time, buffers of some minutes fill up, and pages of libraries and of the sky index are touched for
+the first time.
 """
 
 Figures = dict[str, Any]
@@ -39,7 +40,7 @@ ASKED: dict[str, float] = {
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """Times (monotonic ns) of the start of the flight and of READY, and processor time (s) until READY.
+    """Times (monotonic ns) of a flight's start and of its READY message, and processor time (s) until READY.
 
     `utc_offset_ns` is UTC minus monotonic time.
     """
@@ -60,7 +61,7 @@ class Watched:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Figures of one flight, and the lateness of its cycles and of the bare loop beside it."""
+    """Results of one flight, and the lateness of its cycles and of the bare loop that ran beside it."""
 
     figures: Figures
     flight: Grid
@@ -70,7 +71,7 @@ class Flown:
 def evaluate(
     folder: Path, devices: Path, wakes: Path, began: Began, watched: Watched, warm_up: float
 ) -> Flown:
-    """Return the figures of the flight in `folder` with the devices' truth in `devices`."""
+    """Return the results of the flight in `folder`; `devices` has the true states of its emulated devices."""
     truth = CoilTruth(folder, devices)
     run = truth.run
     start = run["run"][0]
@@ -126,7 +127,7 @@ def _scheduling(run: Run) -> str:
 
 
 def _jobs(run: Run, seconds: float) -> dict[str, Any]:
-    """Return for each worker the numbers of completed and failed jobs, and its share of time at work."""
+    """Return for each worker the numbers of completed and failed jobs, and its fraction of busy time."""
     timing = run["job_timing"]
     found = {}
     for name in sorted(set(timing["name"])):
@@ -138,7 +139,7 @@ def _jobs(run: Run, seconds: float) -> dict[str, Any]:
 
 
 def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
-    """Return processor and memory from the monotonic time `warm_s`, and slopes from `settled_s`."""
+    """Return processor and memory use after the monotonic time `warm_s`, and slopes after `settled_s`."""
     looks = [look for look in watched.looks if look.time >= warm_s]
     if len(looks) < 2:
         raise RuntimeError(f"only {len(looks)} looks at the processes after the warm-up: fly for longer")
@@ -171,9 +172,9 @@ def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
 
 
 def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
-    """Return the slope per hour and its interval; NaN if the time is too short.
+    """Return the slope per hour and its 95 % interval; NaN if the samples span too short a time.
 
-    The memory fluctuates by tenths of a MiB. Over a minute, this alone is a slope of tens of MiB/h.
+    The memory fluctuates by tenths of a MiB, which over one minute alone causes a slope of tens of MiB/h.
     """
     if not seconds or seconds[-1] - seconds[0] < SLOPE_SPAN:
         return np.nan, np.nan, np.nan
@@ -181,11 +182,11 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
 
 
 def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[Any]) -> Figures:
-    """Return the shares of time for which the control thread waited, from the first sample to the last.
+    """Return the fractions of time in which the control thread waited, from the first sample to the last.
 
     `queued` is the time in which the thread was ready, but had no processor. `blocked` is the time within a
     cycle in which the thread was neither running nor ready, for instance because it waited for a worker or a
-    disk. It is a lower limit, and does not depend on the load.
+    disk. `blocked` is a lower limit that does not depend on the load.
     """
     first, last = looks[0], looks[-1]
     on, queued = np.subtract(last.turns["control"], first.turns["control"])
@@ -196,7 +197,7 @@ def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[An
 
 
 def _share(looks: list[Look], name: str) -> float:
-    """Return the share of a core that a process used, together with the processes that replaced it."""
+    """Return the fraction of a core that a process and its replacements used."""
     spent = np.diff([look.processor[name] for look in looks])
     if len(looks) < 2:  # the process was sampled once and then ended
         return 0.0
@@ -204,9 +205,9 @@ def _share(looks: list[Look], name: str) -> float:
 
 
 def misses(figures: Figures) -> list[str]:
-    """Return the names of the figures that exceed their limits.
+    """Return the names of the results that exceed their limits.
 
-    The slope exceeds its limit if its whole interval does. The unknown slope of a short flight is not judged.
+    The slope exceeds its limit if its whole interval does. A flight too short for a slope passes this check.
     """
     found = [name for name, limit in ASKED.items() if not _slope(name) and not figures[name] <= limit]
     steep = figures["memory_slope_interval"][0] > ASKED["memory_slope_mib_per_hour"]
@@ -218,7 +219,7 @@ def _slope(name: str) -> bool:
 
 
 def table(figures: Figures, name: str) -> str:
-    """Return the table of required and measured figures."""
+    """Return the table of required and measured values."""
     late, bare, spent = figures["lateness_s"], figures["lateness_of_bare_loop_s"], figures["execution_s"]
     wrong = misses(figures)
     rows = [

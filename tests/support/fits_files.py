@@ -10,7 +10,7 @@ def _card(keyword: str, value: object) -> bytes:
 
 
 def fits_file(stored: Image, bits: int, **cards: object) -> bytes:
-    """Return a FITS file of `stored` (rows, columns); `cards` add to the mandatory ones or replace them."""
+    """Return a FITS file of `stored` (rows, columns); `cards` extend or replace the mandatory header."""
     header: dict[str, object] = {"SIMPLE": "T", "BITPIX": bits, "NAXIS": 2}
     header |= {"NAXIS1": stored.shape[1], "NAXIS2": stored.shape[0]} | cards
     text = b"".join(_card(keyword, value) for keyword, value in header.items() if value is not None)

@@ -1,4 +1,4 @@
-"""Short flights on simulated hardware, with faults at the wire, for the scenario tests."""
+"""Short flights on simulated hardware, with faults on the device lines, for the scenario tests."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TEXT = CONFIG.read_text(encoding="utf-8")
 DURATION = 26.0
 """Duration (s) of a flight with one fault."""
 FRAME_PERIOD, FRAME_EXPOSURE, FRAME_LATE = 2.0, 0.2, 1.0
-"""Period, exposure and timeout (s) of the camera in flights with a fault; later results count as late."""
+"""Frame period, exposure and result timeout (s) of the camera in flights with a fault."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def demo_config(duration: float, camera: bool = True) -> TestbedConfig:
 
 @cache
 def _demo() -> TestbedConfig:
-    """Return the whole demonstration, which is read once for all flights."""
+    """Return the configuration of the whole demonstration, which is read once for all flights."""
     return as_testbed(configuration.parse(TEXT))
 
 
@@ -71,7 +71,7 @@ def demo_world() -> Simulation:
 
 
 def thesis_config(duration: float) -> TestbedConfig:
-    """Return the demonstration with the receding horizon and the tracker of the thesis, without camera."""
+    """Return the demonstration without camera, with the thesis's receding-horizon planner and tracker."""
     config = demo_config(duration, camera=False)
     guidance = configuration.replace(config.guidance, strategy="receding", current_share=1.0)
     control = configuration.replace(config.control, tracker="thesis", state_weight=20.0)
@@ -90,15 +90,15 @@ def fly(
 ) -> Run:
     """Run a configuration in lock-step, and return its logs; `prepare` may schedule faults.
 
-    `section` describes the world and its seed; the default is that of the demonstration. `absent` removes
-    devices before they are opened, and the run waits for devices. The coils must be at zero current after the
-    devices are closed, however the flight ended.
+    `section` describes the simulated world and its seed; the default is the demonstration's world. Devices in
+    `absent` are removed before they are opened, and the run then waits for them. The coils must be at zero
+    current after the devices are closed, however the flight ended.
     """
     folder.mkdir(parents=True, exist_ok=True)
     section = section or configuration.replace(demo_world(), seed=seed)
     with ExitStack() as stack:
         lock = stack.enter_context(opened_lockstep(config, section, folder))
-        # no command switches off a leg that is stuck high
+        # No command can switch off a bridge leg that is stuck high.
         if not any("-high" in entry.fault for entry in section.faults):
             stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency
@@ -127,12 +127,12 @@ def event_names(run: Run) -> list[str]:
 
 
 def event_time(run: Run, name: str) -> float:
-    """Return the mission time (s) of the first event of a name."""
+    """Return the mission time (s) of the first event named `name`."""
     return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
 
 def config_for(mode: str, camera: bool, duration: float = DURATION) -> Config:
-    """Return half a minute of the demonstration in a mode, optionally with a small and fast camera."""
+    """Return the demonstration, half a minute long in one mode, optionally with a small and fast camera."""
     config = demo_config(duration)
     eye = None
     if camera and config.camera is not None:

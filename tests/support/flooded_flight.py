@@ -70,7 +70,7 @@ def flood(
 
 
 def lateness(run: Path) -> dict[str, Any]:
-    """Return the number of cycles after the first seconds of a run, and quantiles (ms) of their lateness."""
+    """Return the number of cycles after a run's first seconds, and quantiles (ms) of the cycles' lateness."""
     cycles = read_run(run)["cycle_timing"]
     late = cycles["lateness"][cycles["time_ns"] > _WARM_UP_S * 1e9]
     figures = {name: round(1e3 * float(np.quantile(late, part)), 3) for name, part in QUANTILES.items()}

@@ -1,4 +1,4 @@
-"""Power that an ideal controller needs."""
+"""Mean power that an ideal controller needs, which knows the true plant and the disturbances in advance."""
 
 from __future__ import annotations
 

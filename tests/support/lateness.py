@@ -1,4 +1,4 @@
-"""Lateness and lost slots of a periodic loop, and the slots that were lost because of the machine."""
+"""Lateness and lost slots of a periodic loop, and which slots were lost because the machine was busy."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Grid:
         return np.asarray(2.0 * self.lateness >= self.period_ns * 1e-9)
 
     def figures(self) -> dict[str, float]:
-        """Return quantiles (s) of the lateness; a lost slot counts until the loop was back."""
+        """Return quantiles (s) of the lateness; the lateness of a lost slot lasts until the loop resumes."""
         return {name: float(np.quantile(self.lateness, part)) for name, part in QUANTILES.items()}
 
 
 def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
-    """Return the lateness of `count` slots from `first`, by the first start after each due time.
+    """Return the lateness of `count` slots from `first`: the delay from each due time to the next start.
 
     `starts_ns` are in monotonic time and sorted. Slots after the last start are infinitely late.
     """
@@ -46,17 +46,18 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
     """Return the slots that the bare loop lost, including their neighbours.
 
-    A stall may begin and end in different slots of the two loops, because one may be at work while the other
-    sleeps.
+    A stall of the machine may begin and end in different slots of the two loops, because one loop may be
+    working while the other sleeps.
     """
     return np.asarray(np.convolve(machine.lost, np.ones(3), mode="same") > 0.5)
 
 
 def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
-    """Return the slots in which stolen time reached the time of a lost slot and half of the lateness.
+    """Return the slots that are late because the host took the processor (stolen time).
 
-    A slot lasts from the start of its predecessor to the first sample after it was served. `stolen_ns` is the
-    stolen time of all cores since boot, sampled at `noted_ns`.
+    In these slots twice the stolen time is at least the period and at least the lateness. A slot lasts from
+    the due time of its predecessor to the first sample after the slot was served. `stolen_ns` is the stolen
+    time of all cores since boot, sampled at `noted_ns`.
     """
     due_ns = (loop.first + np.arange(len(loop.lateness))) * loop.period_ns
     late_ns = 1e9 * np.minimum(loop.lateness, 60.0)
@@ -72,9 +73,9 @@ def slope_per_hour(
 ) -> tuple[float, float, float]:
     """Return the slope per hour of a noisy level with its 95 % interval (low, high); NaN if too short.
 
-    A working process allocates and frees memory, so the level of each block of time is its 10 % quantile,
-    which a leak also raises. The slope is the median of all pairwise slopes of the blocks, and its interval
-    that of Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
+    A process allocates and frees memory as it works. The level of each block of time is therefore its 10 %
+    quantile, which a leak raises as well. The slope is the median of all pairwise slopes of the blocks, and
+    its interval follows from Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
     """
     from scipy import stats  # noqa: PLC0415 - the bench is not to share the flight's libraries while it flies
 

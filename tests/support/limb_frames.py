@@ -24,7 +24,8 @@ KNOWN_LIMB = 1000.0
 
 
 SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
-"""Ranges of scale height (m) and of the optical depth relative to the standard, for unknown atmospheres."""
+"""Ranges, for unknown atmospheres, of the scale height (m) and of the optical depth relative to the standard.
+"""
 
 
 SUN_SIGMA, FIELD_SIGMA = np.radians(5.0), np.radians(2.0)
@@ -39,7 +40,7 @@ def camera_model() -> EarthCameraModel:
 
 
 def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSettings:
-    """Return the default settings with the camera's response, for a kind of atmosphere of `AIRS`."""
+    """Return the default limb settings with the camera's response, for an atmosphere kind of `AIRS`."""
     response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
     settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
     return replace(settings, limb_height_sigma=KNOWN_LIMB) if air == "known" else settings

@@ -1,4 +1,4 @@
-"""An attacker between ground and satellite who has every frame and all information except the keys."""
+"""An attacker between ground and satellite who knows every frame and everything else except the keys."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LinkAttacker:
         self.gate = self.restarted()
 
     def restarted(self) -> Gate:
-        """Return a new gate on the satellite's stored keys and counters."""
+        """Return a new frame gate that reads the satellite's stored keys and counters."""
         return Gate(self._vault, COMMAND_SPIS, parser_of(_SPACECRAFT), TELECOMMAND_MASK)
 
     def attack(self, chance: Random) -> None:
@@ -57,7 +57,7 @@ class LinkAttacker:
     def frame(self, chance: Random) -> tuple[str, bytes]:
         """Return the kind and the bytes of the next frame."""
         if not self._seen or chance.random() < 0.1:
-            self._held.clear()  # the delayed frames are old now
+            self._held.clear()  # the delayed frames have become too old to be admitted
             return "fresh", self._new(chance)
         if chance.random() < 0.05:
             self._held.append(self._new(chance))

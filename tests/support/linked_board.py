@@ -1,4 +1,4 @@
-"""A board with a link: keys, and a configuration whose `link` section names its lines."""
+"""A board with a radio link: its keys, and a configuration whose `link` section has its addresses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
 
 
 def write_linked_config(place: Path, **lines: Any) -> Path:
-    """Make keys under `place`; return the configuration of a board with these lines, beside the keys."""
+    """Create keys in `place`, and write beside them a board's configuration with a link; return its path."""
     make_keys(place / "keys")
     section = {"keys": str(place / "keys" / "satellite"), **lines}
     commands = json.dumps({"socket": str(place / "commands")})

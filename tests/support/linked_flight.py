@@ -16,12 +16,12 @@ from ground.link.terminal import make_keys
 
 _START_S, _END_S = 120.0, 30.0
 _RATE = 1_000_000
-"""Data rate (bytes/s) of the link: no packet is thinned, so the archive must hold every packet of the log."""
+"""Data rate (bytes/s) of the link, high enough that no packet is dropped and the archive equals the log."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkedFlight:
-    """Folder of a flight, address and keys of the gateway, and the processes by name, `flight` last."""
+    """Folder of a flight, address and keys of its gateway, and its processes by name, with `flight` last."""
 
     run: Path
     gateway: str
@@ -36,7 +36,7 @@ class LinkedFlight:
         _wait((self.run / "flight-0001.ccsds").exists, "the flight", self._log)
 
     def end(self) -> None:
-        """End the flight; link and gateway transmit the rest of its log."""
+        """End the flight, while link and gateway transmit the rest of its log."""
         end(self.processes["flight"])
 
     def stop(self) -> None:
@@ -80,7 +80,7 @@ def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]
 
 @contextmanager
 def service(log: Path, ready: str, *words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `python -m flight WORDS` during the block, which begins when the output contains `ready`."""
+    """Run `python -m flight WORDS` during a `with` block, which begins when the output contains `ready`."""
     process = _started([sys.executable, "-m", "flight", *map(str, words)], log)
     try:
         _wait(lambda: ready in log.read_text(), str(words[0]), log)

@@ -15,7 +15,7 @@ PIXEL = np.radians(20.0) / 1024
 
 @dataclass(frozen=True)
 class Pass:
-    """Positions (n, 3), m, of observer and object at times (n,), s, and the object's relative velocities."""
+    """Positions (n, 3), m, of observer and object at times (n,), s, and their relative velocities."""
 
     times: FloatArray
     observer: FloatArray
@@ -37,7 +37,7 @@ class Pass:
 
 
 def a_pass(rng: np.random.Generator, rate: float, times: FloatArray, before: float) -> Pass:
-    """Return a pass with closest approach, at `rate` (rad/s), `before` s after the start."""
+    """Return a pass whose closest approach, at `rate` (rad/s), is `before` s after its start."""
     radius = 6.878e6
     place = np.array([radius, 0.0, 0.0])
     velocity = np.array([0.0, np.sqrt(EARTH / radius), 0.0])

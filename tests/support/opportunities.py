@@ -1,4 +1,4 @@
-"""Times at which a camera in orbit can observe a resident space object (Sease ch. 4, Table 4.3).
+"""Times at which a camera in orbit can observe a space object (Sease ch. 4, Table 4.3).
 
     scenario = table_4_3(epoch=2_461_041.5)
     for opportunity in opportunities(scenario, cadence=60.0, exposure=0.5):
@@ -70,7 +70,7 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Opportunity:
-    """Frame that shows object number `index`.
+    """A frame that shows object number `index` during the whole exposure.
 
     Attributes:
         index: number of the object in the scenario.
@@ -108,7 +108,7 @@ def table_4_3(
     The initial attitude is the identity. The thesis states neither a date nor the period of the frames:
     `epoch` (Julian date TT) determines the position of the Sun. `pinhole` is by default that of 1024 x 1024
     pixels over 20 degrees, and `half_angle` its half diagonal; the thesis uses half the field of view (2.17,
-    2.19). The ten orbits are those of the camera, 15.3 h; the text states "approximately 14".
+    2.19). The scenario lasts ten orbits of the camera, 15.3 h; the thesis's text states "approximately 14".
     """
     pinhole = pinhole or Pinhole.from_field_of_view(1024, 1024, math.radians(20.0))
     camera = KeplerianElements(semi_major_axis=6748e3, inclination=math.radians(28.5))
@@ -144,7 +144,7 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
     position = scenario.objects[index].orbit.positions_at(times)
     attitudes = scenario.attitude(times)
     good = in_field(scenario.pinhole, attitudes, directions(camera, position))
-    # Only the few remaining times are tested further.
+    # The slower tests run only at the few times that passed the others.
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
     sun_at = sun_position(scenario.epoch + np.asarray(times)[left] / DAY)
@@ -178,8 +178,8 @@ def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> 
 def opportunities(scenario: Scenario, cadence: float, exposure: float) -> list[Opportunity]:
     """Return the frames, one every `cadence` s from time 0, that show an object in their whole exposure.
 
-    Nine instants of each exposure of `exposure` s are tested. Raises OutOfRange if the cadence or the
-    exposure is not positive.
+    Observability is tested at nine instants of each exposure of `exposure` s. Raises OutOfRange if the
+    cadence or the exposure is not positive.
     """
     _check("cadence", cadence)
     _check("exposure", exposure)
@@ -207,7 +207,7 @@ def _opportunity(scenario: Scenario, index: int, start: float, exposure: float) 
 def _bisect(
     scenario: Scenario, index: int, low: FloatArray, high: FloatArray, before: BoolArray, precision: float
 ) -> FloatArray:
-    """Return the times between `low` and `high` (j,), s, at which observability changes from `before`."""
+    """Return the times (j,), s, between `low` and `high` (j,) at which the object's observability changes."""
     while low.size and np.max(high - low) > precision:
         middle = 0.5 * (low + high)
         same = observable(scenario, index, middle) == before

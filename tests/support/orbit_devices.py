@@ -27,7 +27,7 @@ DOWN = float(np.sqrt(0.5))
 
 
 def orbit_config(camera: bool = False) -> TestbedConfig:
-    """Return the demonstration with receiver, six solar cell strings and two horizon cameras."""
+    """Return the demonstration with a GPS receiver, six solar cell strings and two horizon cameras."""
     strings = tuple(
         SolarString(normal=face, address=0x48 + index // 4, channel=index % 4)
         for index, face in enumerate(FACES)

@@ -1,4 +1,4 @@
-"""Attitudes about the local vertical, and limb and Sun in the fields of cameras in orbit.
+"""Attitudes relative to the local vertical, and visibility of limb and Sun to cameras in orbit.
 
 The Earth is a sphere with its equatorial radius. The paper's orbit is that of a Shuttle deployment at 380 km
 (Meller et al., sections 1 and 4.1), with an inclination of 51.6 deg [assumed: the Shuttle's to the Station].
@@ -43,7 +43,10 @@ class Pass:
 def revolution(
     julian_date: float, node: float, step: float, begin: float = 0.0, latitude: float = 0.0
 ) -> Pass:
-    """Return one revolution from `begin` (s), every `step` s; `latitude` (rad) is its argument at time 0."""
+    """Return one revolution from `begin` (s) in steps of `step` s.
+
+    `latitude` (rad) is the argument of latitude at time 0.
+    """
     elements = KeplerianElements(
         semi_major_axis=EARTH_RADIUS + ALTITUDE,
         inclination=float(INCLINATION),
@@ -56,7 +59,7 @@ def revolution(
 
 
 def local_frame(positions: FloatArray, velocities: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) from ICRS to forward, right and down."""
+    """Return the matrices (n, 3, 3) from ICRS to forward, right and down axes."""
     down = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
     right = np.cross(velocities, positions)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
@@ -64,7 +67,7 @@ def local_frame(positions: FloatArray, velocities: FloatArray) -> FloatArray:
 
 
 def limb(positions: FloatArray) -> FloatArray:
-    """Return LIMB_POINTS directions (n, points, 3) of the Earth's limb in forward, right and down."""
+    """Return directions (n, LIMB_POINTS, 3) of the Earth's limb in forward, right and down axes."""
     edge = np.arcsin(EARTH_RADIUS / np.linalg.norm(positions, axis=-1))[:, None]
     around = np.linspace(0.0, 2.0 * np.pi, LIMB_POINTS, endpoint=False)
     across = np.sin(edge)
@@ -79,7 +82,7 @@ def limb(positions: FloatArray) -> FloatArray:
 
 
 def limb_in_daylight(positions: FloatArray, directions: FloatArray, sun: FloatArray) -> BoolArray:
-    """Return which limb points (n, points) are sunlit; all axes are forward, right and down."""
+    """Return which limb points (n, points) are sunlit; all vectors are in forward, right and down axes."""
     radius = np.linalg.norm(positions, axis=-1)
     reach = np.sqrt(radius**2 - EARTH_RADIUS**2)
     ground = reach[:, None, None] * directions

@@ -43,30 +43,32 @@ FIRST_DATE = 2_461_041.5
 AGILITY = 0.005
 """Bandwidth (rad/s) of the control law."""
 SWAY = np.radians(3.0)
-"""Motion (rad rms per axis) about the local vertical."""
+"""Deviation (rad rms per axis) from the local vertical."""
 PUSH_WALK = SWAY * np.sqrt(16.0 * AGILITY**5 / 3.0)
-"""Random walk of the angular acceleration (rad/s^2 per sqrt(s)) that causes this motion with three equal
-poles.
+"""Random walk of the angular acceleration (rad/s^2 per sqrt(s)).
+
+It causes a deviation of SWAY in a control loop with three equal poles.
 """
 RING_CURRENT, IONOSPHERE, IONOSPHERE_TIME = 20e-9, 20e-9, 400.0
 """Standard deviations of ring current and ionosphere (T), and time constant of the ionosphere (s)."""
 OPTICAL_SIGMA = np.radians(0.02)
 """Standard deviation (rad per axis) of Sun and nadir."""
 LEAST_LIMB = 30
-"""Smallest number of limb points, of 720, that must be lit and in one camera's field: 15 deg."""
+"""Smallest number of lit limb points in one camera's field for a nadir reading: 30 of 720, or 15 deg."""
 _COARSE = 20
-"""Number of steps between checks of the fields of view: 10 s."""
+"""Number of time steps between checks of the fields of view, which are 10 s apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """True states at n instants that are STEP apart, and what the cameras have in view.
+    """True states at n instants that are STEP apart, and whether the cameras can measure Sun and nadir.
 
     Attributes:
         pass_: orbit of the satellite.
         attitudes: (n, 4); `rates` (n, 3), rad/s, is the mean over the previous step.
         sun: apparent directions (n, 3), ICRS; `field` (n, 3) is in T, ICRS.
-        sunlit: (n,); `sun_in_field` and `nadir_in_field` (n,) are whether a camera could measure them.
+        sunlit: (n,); `sun_in_field` and `nadir_in_field` (n,) state whether a camera could measure Sun and
+            nadir.
     """
 
     pass_: Pass
@@ -80,11 +82,11 @@ class World:
 
 
 def world(suite: SensorSuite, rng: np.random.Generator, seconds: float | None = None) -> World:
-    """Return a random world; with `seconds` only this time around its sunset."""
+    """Return a random world; with `seconds`, only an interval of that length around sunset."""
     pass_ = _revolution_to_eclipse(rng, seconds)
     frame = local_frame(pass_.positions, pass_.velocities)
     sun = _sun(pass_)
-    # The first camera is across the orbit, away from the Sun, so the other two look to the Sun's side.
+    # The first camera looks across the orbit away from the Sun, so that the other two look to the Sun's side.
     away = -np.sign(np.sum(frame[:, 1] * sun))
     attitudes = multiply(from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi * away])), _sway(frame, rng))
     turns = rotation_vector(multiply(attitudes[1:], conjugate(attitudes[:-1]))) / STEP
@@ -103,7 +105,7 @@ def _revolution_to_eclipse(rng: np.random.Generator, seconds: float | None) -> P
         rises = np.flatnonzero(lit & ~np.roll(lit, 1))
         if rises.size and np.count_nonzero(~lit) * 5.0 > 1500.0:
             break
-    # It lasts from one sunrise to shortly before the next.
+    # The revolution lasts from one sunrise to shortly before the next.
     found = revolution(date, node, STEP, begin=float(whole.times[rises[0]]))
     found = Pass(date, found.times - found.times[0], found.positions, found.velocities)
     dark = np.flatnonzero(~_sunlit(found, _sun(found)))
@@ -126,7 +128,7 @@ def dates(pass_: Pass) -> FloatArray:
 
 
 def _sunlit(pass_: Pass, sun: FloatArray) -> BoolArray:
-    # The directions from the satellite and from the Earth's centre differ too little to matter for the
+    # The Sun's directions from the satellite and from the Earth's centre differ too little to change the
     # shadow.
     return np.asarray(sunlit_share(pass_.positions, ASTRONOMICAL_UNIT * sun) > 0.5)
 
@@ -143,10 +145,11 @@ def _sun(pass_: Pass) -> FloatArray:
 
 
 def _sway(frame: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return random attitudes (n, 4) about the local frame (n, 3, 3): white jerk through three poles."""
+    """Return random attitudes (n, 4) near the local frame (n, 3, 3): white jerk filtered by three poles."""
     a = AGILITY
     chain = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-(a**3), -3.0 * a**2, -3.0 * a]])
-    # This is the stationary covariance of three equal poles under jerk of density q^2.
+    # The matrix is the stationary covariance of a system with three equal poles under white jerk of density
+    # q^2.
     q2 = PUSH_WALK**2
     p0, p1, p2 = 3.0 * q2 / (16.0 * a**5), q2 / (16.0 * a**3), 3.0 * q2 / (16.0 * a)
     stationary = np.array([[p0, 0.0, -p1], [0.0, p1, 0.0], [-p1, 0.0, p2]])
@@ -181,7 +184,7 @@ def _field(pass_: Pass, rng: np.random.Generator) -> FloatArray:
 def _in_fields(
     suite: SensorSuite, pass_: Pass, frame: FloatArray, attitudes: FloatArray, sun: FloatArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return whether a camera has the Sun (n,), and enough of the lit limb (n,), in its field."""
+    """Return whether any camera has the Sun (n,), and enough of the lit limb (n,), in its field of view."""
     turn = attitude_matrix(attitudes)
     sun_body = np.einsum("nij,nj->ni", turn, sun)
     sees_sun = np.zeros(len(sun), bool)
@@ -202,8 +205,8 @@ def _in_fields(
 class Readings:
     """Sensor readings at each of the n instants, and the true biases.
 
-    `gyro` (n, 3), rad/s, is that of the previous step; `magnetometer` (n, 3) is in T; `sun` and `nadir` (n,
-    3) are body directions.
+    `gyro` (n, 3), rad/s, is the mean rate over the previous step; `magnetometer` (n, 3) is in T; `sun` and
+    `nadir` (n, 3) are body directions.
     """
 
     gyro: FloatArray
@@ -215,7 +218,7 @@ class Readings:
 
 
 def readings(suite: SensorSuite, truth: World, rng: np.random.Generator) -> Readings:
-    """Return random readings at every instant; `truth` states when each is available."""
+    """Return random readings at every instant; `truth` states when Sun and nadir are available."""
     gyros, magnetometer = suite.gyros, suite.magnetometer
     if gyros is None or magnetometer is None:
         raise ValueError(f"suite {suite.name} lacks gyros or a magnetometer")

@@ -1,4 +1,4 @@
-"""A run of a few packets, which have the values of a test and zeros otherwise."""
+"""A run of a few packets, with values given by a test and zeros in all other fields."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Rows = Sequence[tuple[float, Mapping[str, Any]]]
 
 
 class WritablePackets(dict[str, Any]):
-    """Writable packets that replace those of a run."""
+    """Packets that a test can change, which replace the packets of a run."""
 
     logs: Any
 

@@ -1,4 +1,4 @@
-"""Photographs of the sky with known centres, and the star tracker's answers for them."""
+"""Photographs of the sky with known centres, and the star tracker's results for them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky
 PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "sky"
 
 
-# Standard deviation (rad) of the prior for tracking: 1.5 px.
+# Standard deviation (rad) of the prior attitude for tracking, equivalent to 1.5 px.
 _PRIOR_SIGMA = 3e-4
 
 
@@ -39,7 +39,7 @@ ARCSECONDS = math.degrees(1.0) * 3600.0
 
 @dataclass(frozen=True)
 class Photograph:
-    """Result of one photograph; arcsec and ms are NaN without a solution."""
+    """Result of one photograph; errors (arcsec) and times (ms) are NaN without a solution."""
 
     name: str
     known: bool
@@ -50,7 +50,7 @@ class Photograph:
 
 
 def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a camera with a field of `fov_deg`, and its range of scale for fields `low` to `high` (deg)."""
+    """Return a camera with a field of `fov_deg`, and its scale range for fields of `low` to `high` (deg)."""
     middle = math.tan(0.5 * math.radians(fov_deg))
     rows, columns = pixels.shape
     scale = tuple(math.tan(0.5 * math.radians(angle)) / middle for angle in (low, high))
@@ -100,7 +100,7 @@ class Solved:
 
     Attributes:
         across: error (arcsec) of the boresight; NaN for a refusal.
-        across_bound: bound (arcsec) of its rms.
+        across_bound: lower bound (arcsec) of the rms of that error.
         nees: squared error of the attitude over its covariance, per degree of freedom.
         rate, rate_bound: error and bound (%) of the rate's magnitude; NaN without a rate.
     """

@@ -1,8 +1,8 @@
-"""Samples of processes from outside through /proc: processor time, and the memory that they hold together.
+"""Samples of the processor time and memory of running processes, read from /proc.
 
 The proportional set (PSS) divides each page among the processes that map it, so a sum over processes counts
-no page twice (proc_pid_smaps(5)). Processes that are not watched also get their share. `unshared` is the
-memory that the watched processes would hold if they were alone.
+no page twice (proc_pid_smaps(5)). Unwatched processes that map a page also count in its division. `unshared`
+computes the memory that the watched processes would hold if no other process shared it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Look:
     """One sample: monotonic time (s), and processor time (s) and proportional set (bytes) by process name.
 
-    `own` is the part of that memory that is not mapped from files, so other processes do not change it.
-    `turns` has two times (s) of each main thread since its start: running, and ready without a processor.
+    `own` is the part of the proportional set that is not mapped from files; other processes do not change it.
+    `turns` has two times (s) of each main thread since its start: time running, and time ready but without a
+    processor.
     """
 
     time: float
@@ -80,7 +81,7 @@ def look(processes: Mapping[str, int]) -> Look:
 
 @contextmanager
 def answering(module: str, *words: str) -> Iterator[None]:
-    """Run `python -m MODULE WORDS` during the block, which begins after its first line of output."""
+    """Run `python -m MODULE WORDS` during a `with` block, which begins after the first line of output."""
     root = Path(__file__).parents[2]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     with subprocess.Popen(
@@ -96,7 +97,7 @@ def answering(module: str, *words: str) -> Iterator[None]:
 
 
 def below(parent: int) -> list[int]:
-    """Return the descendants of the process `parent`."""
+    """Return the identifiers of all descendants of the process `parent`."""
     found = []
     for task in Path(f"/proc/{parent}/task").glob("*/children"):
         for word in task.read_text().split():
@@ -113,10 +114,10 @@ def command(process: int) -> str:
 
 
 def unshared(processes: Mapping[str, int]) -> float:
-    """Return the memory (bytes) that processes would hold if no other process mapped their files.
+    """Return the memory (bytes) that some processes would hold if no other process mapped their files.
 
-    The result is their private memory, and for each segment of a file the largest amount that one of them
-    holds, because they use the same libraries alike.
+    The result is the sum of their private memory and, for each mapped segment of a file, the largest amount
+    that any of them holds, because all use the same libraries in the same way.
     """
     private = 0.0
     of_files: defaultdict[tuple[str, str], float] = defaultdict(float)
@@ -150,7 +151,7 @@ def _processor(process: int) -> float:
 
 
 def _turns(process: int) -> tuple[float, float]:
-    """Return for how long (s) the main thread was running and ready; NaN if the kernel does not count it."""
+    """Return the main thread's running and ready times (s); NaN if the kernel does not count them."""
     try:
         words = Path(f"/proc/{process}/task/{process}/schedstat").read_text().split()
     except FileNotFoundError:  # the kernel does not count it
@@ -159,6 +160,6 @@ def _turns(process: int) -> tuple[float, float]:
 
 
 def _proportional(process: int) -> dict[str, float]:
-    """Return the proportional set and its parts in bytes."""
+    """Return the proportional set and the sizes of its parts, in bytes."""
     lines = [line.split() for line in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()]
     return {words[0]: float(words[1]) * 1024.0 for words in lines if words[0].startswith("Pss")}

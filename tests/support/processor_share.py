@@ -1,7 +1,7 @@
-"""A share of a core for processes under test: how large it is for a slower processor, and how to enforce it.
+"""A limited share of a core that makes processes under test as slow as on a slower processor.
 
-The kernel enforces the share (CFS bandwidth of the controller `cpu`, cgroup v1 or v2), on one core, with a
-period of 5 ms. The kernel grants at least 1 ms, so the period is longer for shares below 20 %. Within the
+The kernel enforces the share on one core (CFS bandwidth of the controller `cpu`, cgroup v1 or v2). The period
+is 5 ms, and longer for shares below 20 %, because the kernel grants at least 1 ms per period. Within the
 share, the control process has priority over its workers, as on a board: it is in a group of its own with a
 far greater weight. Stopping by SIGSTOP and SIGCONT would not work, because the flight replaces a stopped
 worker.
@@ -32,7 +32,7 @@ _SOURCE = Path(__file__).with_name("yardstick.c")
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Published speed of a processor in the two benchmarks.
+    """Published speed of a processor in two benchmarks, heap sort and Linpack.
 
     Attributes:
         sorts: arrays of 8,111 integers that heap sort sorts per second (NBench's numeric sort).
@@ -56,13 +56,13 @@ CORTEX_A53 = Published(
 
 @dataclass(frozen=True, slots=True)
 class Yardstick:
-    """Speed of this core in the two benchmarks, in the units of `Published`."""
+    """Speed of this machine's core in the two benchmarks, in the units of `Published`."""
 
     sorts: float
     mflops: float
 
     def share(self, slow: Published) -> float:
-        """Return the share of this core that is as fast as `slow`: the geometric mean of both ratios."""
+        """Return the share of this core that is as fast as `slow`: the geometric mean of two speed ratios."""
         return math.sqrt(slow.sorts / self.sorts * slow.mflops / self.mflops)
 
 
@@ -81,7 +81,7 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """Resources that a limited group used: throttled and all periods, largest memory (bytes), refusals.
+    """Use by a limited group: throttled and total periods, largest memory (bytes), refused allocations.
 
     The memory is NaN with a kernel before Linux 5.19, whose cgroup v2 does not record the largest use.
     """
@@ -98,7 +98,7 @@ class Limits:
     def __init__(self, share: float, memory: int, root: Path = ROOT) -> None:
         """Create the groups below `root`.
 
-        Raises OSError with the file that the kernel or the rights refuse.
+        Raises OSError with the name of the file if the kernel refuses a setting or access is denied.
         """
         name = f"knightcube-board-{os.getpid()}"
         self._is_v2 = (root / "cgroup.controllers").exists()
@@ -129,7 +129,8 @@ class Limits:
         for part in ("control", "workers"):
             (self._cpu / part).mkdir()
         weight, most, least = ("cpu.weight", 10000, 1) if self._is_v2 else ("cpu.shares", 262144, 2)
-        # The groups have priority over other work of this machine, which would take part of the share.
+        # The groups have priority over other work on this machine, which would otherwise take part of the
+        # share.
         for folder in (self._cpu, self._devices, self._cpu / "control"):
             _write(folder / weight, str(most))
         _write(self._cpu / "workers" / weight, str(least))
@@ -167,7 +168,7 @@ class Limits:
         return Used(int(rows["nr_periods"]), int(rows["nr_throttled"]), memory, refusals)
 
     def close(self) -> None:
-        """Remove the groups, whose processes have ended."""
+        """Remove the groups after their processes have ended."""
         for folder in (self._cpu / "control", self._cpu / "workers", self._cpu, self._memory, self._devices):
             for _ in range(100):
                 if not folder.exists():

@@ -1,4 +1,4 @@
-"""Random slews of two satellites in two orbits."""
+"""Random slews of two satellites, each in two orbits."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _whenever(end: AttitudeEnd) -> EndLaw:
 
 
 def slews(count: int, seed: int, with_cones: bool) -> Iterator[tuple[str, SlewTask]]:
-    """Yield named tasks; with cones, only those that start and end outside of them."""
+    """Yield slew tasks with their names; with exclusion cones, only tasks that start and end outside."""
     rng = np.random.default_rng(seed)
     made = 0
     while made < count:

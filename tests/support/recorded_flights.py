@@ -2,9 +2,9 @@
 
 `python -m tests.support.recorded_flights` writes the record, after an intended change of the behaviour. For
 each number the record has the count of finite values, and their mean, root mean square and last value over
-the flight. The components of an array are weighted by 1, 2, 3, ..., so that an exchange changes the figures.
-Only texts that are names are recorded, because the wording of messages may change. Values that depend on the
-computer are left out.
+the flight. The components of an array are weighted by 1, 2, 3, ..., so that swapping two components changes
+the recorded values. Only texts that are names are recorded, because the wording of messages may change.
+Values that depend on the computer are left out.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ NAMES = {
     ("streak", "status"),
     ("stars", "status"),
 }
-"""Texts that are names."""
+"""Text fields that contain names, which are recorded."""
 OF_THE_COMPUTER = {
     "run": {"config_name", "config_crc", "software", "utc_ns", "seed"},
     "health": {"cpu_share", "proportional", "memory_slope", "disk_free", "temperature"},
     "event": {"code"},
     "plan": {"evaluations"},
 }
-"""Fields that depend on the computer, or on the text of the configuration.
+"""Fields that depend on the computer, or on the text of the configuration, and are not recorded.
 
-The number of evaluations in an optimisation depends on the rounding of the processor.
+For instance, the number of evaluations in an optimisation depends on the processor's rounding.
 """
 UNTIMED = {"cycle_timing", "job_timing", "rate_group"}
-"""Packets with elapsed times of the computer."""
+"""Packets that contain elapsed times measured on the computer."""
 
 Record = dict[str, dict[str, Any]]
 
 
 def record_of(run: Run) -> Record:
-    """Return the record of a flight: for each packet type its count, and the figures of each field."""
+    """Return the record of a flight: the packet count of each packet type, and each field's statistics."""
     found: Record = {}
     for name, layout in LAYOUTS.items():
         rows = run[name]
@@ -82,7 +82,7 @@ def _fields(packet: Packet, rows: Any) -> dict[str, Any]:
 
 
 def _figures(values: Any) -> list[float]:
-    """Return the number of finite values, and the mean, the root mean square and the last of all."""
+    """Return the number of finite values, and the mean, root mean square and last of these values."""
     weighted = values.astype(float).reshape(len(values), -1)
     weighted = weighted * np.arange(1, weighted.shape[1] + 1)
     finite = weighted[np.isfinite(weighted)]
@@ -113,13 +113,13 @@ def _alike(known: Any, now: Any) -> bool:
 
 
 def recorded(name: str) -> Record:
-    """Return the record of a flight."""
+    """Return the stored record of a flight."""
     record: Record = json.loads(RECORD.read_text(encoding="utf-8"))[name]
     return record
 
 
 def faults(*entries: tuple[str, float, float]) -> tuple[FaultEntry, ...]:
-    """Return faults from their texts, starts (s) and durations (s)."""
+    """Return fault entries, each given by its text, start (s) and duration (s)."""
     return tuple(FaultEntry(fault=text, at=at, span=span) for text, at, span in entries)
 
 
@@ -135,7 +135,7 @@ IMPATIENT = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 1.0, "bl
 
 
 def _orbit_config(duration: float) -> OrbitConfig:
-    """Return the configuration of the orbit without cameras."""
+    """Return the configuration of the orbit demonstration without cameras."""
     config = as_orbit(configuration.load(config_path("orbit")))
     return configuration.replace(config, wide_cameras=(), camera=None, duration=duration)
 
@@ -230,13 +230,13 @@ FLIGHTS: dict[str, Callable[[], tuple[Config, Simulation | None]]] = {
 
 
 def flown(name: str, folder: Path) -> Run:
-    """Repeat a recorded flight."""
+    """Run a recorded flight again, and return its log."""
     config, section = FLIGHTS[name]()
     return fly(config, folder, section=section)
 
 
 def unlike_record(name: str, session_folder: Path) -> list[str]:
-    """Return the differences of a flight from its record; it is flown once per test session."""
+    """Return the differences of a flight from its record; the flight runs once per test session."""
     folder = session_folder / "recorded_flights"
     folder.mkdir(exist_ok=True)
     found = made_once(folder, name, lambda: record_of(flown(name, folder / name)))

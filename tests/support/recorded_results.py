@@ -4,8 +4,8 @@ A test module with records has a function for each case. `check(__file__, name, 
 with the file `recorded_results.json` beside the module. `KNIGHTCUBE_RECORD=1 python -m pytest -n 0 MODULE`
 writes the record, after an intended change of the results.
 
-For an array the record has its shape, the number of its finite values, and their mean, root mean square and
-weighted mean. It has no texts, because their wording may change.
+For an array, the record has its shape, the number of finite values, and their mean, root mean square and
+weighted mean. Texts are not recorded, because their wording may change.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ from knightcube.compiled import in_use
 TOLERANCE = 1e-5
 """Largest relative difference from the record, which rounding in another order may cause."""
 COMPILED_TOLERANCE = 1e-2
-"""Same limit with compiled forms, whose rounding decides when an iteration stops.
+"""Largest relative difference from the record with compiled forms.
 
-The largest difference of a covariance or a faint star is 0.7 % (5 of 68 cases of `tests/knightcube/vision`,
-2026-11-27).
+Their rounding may change when an iteration stops.
+
+The largest difference found, of a covariance or a faint star, is 0.7 % (5 of 68 cases of
+`tests/knightcube/vision`, 2026-11-27).
 """
 ANSWERS = ("rate", "quaternion")
-"""Names of figures that keep `TOLERANCE` with compiled forms."""
+"""Names of the values for which `TOLERANCE` also applies with compiled forms."""
 COMPILED = in_use()
 ZERO = 1e-15
 CURE = "if the change is intended, set KNIGHTCUBE_RECORD=1 and run the test to write the record again"
@@ -40,7 +42,7 @@ _DEPTH = 6
 
 
 def figures_of(value: Any, depth: int = 0) -> Any:
-    """Return the numbers of a result as JSON: dataclasses and mappings by name, arrays as figures."""
+    """Return the numbers of a result as JSON: dataclasses and mappings by name, arrays as statistics."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str | Enum):
@@ -91,7 +93,7 @@ def _array(value: Any) -> Any:
 
 
 def differences(record: Any, found: Any, tolerance: float, place: str = "", zero: float = 0.0) -> list[str]:
-    """Return the key paths at which figures differ from their record, one per line.
+    """Return the key paths at which values differ from their record, one per line.
 
     Numbers also agree if their difference is at most `zero`, the rounding error of an exact zero.
     """
@@ -118,7 +120,7 @@ def differences(record: Any, found: Any, tolerance: float, place: str = "", zero
 
 
 def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zero: float = ZERO) -> None:
-    """Fail unless a result has the figures of its record beside the test module.
+    """Fail unless a result agrees with its record, a file beside the test module.
 
     Numbers agree if they differ by at most the fraction `tolerance`, or by `zero`. With compiled forms, all
     except the `ANSWERS` have the tolerance `COMPILED_TOLERANCE`.
@@ -135,7 +137,7 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
 
 
 def unlike(record: Any, found: Any, tolerance: float, zero: float, compiled: bool) -> list[str]:
-    """Return the key paths at which the figures of numpy or `compiled` forms differ from their record."""
+    """Return the key paths at which the results of the numpy or compiled forms differ from their record."""
     lines = differences(record, found, tolerance, zero=zero)
     if not compiled:
         return lines

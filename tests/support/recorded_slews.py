@@ -1,6 +1,6 @@
 """Slews with known optima, and a model of the motion that shares no code with the planner.
 
-The problems, field series and optima of the file come from an independent direct collocation. `flown`
+The file's problems, magnetic field series and optima come from an independent direct collocation. `flown`
 integrates the equations of the file's `model`.
 """
 
@@ -31,7 +31,7 @@ FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum
 
 @cache
 def recorded() -> dict[str, Any]:
-    """Return the file; skip the test if the file is missing."""
+    """Return the content of the file of slews; skip the test if the file is missing."""
     if not FILE.exists():
         pytest.skip(f"no optima of slews at {FILE}")
     content: dict[str, Any] = json.loads(FILE.read_text())
@@ -45,14 +45,14 @@ def problem(name: str) -> dict[str, Any]:
 
 
 def matrix(q: FloatArray) -> FloatArray:
-    """Return the attitude matrix (3, 3) by Euler's formula of the textbooks."""
+    """Return the attitude matrix (3, 3) of a quaternion by the textbook formula of Euler parameters."""
     v, s = np.asarray(q[:3]), float(q[3])
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     return np.asarray((s * s - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) - 2.0 * s * cross)
 
 
 def along_of(case: dict[str, Any]) -> EnvironmentAt:
-    """Return field and position of a problem over time."""
+    """Return the function that gives the magnetic field and the position of a problem at given times."""
     file = recorded()
     orbit = file["orbit"][case["orbit"]]
     radius = file["earth_radius"] + orbit["altitude"]

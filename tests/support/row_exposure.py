@@ -1,7 +1,7 @@
-"""Frames summed instant by instant, each row within its own exposure; independent of the fitted model.
+"""Frames of a rolling shutter, summed instant by instant, independent of the estimator's model.
 
-At each instant a star is a Gaussian that is integrated over each pixel of a patch. It counts in the rows that
-are exposed at that time. The method is simple and slow. The noise is the simulator's.
+At each instant a star is a Gaussian that is integrated over each pixel of a patch. The instant's light counts
+only in the rows that are exposed at that time. The method is simple and slow. The noise is the simulator's.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ Turns = Callable[[FloatArray], FloatArray]
 """Function that returns rotation vectors (m, 3), rad, since mid-exposure at times (m,), s, camera frame."""
 
 _LIMIT = 7.0
-# Largest step (px) between instants, and half width of the patch in widths of the point spread.
+# Largest step (px) of a star between instants, and half width of the patch in units of the point spread's
+# sigma.
 _STEP = 0.25
 _REACH = 5.5
 _SAMPLES = 65
@@ -30,7 +31,7 @@ _SAMPLES = 65
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowScene:
-    """A frame, its stars (n, 2), px, at mid-exposure, brightest first, electrons (n,), and paths (n,), px."""
+    """A frame and its stars, brightest first: mid-exposure positions (px), electrons, path lengths (px)."""
 
     pixels: Image
     stars: FloatArray
@@ -94,7 +95,7 @@ def _add(
     corner = np.rint(path).astype(int) - reach
     across, down = (corner[:, k, None] + np.arange(2 * reach + 1) for k in (0, 1))
     x, y = (_shares(pixel, path[:, k], camera.psf_sigma) for k, pixel in ((0, across), (1, down)))
-    # fraction of the instant that lies within the exposure of each row
+    # Fraction of the interval around the instant that lies within the exposure of each row.
     begin = (down - 0.5 * (camera.rows - 1)) * camera.line_time - 0.5 * exposure
     first = np.maximum(times[kept, None] - 0.5 * step, begin)
     last = np.minimum(times[kept, None] + 0.5 * step, begin + exposure)

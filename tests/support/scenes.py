@@ -1,4 +1,4 @@
-"""Frames with their truth for the campaigns: real stars, a random pointing, a constant body rate."""
+"""Simulated frames with their truth for the campaigns: real stars, random pointing, constant body rate."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXPOSURES = (0.2, 1.0)
 MOST_TURN = 0.5
 """Largest rotation of a random slew, as a fraction of the field."""
 BRIGHTEST = 7000
-"""Number of stars that reproduces the tables of the thesis; the thesis states none."""
+"""Number of brightest stars that reproduces the tables of the thesis, which does not state its number."""
 LEAST_USABLE = 5
 """Smallest number of usable stars in a random slew."""
 _MOST_SKIES = 1000
@@ -54,7 +54,7 @@ class Scene:
 
 @lru_cache(maxsize=4)
 def catalogue(limit: float) -> tuple[StarCatalogue, FloatArray]:
-    """Return the stars brighter than `limit` and their directions (n, 3)."""
+    """Return the catalogue of stars brighter than magnitude `limit`, and their directions (n, 3)."""
     stars = load().brighter_than(limit)
     return stars, stars.directions_at(YEAR)
 
@@ -84,7 +84,7 @@ def slew(
 
 @dataclass(frozen=True, slots=True)
 class RandomSlew:
-    """A random motion of a campaign; its sky is drawn when it is exposed.
+    """A random motion of a campaign; its star field is drawn when a frame is exposed.
 
     Attributes:
         seed: seed of the campaign; `run` is the number of the motion.
@@ -101,7 +101,7 @@ class RandomSlew:
 
     @classmethod
     def drawn(cls, seed: int, run: int) -> RandomSlew:
-        """Return motion number `run`, which does not depend on the number of motions."""
+        """Return motion number `run` of a campaign, which is the same for any number of motions."""
         draw = np.random.default_rng((seed, run, 0))
         theta = float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi)))
         percent = float(100.0 * draw.uniform(0.0, MOST_TURN))

@@ -1,4 +1,4 @@
-"""Defaults of configuration sections as plain values, for the comparison with the published ones."""
+"""Defaults of configuration sections as plain values, for the comparison with the published defaults."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Defaults = dict[str, dict[str, Any]]
 def defaults_of(*modules: ModuleType) -> Defaults:
     """Return the defaults of all sections of modules: numbers, texts and lists by section and key.
 
-    A default that a section inherits belongs to the first section. Missing values and subsections are left
+    An inherited default is listed under the section that defines it. Missing values and subsections are left
     out.
     """
     found: Defaults = {}

@@ -24,8 +24,8 @@ _UNIT_TOLERANCE = 1e-6
 class WideCamera(Section, frozen=True, kw_only=True):
     """A horizon and Sun camera.
 
-    `mounting` rotates body axes to camera axes (boresight z, columns x, rows y). `field_of_view_deg` is that
-    of the columns and, because pixels are square, also determines that of the rows.
+    `mounting` rotates body axes to camera axes (boresight z, columns x, rows y). `field_of_view_deg` is the
+    angle across the columns; because pixels are square, it also determines the angle across the rows.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]
@@ -42,7 +42,10 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
 
 class SolarString(Section, frozen=True, kw_only=True):
-    """A string of solar cells on one side; its current follows the cosine of the Sun's incidence angle."""
+    """A string of solar cells on one face.
+
+    Its current is proportional to the cosine of the Sun's incidence angle.
+    """
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]
     normal: tuple[float, float, float]
@@ -53,7 +56,7 @@ class Gyros(Section, frozen=True, kw_only=True):
     """Three rate gyros along the body axes.
 
     `noise` is in rad/s per sqrt(Hz), `bias_start` in rad/s, and `bias_walk` in rad/s per sqrt(s). `rate_hz`
-    is that of the samples, which are means over their period.
+    is the sample rate; each sample is the mean over its period.
     """
 
     noise: Positive
@@ -70,8 +73,9 @@ class Gyros(Section, frozen=True, kw_only=True):
 class Magnetometer(Section, frozen=True, kw_only=True):
     """A three-axis magnetometer along the body axes.
 
-    `noise` (T) is that of a sample, `bias_start` (T) the hard iron after calibration on the ground.
-    `bias_walk` (T per sqrt(s)) is that of the hard iron and of the field model's error in orbit.
+    `noise` (T) is the noise of a sample, and `bias_start` (T) the hard-iron error after ground calibration.
+    `bias_walk` (T per sqrt(s)) is the random walk of the hard iron together with the field model's error in
+    orbit.
     """
 
     noise: Positive
@@ -81,7 +85,7 @@ class Magnetometer(Section, frozen=True, kw_only=True):
 
 
 class SensorSuite(Section, frozen=True, kw_only=True):
-    """All sensors, and the inertia (kg m^2, body axes) of the satellite."""
+    """All sensors of a satellite, and its inertia (kg m^2, body axes)."""
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
     inertia: tuple[Positive, Positive, Positive]

@@ -10,7 +10,7 @@ from typing import Any
 
 
 def made_once(folder: Path, name: str, make: Callable[[], Any]) -> Any:
-    """Return the result of `make` as JSON represents it; the first caller of a session calls `make`.
+    """Return the result of `make` in its JSON form; only the first caller of a session calls `make`.
 
     `folder` is below the fixture `session_folder`. A caller in another process waits for the result. If
     `make` raises an exception, the next caller calls it again.

@@ -12,7 +12,7 @@ EARTH, FLATTENING, EQUATOR, LIGHT = 3.986004418e14, 1.0826359e-3, 6_378_136.6, 2
 
 
 def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
-    """Return a state above `place`, moving perpendicular to it, at `speed` times the circular speed."""
+    """Return a state at `radius` over `place`, with `speed` times the circular speed horizontally."""
     up = place / np.linalg.norm(place)
     ahead = np.cross(up, rng.normal(size=3))
     ahead /= np.linalg.norm(ahead)
@@ -20,7 +20,7 @@ def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: 
 
 
 def passing_object(rng: np.random.Generator, own: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Return an object drawn 100 to 3,020 km from an observer with state `own` (6,), m and m/s.
+    """Return a random object 100 to 3,020 km away from an observer with state `own` (6,), m and m/s.
 
     The result is the unit vector (3,) to the object, its distance (m) and its state (6,). The orbit of the
     object is nearly circular; its altitude is not limited.

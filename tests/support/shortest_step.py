@@ -1,8 +1,9 @@
-"""Shortest time of a single-axis slew by shooting: full current in one direction, then in the other.
+"""Shortest time of a single-axis slew by shooting, with full current in one direction, then in the other.
 
-The method is independent of planner and collocation. The body is integrated forward from the start under one
-limit, and backward from the end under the other. The current switches where the two curves meet in the phase
-plane. One switch is optimal if the slew takes less than half a period of the thread (more than 20 s here).
+The method is independent of planner and collocation. The motion is integrated forward from the start at one
+current limit, and backward from the end at the other. The current switches where the two curves meet in the
+phase plane. One switch is optimal if the slew takes less than half a period of the thread (more than 20 s
+here).
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ _NEWTON_STEPS = 12
 
 
 def shortest_time(slew: Slew) -> float:
-    """Return the shortest feasible horizon (s), or inf if there is none up to 48 s."""
+    """Return the shortest feasible duration (s) of a slew, or inf if no slew of up to 48 s is feasible."""
     return min(_meeting(slew, 1.0), _meeting(slew, -1.0))
 
 
 def _meeting(slew: Slew, sign: float) -> float:
-    """Return the total time if the first current has this sign."""
+    """Return the shortest total time (s) of a slew whose first current has the given sign, or inf."""
     out = _run(slew, (slew.start_angle, slew.start_rate), sign, _STEP)
     back = _run(slew, (slew.end_angle, slew.end_rate), -sign, -_STEP)
     apart = np.abs(out[:, None, 0] - back[None, :, 0]) + np.abs(out[:, None, 1] - back[None, :, 1])
@@ -38,7 +39,7 @@ def _meeting(slew: Slew, sign: float) -> float:
 
 
 def _refined(slew: Slew, sign: float, times: FloatArray) -> float:
-    """Return the sum of the two times if Newton's iteration from `times` (2,) converges, otherwise inf."""
+    """Return the sum of the times before and after the switch, or inf if Newton's iteration fails."""
     for _ in range(_NEWTON_STEPS):
         if times.min() < -1e-9 or times.max() > _LONGEST:
             return float("inf")

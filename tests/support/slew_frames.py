@@ -1,4 +1,4 @@
-"""A slew of the 3U with a frame every 5 s."""
+"""A slew of the 3U satellite with a camera frame every 5 s."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_3u.yaml"
 
 
 SPEED = 5e-4
-"""Rate (rad/s) at the release."""
+"""Body rate (rad/s) when the satellite is released."""
 
 
 BEGIN, SLEW, TURN = 60.0, 300.0, np.radians(100.0)
@@ -61,7 +61,7 @@ def flight(body: str, seed: int, about: FloatArray | None = None) -> tuple[Orbit
 
 
 def _mounting() -> float:
-    """Return the standard deviation (rad per axis) of the camera's mounting, uniform within its accuracy."""
+    """Return the standard deviation (rad per axis) of a camera's mounting error, uniform within its limit."""
     camera = as_orbit(configuration.parse(CONFIG.read_text(encoding="utf-8"))).camera
     assert camera is not None
     return float(np.radians(camera.accuracy.mounting_deg) / np.sqrt(3.0))
@@ -70,7 +70,7 @@ def _mounting() -> float:
 def compared(
     run: Run, first: float = BEGIN + 5.0, last: float = BEGIN + SLEW
 ) -> tuple[int, int, int, FloatArray]:
-    """Return the counts of frames of the slew, with a rate, and used, and the NEES per axis (n,).
+    """Return three counts of the slew's frames (all, with a rate, used), and the NEES per axis (n,).
 
     Only frames from `first` to `last` (s) count. The comparison is in body axes. The covariance of a frame is
     in camera axes, and the accuracy of the camera's mounting is added.

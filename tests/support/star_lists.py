@@ -1,9 +1,9 @@
 """Synthetic star lists: the output of a perfect detector for a random part of the sky.
 
-A camera of 1024 x 1024 pixels has a random pointing and roll. The guide stars down to its limiting magnitude
-fall on the detector with Gaussian centroid noise. Some are missing. False stars are uniform over the frame,
-with the brightness of random true ones. The list is ordered by a magnitude with errors, as a detector
-measures it.
+A camera of 1024 x 1024 pixels has a random pointing and roll. The guide stars brighter than its limiting
+magnitude are imaged with Gaussian centroid noise. Some are missing. False stars are uniform over the frame,
+with the brightness of random true ones. The list is ordered by magnitudes with errors, as a detector measures
+them.
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ PIXELS = 1024
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """Parameters of a list.
+    """Parameters of a synthetic star list.
 
     Attributes:
         field_deg: field of view, edge to edge.
         noise_px: noise of a centroid along either axis.
         false_stars: number of false stars.
-        faintest: V of the faintest detected star.
+        faintest: V magnitude of the faintest detected star.
         magnitude_error: standard deviation of the instrumental magnitudes.
         lost: fraction of the stars that is missing.
         order: "brightness", or "none" for a shuffled list without magnitudes.
-        known_deg: largest difference between true and assumed field of view; None: see `searched_deg`.
+        known_deg: largest difference (deg) between true and assumed field of view; None if `searched_deg`
+            applies.
         distortion_px: radial distortion at the corner.
         searched_deg: lowest and highest assumed field of view if `known_deg` is None.
         bright: whether the false stars are all brighter than the true ones.
@@ -56,7 +57,7 @@ class ListKind:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarList:
-    """One list and its truth.
+    """One synthetic star list and its truth.
 
     Attributes:
         pixels: centroids (n, 2), x and y.
@@ -75,7 +76,7 @@ class StarList:
     kind: ListKind
 
     def field(self) -> StarField:
-        """Return the list in the form that the star tracker takes."""
+        """Return the list in the form that the star tracker accepts."""
         believed_deg, scale = believed_field(self.kind)
         camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(believed_deg)))
         half = 0.5 * PIXELS / camera.focal_length
@@ -133,7 +134,7 @@ def draw(kind: ListKind, stars: GuideStars, rng: np.random.Generator) -> StarLis
 
 
 def draw_random(kind: ListKind, count: int, rng: np.random.Generator) -> StarList:
-    """Return a list of `count` stars at random positions, which show no part of the sky."""
+    """Return a list of `count` stars at random positions that match no part of the sky."""
     camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(kind.field_deg)))
     pixels = rng.uniform(-0.5, PIXELS - 0.5, (count, 2))
     magnitude = np.sort(kind.faintest - rng.exponential(1.0, count))
@@ -149,7 +150,7 @@ def _distort(pixels: FloatArray, camera: Pinhole, corner: float) -> FloatArray:
 
 
 def configurations(known_deg: float | None = 0.1) -> list[ListKind]:
-    """Return the twelve kinds of list of issue 4: two fields, two noises, three numbers of false stars."""
+    """Return the twelve list kinds of issue 4: two fields, two noise levels, three numbers of false stars."""
     base = ListKind(known_deg=known_deg)
     return [
         replace(base, field_deg=field, noise_px=noise, false_stars=false)

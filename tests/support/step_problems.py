@@ -1,4 +1,4 @@
-"""The KnightCube's plant and the slews that the guidance tests plan."""
+"""Plant parameters of the KnightCube, and the slews of the guidance tests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OPTIMUM_FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / 
 
 @dataclass(frozen=True)
 class Problem:
-    """Boundary states (q2, rad/s) and horizon (s) of one slew of one plant."""
+    """Plant, boundary states (q2, rad/s) and duration (s) of one slew."""
 
     plant: SingleAxisPlant
     start_q2: float
@@ -31,12 +31,12 @@ class Problem:
     horizon: float
 
     def planned(self, **options: Any) -> StepPlan:
-        """Return the planner's answer."""
+        """Return the planner's result for the slew."""
         states = self.start_q2, self.start_rate, self.end_q2, self.end_rate
         return plan(self.plant, *states, self.horizon, **options)
 
     def slew(self, horizon: float) -> Slew:
-        """Return the same slew for the collocation oracle, over `horizon` s."""
+        """Return the same slew for the collocation oracle, with a duration of `horizon` s."""
         plant = self.plant
         return Slew(
             angle_of(self.start_q2),
@@ -56,7 +56,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class KnownOptimum:
-    """A problem of the data file with its optimum (J) and its shortest feasible horizon (s)."""
+    """A problem of the data file with its optimum (J) and its shortest feasible duration (s)."""
 
     problem: Problem
     energy: float
@@ -124,9 +124,10 @@ def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0,
 def feasible_problems(
     count: int, seed: int, share: tuple[float, float] = (1.1, 2.5)
 ) -> list[tuple[Problem, float]]:
-    """Return slews with horizons of `share` times the shortest feasible one, and that shortest horizon (s).
+    """Return slews, each with its shortest feasible duration (s); it lasts a random factor in `share` longer.
 
-    A third each has no thread and two kinds of thread; half have a disturbance, and half a moving end.
+    A third of the plants has no thread, and two thirds a thread of one of two stiffnesses. Half of the plants
+    have a disturbance, and half of the slews end with a rate.
     """
     rng = np.random.default_rng(seed)
     problems: list[tuple[Problem, float]] = []
@@ -148,7 +149,7 @@ def feasible_problems(
 
 
 def largest_ratio(problem: Problem, found: StepPlan) -> float:
-    """Return the largest of |I| and |q2| over their limits along the path."""
+    """Return the largest ratio of |I| or |q2| to its limit along the path."""
     motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001))
     current = float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
     return max(current, float(np.abs(np.sin(0.5 * motion[0])).max()) / Q2_LIMIT)

@@ -5,9 +5,9 @@ parameters p is the sum over pixels of (dm/dp)(dm/dp)^T / (floor + m), with the 
 `floor` of all other noise (read noise squared, dark current, rounding). The signal is that of a point that
 moves under a constant rate, with a Gaussian point spread integrated over each pixel. It is summed by
 Gauss-Legendre quadrature in time, exact to rounding, and independent of the faster model that the estimator
-fits. Position, flux and background of every star are unknown; on request also the common width of the point
-spread. The signal of one star in the pixels of another is left out, which makes the bound too low, if
-anything.
+fits. Position, flux and background of every star are unknown, and optionally also the common width of the
+point spread. The signal of one star in the pixels of another is ignored, which can only make the bound too
+low.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import CameraMotion, paths, sensitivities
 
-# Parameters of a star's information: rotation (3) and point spread; then position (2), electrons, background.
+# Number of parameters that stars share: rotation (3) and point spread. Each star also has position (2),
+# electrons and background.
 _SHARED = 4
 _ALONE = 4
 _REACH_SIGMAS = 6.0
@@ -31,7 +32,7 @@ _PIECE = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateBound:
-    """Bound of one frame.
+    """Cramer-Rao bounds of one frame.
 
     Attributes:
         covariance: smallest covariance (3, 3), rad^2/s^2, of the rate, camera frame.
@@ -54,8 +55,8 @@ def rate_bound(
 ) -> RateBound:
     """Return the bound on the rate (3,), rad/s, from stars at pixels `stars` (n, 2) at mid-exposure.
 
-    `electrons` (n,) are those of the whole exposure, and `floor` is in e-^2 per pixel. Raises
-    numpy.linalg.LinAlgError if the stars do not determine the rate.
+    `electrons` (n,) are counted over the whole exposure; `floor` is the variance of other noise, e-^2 per
+    pixel. Raises numpy.linalg.LinAlgError if the stars do not determine the rate.
     """
     motion = CameraMotion.steady(np.asarray(rate) * exposure)
     shared = np.zeros((_SHARED, _SHARED))
@@ -76,10 +77,10 @@ def rate_bound(
 def endpoint_bound(
     length: float, electrons: float, psf_sigma: float, floor: float, angle: float = 0.0, fit_psf: bool = False
 ) -> tuple[float, float]:
-    """Return the bounds (px) on one end of an isolated straight streak, along it and across it.
+    """Return the bounds (px) on one end point of an isolated straight streak, along and across the streak.
 
-    Both ends, `electrons` and background are unknown. `angle` (rad) is that between streak and rows. The
-    bounds are averaged over the positions of the ends within a pixel.
+    Both ends, `electrons` and background are unknown. `angle` (rad) is the angle between the streak and the
+    rows. The bounds are averaged over the positions of the ends within a pixel.
     """
     phases = np.array([[0.0, 0.0], [0.3, 0.7], [0.5, 0.2], [0.8, 0.4]])
     variance = np.zeros(2)
@@ -89,13 +90,13 @@ def endpoint_bound(
         node, weight = _quadrature(length, psf_sigma)
         mean = np.asarray(phase)
         points = mean + length * node[:, None] * direction
-        # d(point)/d(first end, last end), each (x, y)
+        # Derivatives of each point with respect to the first and the last end, each (x, y).
         blend = np.zeros((len(node), 2, 4))
         blend[:, 0, 0] = blend[:, 1, 1] = 0.5 - node
         blend[:, 0, 2] = blend[:, 1, 3] = 0.5 + node
         images = _images(points, weight, blend, psf_sigma, electrons, None)
         information = _information(images, electrons, floor)
-        # Order: ends (4), point spread, electrons, background.
+        # Order of the parameters: ends (4), point spread, electrons, background.
         kept = [0, 1, 2, 3, *([4] if fit_psf else []), 5, 6]
         covariance = _inverse(information[np.ix_(kept, kept)])
         for end in (0, 2):
@@ -108,9 +109,10 @@ def endpoint_bound(
 def star_information(
     pinhole: Pinhole, motion: CameraMotion, star: FloatArray, electrons: float, psf_sigma: float, floor: float
 ) -> FloatArray:
-    """Return the Fisher information (8, 8) of rotation (3) rad, PSF sigma px, x, y px, electrons, background.
+    """Return one star's Fisher information (8, 8).
 
-    `star` (2,) is the pixel at mid-exposure. Signal off the detector gives no information.
+    The parameters are rotation (3), rad, PSF sigma, px, position (2), px, electrons and background. `star`
+    (2,) is the pixel at mid-exposure. Signal off the detector gives no information.
     """
     ends = paths(pinhole, motion, np.tile(star, (9, 1)), np.linspace(-0.5, 0.5, 9))
     length = float(np.sum(np.hypot(*np.diff(ends.position, axis=0).T)))
@@ -142,10 +144,10 @@ def _images(
     electrons: float,
     shape: tuple[int, int] | None,
 ) -> FloatArray:
-    """Return d(signal)/d(k path parameters, sigma, electrons, background), (k + 3, pixels).
+    """Return derivatives (k + 3, pixels) of the signal by k path parameters, sigma, electrons and background.
 
-    The last row but one times `electrons` is the signal itself. The `points` (m, 2) carry fractions `weight`
-    (m,) of it, and move by `change` (m, 2, k).
+    The row of `electrons`, multiplied by `electrons`, is the signal itself. Each of the `points` (m, 2) has a
+    fraction `weight` (m,) of the signal; `change` (m, 2, k) are the points' derivatives by the parameters.
     """
     reach = math.ceil(_REACH_SIGMAS * sigma) + 1
     low, high = np.floor(points.min(axis=0)).astype(int), np.ceil(points.max(axis=0)).astype(int)
@@ -155,7 +157,7 @@ def _images(
     if np.any(low > high):
         return np.zeros((change.shape[2] + 3, 0))
     rows = np.zeros((change.shape[2] + 3, high[1] - low[1] + 1, high[0] - low[0] + 1))
-    # The path is processed in short segments, because the signal of each fits a small patch.
+    # The path is processed in short segments, because the signal of a segment fits a small patch of pixels.
     for start in range(0, len(points), _PIECE):
         piece = slice(start, start + _PIECE)
         near, far = points[piece].min(axis=0), points[piece].max(axis=0)
@@ -187,7 +189,7 @@ def _near_path(light: FloatArray) -> IntArray:
 def _profile(
     pixels: FloatArray, place: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the fraction (m, p) of points' signal per pixel, and its derivatives by place and sigma."""
+    """Return the fraction (m, p) of each point's signal per pixel, and its position and sigma derivatives."""
     right = (pixels + 0.5 - place[:, None]) / sigma
     left = (pixels - 0.5 - place[:, None]) / sigma
     bell_right = np.exp(-0.5 * right**2) / math.sqrt(2.0 * math.pi)

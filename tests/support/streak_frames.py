@@ -1,4 +1,4 @@
-"""Simulated star frames for the tests of vision, independent of the simulator's camera.
+"""Simulated star frames for the tests of image processing, independent of the simulator's camera.
 
 Fixed point stars move as v' = -omega x v. They are sampled along the motion at 0.1 px or finer, spread by a
 Gaussian that is integrated over each pixel (erf), and get photon, dark and read noise.
@@ -15,7 +15,7 @@ from scipy.special import erf
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Pinhole
 
-# Numbers of stars on the whole sky that are brighter than V (Hipparcos).
+# Magnitudes V, and numbers of stars on the whole sky that are brighter (Hipparcos).
 _COUNTS_V = (6.0, 6.5, 7.0, 8.0, 8.5)
 _COUNTS = (4995.0, 8789.0, 15404.0, 41074.0, 61320.0)
 _CHUNK_PX = 10.0
@@ -38,20 +38,20 @@ class Camera:
 
 
 def star_camera(size: int = 1024, psf_sigma: float = 1.0) -> Camera:
-    """Return the demonstration's camera, or its central `size` x `size` px; 20 deg are 1024 px."""
+    """Return the demonstration's camera (1024 px for 20 deg), or its central `size` x `size` px."""
     whole = Pinhole.from_field_of_view(1024, 1024, np.deg2rad(20.0))
     return Camera(Pinhole(size, size, whole.focal_length), psf_sigma=psf_sigma)
 
 
 def rate_at(theta: float, speed: float, roll: float = 0.0) -> FloatArray:
-    """Return a rate (3,) of `speed` rad/s with its axis `theta` (rad) off the boresight; pi/2 is +y."""
+    """Return a rate (3,) of `speed` rad/s whose axis is `theta` (rad) off the boresight, by default to +y."""
     return speed * np.array([np.sin(theta) * np.sin(roll), np.sin(theta) * np.cos(roll), np.cos(theta)])
 
 
 def random_stars(
     rng: np.random.Generator, pinhole: Pinhole, reach: float, faintest: float = 7.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Return directions (n, 3) and magnitudes (n,) to `faintest`, uniform over the cap of the field."""
+    """Return random stars on a cap of the sky: directions (n, 3), and magnitudes (n,) up to `faintest`."""
     cap = min(pinhole.half_diagonal + reach, np.pi)
     part = 0.5 * (1.0 - np.cos(cap))
     on_sky = 10.0 ** np.interp(faintest, _COUNTS_V, np.log10(_COUNTS))
@@ -78,7 +78,7 @@ def rotate(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def true_endpoints(camera: Camera, directions: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the pixels (n, 2, 2) at the first and last instant of stars that are given at mid-exposure."""
+    """Return the pixels (n, 2, 2), at start and end of an exposure, of stars given at mid-exposure."""
     first = camera.pinhole.project(rotate(directions, -0.5 * rotation))
     last = camera.pinhole.project(rotate(directions, 0.5 * rotation))
     return np.stack([first, last], axis=1)
@@ -109,8 +109,8 @@ def expose(
 ) -> FloatArray:
     """Return the mean electrons (rows, columns) of stars (n, 3) while the camera rotates by `rotation` (3,).
 
-    `growth` is the relative change of the rate over the exposure. `directions` are those at the attitude
-    half-way in angle.
+    `growth` is the relative change of the rate over the exposure. `directions` are in camera axes at the
+    attitude half-way in angle.
     """
     image = np.zeros((camera.pinhole.rows, camera.pinhole.columns))
     electrons = camera.zero_magnitude * 10.0 ** (-0.4 * magnitudes) * exposure
@@ -119,7 +119,7 @@ def expose(
     seen = camera.pinhole.contains(ends.mean(axis=1), margin=float(np.nanmax(length, initial=0.0)) + 10.0)
     for star in np.flatnonzero(seen):
         chunks = max(1, int(np.ceil(length[star] / _CHUNK_PX)))
-        # The number is half as large again, because an arc is longer than its chord and the speed varies.
+        # The number is 1.5 times as large, because an arc is longer than its chord and the speed varies.
         steps = chunks * int(np.ceil((1.5 + growth) * _CHUNK_PX / _STEP_PX)) if length[star] > 0.0 else 1
         time = (np.arange(steps) + 0.5) / steps - 0.5
         fraction = time + 0.5 * growth * (time**2 - 0.25)
@@ -150,7 +150,7 @@ def read_out(
     rng: np.random.Generator,
     dtype: npt.DTypeLike = np.uint16,
 ) -> Image:
-    """Return the frame of counts, with photon, dark and read noise, pedestal, clipping and rounding."""
+    """Return the frame in counts, with photon, dark and read noise, pedestal, clipping and rounding."""
     drawn = rng.poisson(electrons + camera.dark * exposure).astype(float)
     drawn = np.minimum(drawn, camera.full_well) + camera.read_noise * rng.standard_normal(electrons.shape)
     top = min(camera.top, int(np.iinfo(dtype).max))

@@ -1,4 +1,4 @@
-"""Frames of the Sun, and the Sun sensor's answers for them."""
+"""Simulated frames of the Sun, and the Sun sensor's results for them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
 from tests.support.earth_truth import sun_direction, sun_point
 
 K1 = -0.1
-"""Radial distortion of the lenses, which moves the corners inwards by 30 px."""
+"""Radial distortion coefficient of the lenses, which moves the corners inwards by 30 px."""
 
 
 CAMERAS: dict[str, tuple[EarthCameraModel, SunSettings]] = {
@@ -25,12 +25,12 @@ CAMERAS: dict[str, tuple[EarthCameraModel, SunSettings]] = {
         SunSettings(least_radius=np.radians(2.6), greatest_radius=np.radians(3.8)),
     ),
 }
-"""Cameras by name; `overexposed` images sea and haze bright and every cloud saturated."""
+"""Cameras by name; with `overexposed`, sea and haze are bright and every cloud is saturated."""
 
 
 @dataclass
 class Outcome:
-    """Figures of a campaign: errors (rad), normalised squares, statuses, CPU time (s) of each frame."""
+    """Results for each frame: errors (rad), normalised squared errors, statuses, CPU times (s)."""
 
     errors: list[float] = field(default_factory=list)
     whole: list[float] = field(default_factory=list)
@@ -62,7 +62,7 @@ def frames_with_sun(name: str, count: int, seed: int) -> Outcome:
 
 
 def frames_without_sun(name: str, count: int, seed: int) -> Outcome:
-    """Return the results of `count` frames of the sunlit limb with the Sun 40 px or more outside."""
+    """Return the results of `count` frames of the sunlit limb, with the Sun at least 40 px outside."""
     model, settings = CAMERAS[name]
     generator = np.random.default_rng(seed)
 

@@ -1,8 +1,8 @@
 """Independent renderer of frames of streaks, for any point spread, lens and motion.
 
 The estimator's model and `sim_hal.star_camera` use one Gaussian point spread and analytic streaks. This
-renderer uses neither. It lays points along each star's path on a grid of three by three cells per pixel,
-convolves the grid with a sampled point spread, and sums the cells of each pixel.
+renderer uses neither of these two approximations. It lays points along each star's path on a grid of three by
+three cells per pixel, convolves the grid with a sampled point spread, and sums the cells of each pixel.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import Pinhole
 
 Cells = npt.NDArray[np.floating[Any]]
-"""Signal (rows, columns) on a grid of cells."""
+"""Signal (rows, columns) on a grid of cells that are finer than pixels."""
 
 CELLS = 3
-"""Cells along a pixel's side."""
+"""Number of cells along a pixel's side."""
 
 Spread = Callable[[FloatArray, FloatArray], FloatArray]
 """Density of a point's signal at (dx, dy) px from it, which need not be normalised."""
@@ -64,7 +64,7 @@ def disc(diameter: float) -> Spread:
 
 
 def ring(diameter: float, hole: float) -> Spread:
-    """Return a defocused point of a telescope with a central obstruction: a disc (px) with a hole (px)."""
+    """Return a defocused point of a telescope with a central obstruction: a disc with a hole (px)."""
     whole, dark = disc(diameter), disc(hole)
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
@@ -103,11 +103,11 @@ class Optics:
     """Optics of a camera.
 
     Attributes:
-        spreads: point spreads from the centre of the field to its corner, between which the signal is mixed.
+        spreads: point spreads from the field's centre to its corner; the signal is interpolated between them.
         radius: distance (px) beyond which a point has no signal.
         distortion: relative outward displacement of the corner, with the cube of the radius.
         offset: distance (px) of the optical axis from the centre of the detector.
-        scintillation: rms of each star's brightness between segments of its path.
+        scintillation: relative rms variation of each star's brightness between segments of its path.
     """
 
     spreads: tuple[Spread, ...] = (gaussian(1.0),)
@@ -126,7 +126,7 @@ class Sky:
 
 
 Attitudes = Callable[[FloatArray], FloatArray]
-"""Function that returns attitudes (m, 4), sky to camera, at times (m,) in exposures from mid-exposure."""
+"""Function that returns attitudes (m, 4), sky to camera, at times (m,) since mid-exposure, in exposures."""
 
 
 def light(
@@ -140,7 +140,8 @@ def light(
 ) -> FloatArray:
     """Return the expected electrons (rows, columns) of a sky.
 
-    `length` (px) bounds the length of paths. `delay` is the time between rows in exposures (rolling shutter).
+    `length` (px) bounds the length of paths. `delay` is the time between rows (rolling shutter) in units of
+    the exposure.
     """
     layers = len(optics.spreads)
     grid: Cells = np.zeros((layers, CELLS * pinhole.rows, CELLS * pinhole.columns), dtype=np.float32)
@@ -156,8 +157,8 @@ def light(
         weight = np.full(place.shape[:2], 1.0) * sky.electrons[some, None] * (2.0 * room / count)
         if delay:
             late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
-            # The first and the last point of a path count by their exposed fraction. Otherwise stars of some
-            # rows would all be displaced by part of the distance to the next point.
+            # The first and the last point of a path are weighted by their exposed fraction. Otherwise all
+            # stars of some rows would be displaced by part of the distance between points.
             weight *= np.clip((0.5 - np.abs(late)) * count / (2.0 * room) + 0.5, 0.0, 1.0)
         if optics.scintillation:
             knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)

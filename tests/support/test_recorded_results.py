@@ -1,4 +1,4 @@
-"""Tests of the comparison of results with their record, by numpy's and by compiled forms."""
+"""Tests of the comparison of results with their record, for the numpy and the compiled forms."""
 
 from __future__ import annotations
 

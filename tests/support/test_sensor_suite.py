@@ -1,4 +1,4 @@
-"""Tests that the sensors of the three satellites are placed as in the paper; wrong files are refused."""
+"""Tests that the three satellites' sensors are mounted as in the paper, and that wrong files are refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def angles(first: FloatArray, second: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("name", SUITES)
 def test_every_camera_is_the_paper_s_and_its_picture_hangs_right(name: str) -> None:
-    """The cameras have 512 x 512 px over 67 deg; rows run to nadir, unless the camera looks up."""
+    """The cameras have 512 x 512 px over 67 deg.
+
+    Row numbers increase towards nadir, unless the camera looks up.
+    """
     for camera in suite(name).cameras:
         assert (camera.columns, camera.rows, camera.field_of_view_deg) == (512, 512, 67.0)
         assert np.linalg.det(camera.to_camera) == pytest.approx(1.0)
@@ -36,7 +39,7 @@ def test_every_camera_is_the_paper_s_and_its_picture_hangs_right(name: str) -> N
 
 @pytest.mark.parametrize("name", ["vt", "uw"])
 def test_three_side_cameras_look_level_120_deg_apart(name: str) -> None:
-    """Sections 4.1 and 4.2: the cameras are on alternate sides, with gaps of 53 deg between fields."""
+    """Sections 4.1 and 4.2 of the paper: the cameras are on alternate sides, 53 deg between their fields."""
     side = boresights(name)[:3]
     np.testing.assert_allclose(angles(side, side)[np.triu_indices(3, 1)], 120.0)
     np.testing.assert_allclose(side @ DOWN, 0.0, atol=1e-9)
@@ -50,24 +53,24 @@ def test_the_fourth_camera_of_uw_looks_out_of_the_top_and_vt_has_none() -> None:
 
 
 def test_vt_uses_its_cameras_for_the_earth_alone() -> None:
-    """Section 1: VT uses its cameras for the Earth only, UW and USU for both."""
+    """Section 1 of the paper: VT uses its cameras for the Earth only, UW and USU for Earth and Sun."""
     assert not any(camera.sun for camera in suite("vt").cameras)
     assert all(camera.sun for name in ("uw", "usu") for camera in suite(name).cameras)
 
 
 def test_the_cameras_of_usu_are_tipped_like_the_satellite() -> None:
-    """Section 4.3: one camera is 55 deg from nadir, the others are 45 deg to either side of it."""
+    """Section 4.3 of the paper: one camera is 55 deg from nadir, the others 45 deg to either side of it."""
     middle, forward, aft = boresights("usu")
     assert angles(middle, DOWN) == pytest.approx(55.0)
     for other, turned in ((forward, 45.0), (aft, -45.0)):
-        # Rotation about y by that angle moves the component across the axis.
+        # A rotation about y by 45 deg moves the component of the boresight that is perpendicular to y.
         found = np.degrees(np.arctan2(other[0], other[2]) - np.arctan2(middle[0], middle[2]))
         assert found == pytest.approx(turned)
         assert other[1] == pytest.approx(middle[1])
 
 
 def written(tmp_path: Path, old: str, new: str) -> Path:
-    """Write the suite VT with one text replaced; return the file."""
+    """Write the file of the suite VT with one text replaced, and return its path."""
     text = Path("config/sensors/vt.yaml").read_text()
     assert old in text
     path = tmp_path / "suite.yaml"

@@ -1,4 +1,4 @@
-"""A body on the thread, a filter and a controller at 40 Hz, as a reduced loop for tests of controllers."""
+"""A reduced control loop for tests of controllers: body on the thread, filter and controller at 40 Hz."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def fly(
     seed: int = 1,
     noise: float = 1.0,
 ) -> FloatArray:
-    """Return rows (t, theta, omega, current) of a flight with `noise` times the noise of the testbed.
+    """Return rows (t, theta, omega, current) of a run whose noise is `noise` times that of the testbed.
 
-    The filter assumes the plant without thread. The present current is the command of the previous cycle,
-    with the uncertainty of the testbed.
+    The filter assumes the plant without thread. The filter's input is the current commanded in the previous
+    cycle, with the testbed's uncertainty.
     """
     rng = np.random.default_rng(seed)
     filter_ = SingleAxisFilter(BELIEVED, FilterSettings(2e-3, PERIOD, 5e-4))
@@ -67,7 +67,7 @@ def fly(
 
 
 def held(angle: float) -> Callable[[float], PathSample]:
-    """Return the path of a constant angle."""
+    """Return a reference path that stays at a constant angle."""
     return lambda _: PathSample(angle, 0.0, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Flights whose true body differs from the configured one, and the judgement of their coil monitor."""
+"""Flights of a body that differs from its configuration, and the findings of their coil monitor."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def configured(name: str) -> tuple[OrbitConfig, Simulation]:
 
 
 def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
-    """Return the configuration without cameras, which a tumble does not use."""
+    """Return a configuration without cameras, which a tumbling satellite does not use."""
     return configuration.replace(config, duration=duration, camera=None, wide_cameras=())
 
 
 def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -> Simulation:
-    """Return a world with other errors of its description, and optionally a fault at `at` s."""
+    """Return a world whose random errors are drawn with another seed, optionally with a fault at `at` s."""
     entries = (FaultEntry(fault=fault, at=at),) if fault else ()
     return configuration.replace(world, seed=seed, faults=entries)
 
@@ -40,7 +40,7 @@ def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -
 def with_other_body(
     world: Simulation, moments: Sequence[float], axes_deg: float, seed: int, fault: str = ""
 ) -> Simulation:
-    """Return a world whose body has other principal moments (3,), kg m^2, and axes, with any fault."""
+    """Return a world whose body has other principal moments (3,), kg m^2, and axes, and maybe a fault."""
     body = world.free_body
     assert body is not None
     craft = body.craft or CraftSection()
@@ -55,9 +55,10 @@ def with_other_body(
 
 
 def coil_judgement(flown: Run, broken: str) -> dict[str, Any]:
-    """Return the judged axes, and the times (s) at which the `broken` axis (or "") was named and corrected.
+    """Return what the monitor reported about each coil, and when (s) it reported the `broken` one.
 
-    `flown_with` is the last factor on the broken coil's dipole, 1 without a correction.
+    `broken` is the axis of the broken coil, or empty. `flown_with` is the last factor that the flight applied
+    to the broken coil's dipole, or 1 without a correction.
     """
     isolated: dict[str, float] = {}
     named: dict[str, float] = {}

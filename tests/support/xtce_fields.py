@@ -1,7 +1,7 @@
-"""Every field of every packet, read by `space-packet-parser` from our XTCE and by our own reader.
+"""Compares all packet fields as read by `space-packet-parser` with our XTCE, and by our own reader.
 
 `python -m tests.support.xtce_fields RUN...` prints the number of equal fields in the logs of the runs. The
-exit status is 1 if a field differs, a packet is not read, or a shifted field is not noticed.
+exit status is 1 if a field differs, a packet is not read, or a deliberately shifted field is not detected.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _BY_APID = {layout.packet.apid: layout for layout in LAYOUTS.values()}
 
 
 def definition_of(text: str) -> XtcePacketDefinition:
-    """Return the other client's definition of an XTCE document."""
+    """Return the packet definition that `space-packet-parser` reads from an XTCE document."""
     return XtcePacketDefinition.from_xtce(io.BytesIO(text.encode()))
 
 
 def compare(data: bytes, text: str) -> dict[str, int]:
-    """Return the numbers of compared packets and fields of `data`, and of different and unread ones.
+    """Return the numbers of packets, unread packets, compared fields and different fields of `data`.
 
     Sequence count, mission time and version of each packet are compared too.
     """
@@ -57,7 +57,7 @@ def compare(data: bytes, text: str) -> dict[str, int]:
 
 
 def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
-    """Return the values of a packet in our reader by their XTCE names."""
+    """Return the values that our reader finds in a packet, by their XTCE names."""
     sequence = int(layout.sequence_counts(raw)[0])
     values: dict[str, Any] = {
         "time_ns": int(row["time_ns"]),
@@ -72,14 +72,14 @@ def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
 
 
 def single_bits(field: Field, value: int) -> list[int]:
-    """Return the number in the unused bits of a bit field, if any, and its named bits from the highest."""
+    """Return the value of a bit field's unused bits, if any, and then its named bits from the highest."""
     used, size = len(field.bits), 8 * int(field.kind[1:])
     spare = [value >> used] if size > used else []
     return spare + [value >> bit & 1 for bit in reversed(range(used))]
 
 
 def _alike(read: Any, wanted: Any) -> bool:
-    """Return whether the other client's value is ours; named or scaled fields are compared as raw values."""
+    """Return whether both readers found the same value; named or scaled fields are compared as raw values."""
     if read is None:
         return False
     value = read if isinstance(wanted, str) else read.raw_value
@@ -89,7 +89,7 @@ def _alike(read: Any, wanted: Any) -> bool:
 
 
 def shifted(text: str) -> str:
-    """Return an XTCE document whose `imu` has its second field a byte too late and a CRC of one byte."""
+    """Return an XTCE document whose `imu` has a second field a byte too late, and a CRC of one byte."""
     entry = '<ParameterRefEntry parameterRef="{}" />'
     before, after = text.split(entry.format("imu_device_time_ns"))
     pads = [

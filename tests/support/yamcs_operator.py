@@ -1,4 +1,4 @@
-"""An operator who works through Yamcs's own client (`yamcs-client`)."""
+"""Actions of an operator who uses Yamcs's own Python client (`yamcs-client`)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Operator:
         _until(lambda: value() == wanted)
 
     def archived(self, packet: str, number: int) -> int:
-        """Wait for a number of packets of one kind, and return how many the archive has at the end."""
+        """Wait for `number` packets of one kind until a timeout, and return how many the archive has."""
         archive, counts = self._client.get_archive(INSTANCE), [0]
 
         def complete() -> bool:
@@ -65,7 +65,7 @@ class Operator:
         return status()
 
     def raised_and_acknowledged(self, parameter: str) -> tuple[str, bool, str | None]:
-        """Wait for the alarm of a parameter, acknowledge it, return severity, state and message."""
+        """Wait for a parameter's alarm, and acknowledge it; return its severity, state and message."""
         name = f"/{SPACE}/{parameter}"
 
         def alarms() -> list[Alarm]:
@@ -83,7 +83,7 @@ class Operator:
         return [entry.name.rpartition("/")[2] for entry in history]
 
     def downloaded(self, name: str) -> bytes:
-        """Command a file of the satellite down and return its content."""
+        """Command the download of a file from the satellite, and return its content."""
         arguments = {"entity": "another-ground-station", "name": name}
         transfers = self._files.create_transfer_subscription()
         self._processor.issue_command(f"/{SPACE}/send-file", args=arguments)
@@ -95,7 +95,7 @@ class Operator:
         return bytes(stored.download())
 
     def upload(self, content: bytes, remote: str) -> None:
-        """Send a file up and wait for the end of the transfer."""
+        """Upload a file to the satellite, and wait for the end of the transfer."""
         bucket = self._client.get_storage_client().get_bucket(UP_BUCKET)
         bucket.upload_object("file", content)
         way = {"source_entity": "ground", "destination_entity": "satellite", "options": {"reliable": True}}

@@ -34,7 +34,10 @@ def troubles(log: str) -> list[str]:
 
 @contextmanager
 def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
-    """Start Yamcs with a configuration, yield it when it answers, and end it. Its log is `folder/log`."""
+    """Start Yamcs with a configuration, yield it when it responds, and end it after the block.
+
+    Its log is `folder/log`.
+    """
     log = folder / "log"
     compile_link(folder)
     with log.open("w") as out:
@@ -48,12 +51,12 @@ def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
 
 
 def basic(password: str) -> str:
-    """Return the HTTP header with the user's password."""
+    """Return the HTTP authorisation header with the user's password."""
     return "Basic " + base64.b64encode(f"{USER}:{password}".encode()).decode()
 
 
 def credentials(folder: Path) -> str:
-    """Return the header with the password in the configuration of a folder."""
+    """Return the HTTP authorisation header with the password in a folder's configuration."""
     found = re.search(r'password: "(\w+)"', (folder / USERS).read_text(encoding="utf-8"))
     assert found is not None
     return basic(found[1])
@@ -81,11 +84,11 @@ class Yamcs:
         raise RuntimeError(f"Yamcs does not answer:\n{self.log.read_text()[-2000:]}")
 
     def ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        """Return the answer to GET, or to POST of a body."""
+        """Return the response to a GET request, or to a POST request with `body`."""
         return json.loads(self.raw(path, body))
 
     def raw(self, path: str, body: dict[str, Any] | None = None) -> bytes:
-        """Return the bytes of an answer."""
+        """Return a response as bytes."""
         data = None if body is None else json.dumps(body).encode()
         headers = {"Content-Type": "application/json", "Authorization": self.credentials}
         request = urllib.request.Request(self.url + path, data, headers)
@@ -94,7 +97,7 @@ class Yamcs:
             return bytes(answer.read())
 
     def link_up(self) -> bool:
-        """Return whether its data link is connected."""
+        """Return whether the instance's data link is connected."""
         return bool(self.ask(f"/links/{INSTANCE}/gateway")["status"] == "OK")
 
     def command(self, name: str, arguments: dict[str, Any]) -> str:
@@ -104,7 +107,7 @@ class Yamcs:
         return str(self.ask(path, {"args": texts})["id"])
 
     def history(self, command: str) -> dict[str, Any]:
-        """Return the command history of a command by attribute."""
+        """Return a command's entries in the command history, by attribute."""
         entry = self.ask(f"/archive/{INSTANCE}/commands/{quote(command)}")
         found = {}
         for attribute in entry.get("attr", entry.get("attributes", [])):

@@ -1,7 +1,7 @@
 """`python -m tests.studies.bench NAME [arguments]`: runs a benchmark; without a name, lists all of them.
 
 A benchmark is a module of this package with a function `main`. The list is read from the docstrings. Only the
-requested benchmark is imported, so the extras of other benchmarks may be missing.
+requested benchmark is imported, so optional packages of other benchmarks may be missing.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    """Run `main` of a benchmark, with its arguments as a list if it takes them."""
+    """Run a benchmark's `main`, and pass the argument list if it accepts one."""
     bench = importlib.import_module(f"tests.studies.bench.{name}").main
     with _command_line(f"python -m tests.studies.bench {name}", arguments):
         status = bench(arguments) if inspect.signature(bench).parameters else bench()
@@ -62,7 +62,7 @@ def _run(name: str, arguments: list[str]) -> int:
 
 @contextmanager
 def _command_line(program: str, arguments: list[str]) -> Iterator[None]:
-    """Set the process's command line, for functions `main` that read it and for their help texts."""
+    """Set the process's command line, which some `main` functions read and which their help texts show."""
     before = sys.argv
     sys.argv = [program, *arguments]
     try:

@@ -1,11 +1,11 @@
-"""A bare sleep loop in a separate process beside the flight process: it measures stalls of the machine.
+"""A bare sleep loop that runs in a separate process beside a flight, and measures stalls of the machine.
 
 The loop calls clock_nanosleep with TIMER_ABSTIME for the next slot, as a minimal C program does. It records
-the time of each wake-up, and the processor time that the host has given to other virtual machines until then.
-Its slots are multiples of the period in CLOCK_MONOTONIC, like those of a real-time flight. Command: `python
--m tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`. A priority above zero selects SCHED_FIFO. At
-SIGTERM the program writes its records to the file: rows of two int64, the monotonic time (ns) and the stolen
-time since boot (ns).
+each wake-up's time, and the processor time that the host has given to other virtual machines since boot. Its
+slots are multiples of the period in CLOCK_MONOTONIC, like those of a real-time flight. Command: `python -m
+tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`. A priority above zero selects SCHED_FIFO. At SIGTERM
+the program writes its records to the file: rows of two int64, the monotonic time (ns) and the stolen time
+since boot (ns).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class _Timespec(ctypes.Structure):
 
 
 def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
-    """Wake at every slot until `stopped` is not empty, and record the wake-up times and the stolen time.
+    """Wake at every slot, and record wake-up times and stolen time, until `stopped` has an element.
 
     Missed slots are skipped.
     """

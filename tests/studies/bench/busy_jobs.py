@@ -2,8 +2,8 @@
 
 `python -m tests.studies.bench executive --busy` uses them, because a satellite plans at most every 10 s, and
 because emulating a camera frame takes longer than processing it. The flight's own jobs are repeated, and the
-results of the repetitions are discarded. A new job waits for the end of the running repetition. Imports are
-made late, because the functions run in the workers.
+results of the repetitions are discarded. A new job waits for the end of the running repetition. Modules are
+imported inside the functions, because the functions run in the workers.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Again:
         return result
 
     def rest(self) -> None:
-        """Stop the repetition until the next job."""
+        """Stop repeating the last job until the next job arrives."""
         self._goes.clear()
 
     def _repeat(self, run: Callable[[Any], Any]) -> None:
@@ -58,7 +58,7 @@ class Again:
 
 
 def _one_heap() -> None:
-    """Let all threads of this process use one heap, like a worker, which has one thread."""
+    """Make all threads of this process use one heap, as in a worker, which has one thread."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_ARENA_MAX, 1)
@@ -93,11 +93,11 @@ BUSY: dict[str, Callable[[Any], Any]] = {
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,
 }
-"""Repeated functions by the module of their job."""
+"""Functions that are repeated, by the module of the job that they replace."""
 
 
 def keep_busy() -> None:
-    """Let the flight of this process keep its workers busy."""
+    """Make the flight in this process use workers that are never idle."""
     from flight.app import flight as opening  # noqa: PLC0415
     from flight.app.flight import workers as made  # noqa: PLC0415
 

@@ -1,9 +1,9 @@
 """The command socket under a flood: `python -m tests.studies.bench command_flood [--seconds S]`.
 
 The step demonstration runs in real time with a UDP command port, in three cases: without a flood, with 20,000
-datagrams a second that are not commands, and with 20,000 a second that begin like commands. A peer sends
-twenty pings, each once. The benchmark prints the lateness of the control cycles and the number of answered
-pings.
+datagrams a second that are not commands, and with 20,000 a second that begin like commands. An authorised
+sender sends twenty pings, each once. The benchmark prints the lateness of the control cycles and the number
+of answered pings.
 """
 
 from __future__ import annotations

@@ -4,12 +4,13 @@ The step demonstration flies in real time on emulated devices in separate proces
 without pause, and the guardian watches. With `--orbit` the satellite of `config/orbit.yaml` flies instead. It
 points to nadir from the start, its planner has the shortest period that the configuration allows (10 s), and
 its horizon cameras run at their flight rate. With `--busy` each worker repeats its last job until the next
-one comes, so no worker is ever idle.
+job arrives, so no worker is ever idle.
 
 A bare sleep loop at the same rate (`tests.studies.bench.bare_loop`) runs beside the flight and measures
-stalls of the machine. The kernel measures the time that a virtual machine's host takes. A working loop meets
-such stalls more often than a sleeping loop. If SCHED_FIFO is permitted, the flight runs twice, with and
-without it. Run the benchmark alone on two cores. The slope of memory needs flights of 16 minutes or longer.
+stalls of the machine. The kernel measures the time that a virtual machine's host takes. A loop with work to
+do is affected by such stalls more often than a loop that only sleeps. If SCHED_FIFO is permitted, the flight
+runs twice, with and without it. Run the benchmark alone on two cores. The slope of memory needs flights of 16
+minutes or longer.
 """
 
 from __future__ import annotations
@@ -56,11 +57,13 @@ PRIORITY = 50
 
 ORBIT = ROOT / "config" / "orbit.yaml"
 SHARED_LOOKS = 9
-"""Interval at which the shared memory of the flight is sampled."""
+"""Number of samples of the memory that the flight shares with other processes."""
 SHORTEST_REPLAN = 10.0
-"""Interval (s) of pointing plans: the shortest that the schema permits."""
+"""Shortest interval (s) between pointing plans that the schema permits."""
 AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
-"""Release state: along the flight direction with the star camera at the sky, so that all tasks work at once.
+"""Release state along the flight direction, with the star camera pointing to the sky.
+
+All tasks can work at once.
 """
 
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
@@ -85,12 +88,12 @@ _ROLES = {
     "tests.studies.bench.busy_jobs:see ": "vision",
     "tests.studies.bench.busy_jobs:see_wide": "wide",
 }
-"""Function of a process, by a text in its command line."""
+"""Role of a process, by a text that its command line contains."""
 
 
 @dataclass(frozen=True)
 class Load:
-    """Duration, intervals of frames and plans, and warm-up time (s), with the configuration."""
+    """Configuration of a flight, with its duration, frame interval, plan interval and warm-up time (s)."""
 
     duration: float
     camera_period: float = 0.4
@@ -102,7 +105,7 @@ class Load:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run, and print required and measured figures. Returns 1 if a requirement is not met."""
+    """Run the benchmark, and print required and measured values. Returns 1 if a requirement is not met."""
     load, options = _load(arguments)
     flights: dict[str, Figures] = {}
     grids: dict[str, Grid] = {}
@@ -122,7 +125,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
-    """Return the load and all options."""
+    """Return the load and all options of a command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -160,7 +163,7 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
 
 
 def _schedulings(wanted: str) -> list[str]:
-    """Return the schedulings to run: the ordinary one, and SCHED_FIFO if it is permitted."""
+    """Return the scheduling policies to run: the ordinary one, and SCHED_FIFO if it is permitted."""
     if wanted == "ordinary" or fifo_allowed():
         return ["fifo", "ordinary"] if wanted == "both" else [wanted]
     sys.stderr.write("SCHED_FIFO is refused here: flown without it\n")
@@ -168,7 +171,7 @@ def _schedulings(wanted: str) -> list[str]:
 
 
 def _write(folder: Path, load: Load, flights: dict[str, Figures], grids: dict[str, Grid]) -> None:
-    """Write the figures, and the picture if matplotlib is installed."""
+    """Write the measured values, and the histogram if matplotlib is installed."""
     folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"load": asdict(load), "asked": ASKED, "flights": flights}, indent=2)
     (folder / "executive.json").write_text(text + "\n", encoding="utf-8")
@@ -225,7 +228,7 @@ def _compiled() -> Iterator[None]:
 
 
 def fly(folder: Path, load: Load, fifo: bool) -> Flown:
-    """Run once in `folder` beside the bare loop; return the measured figures."""
+    """Run the flight once in `folder` beside the bare loop, and return the measured values."""
     config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
     facts = devices / "facts.json"
     config.write_text(full_load(load), encoding="utf-8")
@@ -255,7 +258,7 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
 
 
 def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watched:
-    """Watch the flight until it ends, with the service manager's end of the notification socket."""
+    """Sample the flight until it ends, and read its service notifications."""
     shared: list[float] = []
     due = time.monotonic() + 0.5 * (load.duration + load.warm_up)
     with closing(ProcessWatch(lambda: members(flight), load.look_period)) as watch:
@@ -268,12 +271,12 @@ def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watc
                     present = members(flight)
                     held = sum(process_watch.look(present).memory.values())
                     shared.append(process_watch.unshared(present) - held)
-    # A single sample would count a job that begins or ends during it as shared memory.
+    # The median is used, because a job that begins or ends during a sample would count as shared memory.
     return Watched(watch.looks, max(0.0, median(shared)) if shared else 0.0)
 
 
 def members(flight: LiveFlight) -> dict[str, int]:
-    """Return the processes of the flight by their function."""
+    """Return the processes of the flight by their role."""
     found = {"control": flight.process.pid}
     for process in process_watch.below(flight.process.pid):
         words = process_watch.command(process)

@@ -1,8 +1,9 @@
 """File transfer with killed processes: `python -m tests.studies.bench file_kills [--kills N] [--seed S]`.
 
 The link process and the ground's `flight files` run as separate processes on loopback. In each of N
-transfers, alternately down and up, each process gets one SIGKILL at a random time and is restarted. The
-benchmark counts the transfers whose file arrived complete (SHA-256) and which are closed at both ends.
+transfers, alternately downlink and uplink, each process receives one SIGKILL at a random time and is
+restarted. The benchmark counts the transfers whose file arrived complete (SHA-256) and which are closed at
+both ends.
 """
 
 from __future__ import annotations

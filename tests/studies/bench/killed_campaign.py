@@ -1,8 +1,8 @@
-"""Killed and resumed campaign of a user: `python -m tests.studies.bench killed_campaign [--dask]`.
+"""A user's campaign, killed and resumed: `python -m tests.studies.bench killed_campaign [--dask]`.
 
 The command `knightcube campaign` runs with the same draws undisturbed, and then killed at random times (one
 SIGINT, otherwise SIGKILL) and restarted each time. With `--dask` it also runs on a cluster of two workers,
-one of which is killed. The benchmark compares the printed figures and the result of each flight. It counts
+one of which is killed. The benchmark compares the printed summaries and the result of each flight. It counts
 the flights that were flown twice, the processes that outlive a campaign, and the remaining temporary files.
 """
 
@@ -107,8 +107,8 @@ class UserCampaign:
     def interrupt(self, number: signal.Signals, results: int, delay: float) -> tuple[bool, int]:
         """Start the command, and send a signal `delay` seconds after it has written a number of results.
 
-        Returns whether the signal came before the end of the command, and the number of processes that
-        outlived the command by more than a minute.
+        Returns whether the signal arrived before the command ended, and the number of processes that outlived
+        the command by more than a minute.
         """
         with self.start() as process:
             while process.poll() is None and len(self.lines()) < results:

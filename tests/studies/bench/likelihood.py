@@ -1,12 +1,13 @@
 """Likelihood fit relative to the Cramer-Rao bound, and its time: `python -m tests.studies.bench.likelihood`.
 
 The frames show random fields of the real sky through the simulator's default camera (1024 x 1024, 20 deg). A
-ratio is the rms error divided by the bound of the 20 brightest stars, each taken alone in the sky. The table
-has the ratios of the whole rate vector, of the rate's magnitude, and of the mid-exposure positions of the
-eight brightest stars. The NEES is 1 if the covariance is correct. The seeds are used by no other study.
+ratio is the rms error divided by the bound of the 20 brightest stars, each computed as if it were alone in
+the sky. The table has the ratios of the whole rate vector, of the rate's magnitude, and of the mid-exposure
+positions of the eight brightest stars. The NEES is 1 if the covariance is correct. No other study uses these
+seeds.
 
 With `--known-sky` the stars are identified after the first fit, without prior attitude. The streaks are then
-fitted again with all stars of the catalogue, as in flight; figures and times are those of the second fit.
+fitted again with all stars of the catalogue, as in flight; the results and times are those of the second fit.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def rate_row(
 
 
 def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[float]:
-    """Return the squared position errors of the brightest stars relative to the bound; 1 is expected.
+    """Return squared position errors of the brightest stars / bound, whose expectation is 1.
 
     Streaks with both ends outside the image are omitted, because their position along the streak is
     undetermined.

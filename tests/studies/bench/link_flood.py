@@ -2,8 +2,8 @@
 
 The step demonstration flies in real time on its emulated devices beside its link process. It flies first
 without a flood. In the second flight the link receives 10,000 forged frames a second while it plays back the
-archive and sends a file of 50 MB, together at a megabyte a second. The benchmark prints the lateness of the
-control cycles, the counts of link and ground, and the received part of the file.
+archive and sends a file of 50 MB, at a total of a megabyte per second. The benchmark prints the lateness of
+the control cycles, the counts of link and ground, and the received part of the file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _UP_RATE = 20_000.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly both flights and print the figures."""
+    """Run both flights, and print the measured values."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default 60)"

@@ -1,9 +1,9 @@
-"""Links killed between accepting, storing and forwarding commands: python -m tests.studies.bench link_kills.
+"""Link killed between accepting, storing and forwarding commands: `python -m tests.studies.bench link_kills`.
 
 Each time a link process receives the commands of a ground station while an attacker replays every old frame.
 The link process is killed (SIGKILL) before or after one of its calls that write to the disk or to the socket
 of the flight. Some of the writes are cut in the middle first. The ground's sender is killed in the same way.
-The benchmark counts commands that the flight received twice, and counters that two frames share.
+The benchmark counts commands that the flight received twice, and frame counters that were used twice.
 
 With `--scheduled` the commands are in the link's schedule and fall due while the link process is killed. A
 second process, which is not killed, continues. The benchmark counts commands that the flight received twice,
@@ -56,8 +56,8 @@ class Findings:
     Attributes:
         kills: processes that were killed.
         scheduled: commands that were put into the schedule.
-        schedules_lost: schedules of which no copy was good.
-        counters_twice: counters, of either direction, under which two different frames were seen.
+        schedules_lost: schedules of which no intact copy remained.
+        counters_twice: counter values, in either direction, with which two different frames were sent.
         seen: frames by SPI and IV.
         obeyed: how often the flight received each command, by the number of its ping.
     """
@@ -96,7 +96,7 @@ class Findings:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Kill the processes and print the counts.
 
-    Returns 0 if no command came twice and each kill cost one command at most.
+    Returns 0 if the flight received no command twice and each kill cost at most one command.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=1000, metavar="N", help="of the link (default 1000)")
@@ -163,7 +163,7 @@ def measure_scheduled(place: Path, kills: int, seed: int) -> Findings:
 
 
 class Way:
-    """Calls of a process that is killed at one of them."""
+    """Replacement of the writing calls of a process, which is killed at one of these calls."""
 
     def __init__(self, point: int, torn: bool, writer: socket.socket) -> None:
         self._left = point
@@ -186,7 +186,7 @@ class Way:
         socket.socket.sendto = sendto  # type: ignore[method-assign, assignment]  # of this process alone
 
     def ends(self) -> bool:
-        """Return whether this call is the last one."""
+        """Return whether the process is killed at this call."""
         self._left -= 1
         return self._left < 0
 
@@ -270,7 +270,7 @@ def _send(place: Path, number: int, way: Way) -> None:
 
 
 def _serve(place: Path, frames: list[bytes] | None, turns: int, way: Way) -> None:
-    """Serve as the link for a number of turns, with the received `frames`; None if the link has no line."""
+    """Run the link process for a number of rounds, in which it receives `frames`."""
     control: ControlLine[Sent] = ControlLine(place / "commands", place)
     clock = ManualClock()
     settings = StationSettings(SETTINGS.spacecraft, SETTINGS.frame_bytes, _RATE)

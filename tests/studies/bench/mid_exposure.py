@@ -2,8 +2,8 @@
 
 Command: `python -m tests.studies bench mid_exposure`.
 
-Row `flight` is the star tracker's answer to the first fit with a rough prior of the pointing. Row `known sky`
-is its answer after the second fit, in which the light of unseen stars is subtracted
+Row `flight` is the star tracker's result for the first fit, with a rough prior of the pointing. Row `known
+sky` is its result for the second fit, in which the light of undetected stars is subtracted
 (`knightcube.vision.startracker.catalogue_refit`). The rates of both fits are compared with their bound too.
 
 The bound is the Fisher information of all pixels of the brightest stars, as in `tests.support.streak_bound`.
@@ -37,11 +37,13 @@ from tests.support.scenes import FIELD, Scene, noise_floor, slew
 from tests.support.streak_bound import star_information
 
 _STARS = 30
-# Common parameters: rotation (3) and point spread, followed by attitude (3) or a star's x and y.
+# Number of parameters common to all stars: rotation (3) and point spread. Attitude (3) or a star's x and y
+# follow.
 _SHARED = 4
 EXPOSURE = 0.2
 SOLUTIONS = ("flight", "known sky")
-# Error (rad) of the tracker's prior about each axis, and its claimed standard deviation.
+# Error (rad) about each axis of the prior attitude that the tracker receives, and its standard deviation
+# (rad).
 _PRIOR_ERROR, _PRIOR_SIGMA = np.array([2e-4, -1e-4, 1e-4]), 3e-4
 # Median distance of a point whose two coordinates have an rms of 1 each, divided by the rms distance.
 _RAYLEIGH_MEDIAN = float(np.sqrt(np.log(2.0)))
@@ -77,7 +79,7 @@ def scenes(
 
 
 def _by_attitude(vectors: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return d(pixel)/d(small rotation of the camera) (n, 2, 3) of directions (n, 3); v moves by v x psi."""
+    """Return the derivatives (n, 2, 3) of the pixels of directions (n, 3) by a small camera rotation."""
     x, y, z = vectors.T
     projected = np.zeros((len(vectors), 2, 3))
     projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / z
@@ -135,7 +137,7 @@ def tracked(
 def attitude_rows(
     percent: float, frames: int, seed: int, faintest: float, exposure: float
 ) -> list[dict[str, Any]]:
-    """Return the errors across the boresight at mid-exposure of each solution, in px and over the bound."""
+    """Return each solution's errors across the boresight at mid-exposure, in px and relative to the bound."""
     camera = StarCameraModel(field_of_view=FIELD)
     figures: list[list[tuple[float, float, float]]] = []
     bounds: list[float] = []

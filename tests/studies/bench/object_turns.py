@@ -1,4 +1,4 @@
-"""Objects among long streaks, and the time of the search: `python -m tests.studies.bench.object_turns`.
+"""Detection of objects among long streaks, and its time: `python -m tests.studies.bench.object_turns`.
 
 The camera of the simulator rotates by 10 to 30 % of its field within 0.5 s about a random axis. A frame has
 no object, or one of the given magnitude that moves by 9 to 87 px relative to the stars, as in the campaign
@@ -38,12 +38,12 @@ _SEED = 27_182
 
 @dataclass(frozen=True, slots=True)
 class Looked:
-    """Result of the search of one frame.
+    """Result of the object search in one frame.
 
     Attributes:
         error: error (px) of the true object's ends, or None if the object is not found.
         claims: squared errors (2,) of the two ends in claimed standard deviations, or None.
-        others: number of false detections.
+        others: number of false detections in the frame.
         spent: processor time, ms.
     """
 
@@ -123,7 +123,7 @@ def main() -> None:
     camera, out = StarCameraModel(field_of_view=FIELD), sys.stdout
     out.write(f"{options.frames} frames a row, seed {options.seed}\n")
     out.write("  %    V   rates  found  others  error px  (error/claim)^2  CPU ms: median  95 %     max\n")
-    # The first search of a process also loads compiled code.
+    # One search runs untimed, because the first search of a process also loads compiled code.
     pixels, rate, _ = frame(camera, (options.seed,), options.percent[0], None)
     looked(camera, pixels, rate, None)
     for percent in options.percent:

@@ -31,7 +31,7 @@ import runpy, time
 time.perf_counter_ns = time.thread_time_ns
 runpy.run_module("flight", run_name="__main__", alter_sys=True)
 """
-"""Program that runs the flight application with processor times instead of elapsed times in its log."""
+"""Source of a program that runs the flight application and logs processor times instead of elapsed times."""
 MODES = (Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT, Mode.TESTBED_DEMO)
 
 

@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _recorded(planner: Planner) -> int:
-    """Compare with the recorded optima; return the exit status."""
+    """Plan the recorded slews, and compare them with their optima; return the exit status."""
     if not FILE.exists():
         sys.stdout.write(f"no optima of slews at {FILE.name}\n")
         return 1
@@ -121,7 +121,7 @@ def _random(runs: int, seed: int, with_cones: bool, planner: Planner) -> int:
 
 
 def _jobs(runs: int, seed: int) -> int:
-    """Run the planner's job of random slews; return the exit status."""
+    """Run the flight's planning job for random slews; return the exit status."""
     rng = np.random.default_rng([seed, 1])
     whole, plans = list[float](), list[float]()
     planner, planned = slew, 0
@@ -149,7 +149,7 @@ def _jobs(runs: int, seed: int) -> int:
 
 
 def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
-    """Return the job of a task with torques of `draw` (9,) times the filter's prior standard deviations."""
+    """Return a task's planning job, with torques of `draw` (9,) times the filter's prior sigmas."""
     craft = {"1U": "knightcube", "3U": "cubesat_3u"}[name[:2]]
     place = task.along(np.array([0.0, 1.0])).position
     end = task.end(task.horizon)

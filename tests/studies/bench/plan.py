@@ -1,10 +1,10 @@
 """Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N]`.
 
 The slews are random over the testbed's range, with thread stiffness, disturbance and moving end points
-(tests.support.step_problems). The horizons of the first set are 1.1 to 2.5 times the shortest feasible one.
-Those of the second set are too short, and the planner stretches them. Solve times are processor times of this
-process. The cost is compared with that of the collocation oracle at the same horizon. Limits are checked at
-4001 points of the path.
+(tests.support.step_problems). The durations of the first set are 1.1 to 2.5 times the shortest feasible one.
+The durations of the second set are too short, and the planner extends them. Solve times are processor times
+of this process. The cost is compared with the collocation oracle's cost for the same duration. Limits are
+checked at 4001 points of the path.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOO_SHORT = (0.6, 0.99)
 
 
 def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
-    """Return the figures of slews, each given with its shortest feasible horizon (s)."""
+    """Return statistics of planned slews, each given with its shortest feasible duration (s)."""
     spans, costs, passed, beyond, failed, unsolved = [], [], [], [], 0, 0
     stretched = 0
     for problem, shortest in problems:
@@ -63,7 +63,7 @@ def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
 
 
 def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
-    """Return evaluations of the second plan of a slew, a third on its way, from scratch and from the last."""
+    """Return the evaluations of a second plan after a third of a slew, with and without the first plan."""
     cold, warm = [], []
     for problem, _ in problems:
         first = problem.planned()

@@ -1,10 +1,10 @@
-"""Real releases renewed over the link: `python -m tests.studies.bench releases`.
+"""Updates of real releases over the link: `python -m tests.studies.bench releases`.
 
 The releases are built from the sources of this repository with pip, virtual environments and the packages of
 this Python environment. Only systemd and the radio are replaced by test doubles. `deploy/install.sh` installs
 the first release into a folder. The second release has a higher version. The ground signs its bundle, sends
 it by CFDP and activates it. The privileged program builds the release and is killed once during the build.
-The release is tested, flown and confirmed. Then the ground withdraws it, and the first release flies again. A
+The release is tested, flown and confirmed. Then the ground revokes it, and the first release flies again. A
 third release passes its self-test, but its flight with the board's configuration ends at once, so the
 previous release flies again.
 """
@@ -45,7 +45,7 @@ import sys
 if "run" in sys.argv and any(word.endswith("board.yaml") for word in sys.argv):
     raise SystemExit("this release cannot fly")
 """
-"""Statements that end a flight of the board's configuration, and no other command."""
+"""Statements that end a flight with the board's configuration at once, and leave other commands working."""
 
 
 class RealBoard(FakeBoard):
@@ -64,7 +64,8 @@ class RealBoard(FakeBoard):
         build = [*program, "build", "--python", python, "--reuse", "packages"]
         done = subprocess.run(build, capture_output=True, text=True, check=True)
         subprocess.run([*program, "switch", done.stdout.split()[-1]], check=True)
-        return super().install(label)  # finds the release of these sources, and installs all other files
+        # The installer finds this release in its folder, and installs all other files.
+        return super().install(label)
 
     @staticmethod
     def _copy_packages(release: Path) -> None:
@@ -105,7 +106,7 @@ class RealBoard(FakeBoard):
 
 
 class RealReleases(RenewedBoard):
-    """A board with real releases, and the ground that signs for it."""
+    """A board with real releases, and the ground station that signs them."""
 
     def __init__(self, place: Path) -> None:
         super().__init__(place)
@@ -127,7 +128,7 @@ class RealReleases(RenewedBoard):
 
 
 class Rehearsal:
-    """The steps of the benchmark, each with the version in use after it and its duration."""
+    """The benchmark's steps; for each, the version in use afterwards and the duration are recorded."""
 
     def __init__(self, place: Path) -> None:
         self._begun = time.monotonic()

@@ -1,14 +1,14 @@
-"""The star tracker on real photographs, points and streaks: `python -m tests.studies.bench sky`.
+"""The star tracker on photographs and on simulated frames: `python -m tests.studies.bench sky`.
 
-The photographs are those of a folder with a `truth.json`, which gives right ascension and declination of the
+The photographs are in a folder with a file `truth.json`, which gives right ascension and declination of the
 image's centre and the horizontal field of view in degrees. Each photograph is solved with the field known to
 5 %, and also with an unknown field if it is 10 to 30 deg wide. The simulated frames have the simulator's
 camera with a field of 12 deg known to 0.1 deg and an exposure of 0.1 s. The axis of rotation is 30 to 90 deg
 off the boresight, or perpendicular to it. `over bound` is the rms error across the boresight divided by the
 Cramer-Rao bound of the star positions; `bound` is the same ratio of the rate's magnitude. Identified stars
 lower the bound of the rate by at most 2 %, because the rate follows from the lengths of streaks. Times are
-processor times of one core. Peers extract the stars themselves, with their default filters and without
-filters.
+processor times of one core. The other star identification programs extract the stars themselves, with their
+default filters and without filters.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def scene_of(length: float, theta_deg: tuple[float, float], frame: int) -> SkyFr
 
 
 def row_of(length: float, theta_deg: tuple[float, float], frames: int) -> dict[str, Any]:
-    """Return the figures of `frames` random frames with streaks that are `length` px long."""
+    """Return the statistics of `frames` random frames with streaks that are `length` px long."""
     each = [solved(scene_of(length, theta_deg, frame), length) for frame in range(frames)]
     columns = {name: np.array([getattr(one, name) for one in each]) for name in asdict(each[0])}
     told = ~np.isnan(columns["across"])
@@ -108,7 +108,7 @@ def _or_nan(figure: Any, values: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Case:
-    """A frame for the peers, with its configuration, true direction (3,) and job in their format."""
+    """A frame for the other programs, with its configuration, true direction (3,) and job in their format."""
 
     configuration: str
     boresight: FloatArray
@@ -146,7 +146,7 @@ def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
 
 
 def peer_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the figures of every peer by configuration."""
+    """Return the statistics of every other program by configuration."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         cases = peer_cases(options, Path(folder))

@@ -1,8 +1,8 @@
 """Rates from streaks during a slew: `python -m tests.studies.bench slew_frames [--as-they-come]`.
 
 The 3U of `config/orbit_3u.yaml` is released near rest, holds its attitude and slews by 100 deg in 300 s or
-more. The whole loop runs, with a frame every 5 s. Exposures avoid the steps of the coils, or begin at the
-scheduled times of the camera. Each rate is compared with the mean true rate over the exposure.
+more. The whole loop runs, with a frame every 5 s. Exposures avoid the coils' steps; with `--as-they-come`,
+they begin at the camera's scheduled times. Each rate is compared with the mean true rate over the exposure.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
 """Flight on a board of the 800 MHz class: `python -m tests.studies.bench slow_board [--orbit] [--share S]`.
 
-The flight runs in real time on emulated devices, with vision and planner, in a fraction of one core and 512
-MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz. It follows from benchmarks
-(heap sort and Linpack's elimination) that are measured here and compared with the published figures of that
-processor (`tests.support.processor_share`). The inertial unit sends 200 readings a second (`--imu-rate`). The
-limit does not apply to the emulated devices. `--camera-period` and `--replan-period` can request more work
-than the board can do, so that work is shed. The benchmark needs root, and a cgroup hierarchy with the
-controllers `cpu` and `memory`. `user_mode_linux.sh` runs the bench with cgroup v2 on a machine with cgroup
-v1.
+The flight runs in real time on emulated devices, with image processing and planner. It is limited to a
+fraction of one core and 512 MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz.
+It follows from benchmarks (heap sort and Linpack's elimination) that are measured here and compared with the
+published figures of that processor (`tests.support.processor_share`). The inertial unit sends 200 readings a
+second (`--imu-rate`). The limit does not apply to the emulated devices. `--camera-period` and
+`--replan-period` can request more work than the board can do, so that the flight sheds work. The benchmark
+needs root, and a cgroup hierarchy with the controllers `cpu` and `memory`. `user_mode_linux.sh` runs the
+bench with cgroup v2 on a machine with cgroup v1.
 """
 
 from __future__ import annotations

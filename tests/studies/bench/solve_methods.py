@@ -1,10 +1,10 @@
-"""Solvers and centroids on the same frames: `python -m tests.studies.bench solve_methods`.
+"""Attitude solvers and centroid methods on the same frames: `python -m tests.studies.bench solve_methods`.
 
-The frames show real stars to V 8.5 at rest (1024 x 1024, 12 deg, 0.2 s). Each centroid identifies the stars
-once. Each attitude solver of `flight solve --attitude` and Delabie's image matching (AIM) then use the same
-positions. The lens is known. The table has the errors across and about the boresight (arcsec rms per axis),
-the NEES of three axes divided by three (1 if the covariance is correct), and the processor times (ms) of
-finding and measuring the stars, and of identification, image fit and solver.
+The frames show real stars to V 8.5 at rest (1024 x 1024, 12 deg, 0.2 s). With each centroid method the stars
+are identified once. Each attitude solver of `flight solve --attitude` and Delabie's image matching (AIM) then
+use the same positions. The lens is known. The table has the errors across and about the boresight (arcsec rms
+per axis), the NEES of three axes divided by three (1 if the covariance is correct), and the processor times
+(ms) of finding and measuring the stars, and of identification, image fit and solver.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _ARCSECONDS = float(np.degrees(3600.0))
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Figures of one solver with one centroid."""
+    """Results of one attitude solver with one centroid method."""
 
     centroid: str
     attitude: str
@@ -54,7 +54,7 @@ class Row:
 
 
 def compare(frames: int, seed: int) -> list[Row]:
-    """Return a row for each centroid and solver, over the same frames."""
+    """Return a row for each centroid method and solver, over the same frames."""
     camera, sky = StarCameraModel(field_of_view=_FIELD), default_index().at(YEAR)
     turns: dict[tuple[str, str], list[FloatArray]] = {}
     nees: dict[tuple[str, str], list[float]] = {}

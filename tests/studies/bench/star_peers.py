@@ -1,11 +1,11 @@
-"""Star identification programs of others on our lists: tests/studies/bench/star_peers.py PEER JOBS.json.
+"""Runs another star identification program on our lists: tests/studies/bench/star_peers.py PEER JOBS.json.
 
-The program runs without this repository in the Python environment of the peers, because cedar-solve needs
-numpy below 2. A job is a star list (`pixels`, `size`) or a frame (`image`, a numpy file), with the field of
-view and its uncertainty in degrees. For a frame, the time includes the star extraction of the peer. The
-program prints one JSON object with the CPU time (ms) and the boresight (3,) of each job, or null for a
-refusal. It also prints by how much catalogue and index increase the resident memory after the import of the
-peer.
+The program runs without this repository in the Python environment of the other programs, because cedar-solve
+needs numpy below 2. A job is a star list (`pixels`, `size`) or a frame (`image`, a numpy file), with the
+field of view and its uncertainty in degrees. For a frame, the time includes the other program's star
+extraction. The program prints one JSON object with the CPU time (ms) and the boresight (3,) of each job, or
+null for a refusal. It also prints by how much catalogue and index increase the resident memory after the
+import of the other program.
 """
 
 import importlib
@@ -85,11 +85,11 @@ PEERS: dict[str, tuple[str, Callable[[], Solver]]] = {
     "tetra3rs": ("tetra3rs", tetra3rs),
     "tetra3rs, any shape": ("tetra3rs", lambda: tetra3rs(max_elongation=None, max_sharpness=None)),
 }
-"""Module and solver factory of each peer, with its default filters or without filters."""
+"""Module and solver factory of each other program, with its default filters or without filters."""
 
 
 def main(peer: str, path: str) -> int:
-    """Print the peer's answers to the jobs of a file."""
+    """Print the results of the program `peer` for the jobs of a file."""
     with open(path, encoding="utf-8") as file:
         jobs = json.load(file)
     module, make = PEERS[peer]

@@ -1,14 +1,14 @@
-"""Star identification beside cedar-solve and tetra3rs: `python -m tests.studies.bench starid`.
+"""Star identification compared with cedar-solve and tetra3rs: `python -m tests.studies.bench starid`.
 
 The lists have the twelve configurations of issue 4: 1024 x 1024 pixels, fields of 12 and 20 deg, 0.1 and 0.5
 px of noise, 0, 2 and 5 false stars, and an error of the known field of up to 0.1 deg. Further lists have an
-unknown field between 10 and 30 deg, or show no part of the sky. An answer is correct if its boresight is
+unknown field between 10 and 30 deg, or show no part of the sky. A result is correct if its boresight is
 correct to 0.05 deg and 80 % of the identified stars are correct. Times are processor times of one core with
-one list per call. Peers run in separate processes.
+one list per call. The other programs run in separate processes.
 
 `bound` is the median pointing error divided by the median error that the centroid noise allows. The latter
-follows from the Fisher information of all true stars of the list with attitude and scale unknown (1.1774
-sigma: Rayleigh).
+follows from the Fisher information of all true stars of the list for unknown attitude and scale. It is 1.1774
+sigma, the median of a Rayleigh distribution.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _INSTALL = (
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Answer of one solver to a list: time (ms), boresight (3,) or None, share of correct identifications."""
+    """Result of one solver: time (ms), boresight (3,) or None, fraction of correct identifications."""
 
     ms: float
     boresight: FloatArray | None
@@ -58,7 +58,7 @@ class Answer:
 
 
 def our_answers(lists: Sequence[StarList], sky: SkyIndex) -> list[Answer]:
-    """Return the default method's answers."""
+    """Return the results of this project's default method."""
     answers = []
     for drawn in lists:
         field = drawn.field()
@@ -75,9 +75,9 @@ def our_answers(lists: Sequence[StarList], sky: SkyIndex) -> list[Answer]:
 
 
 def peer_answers(peer: str, python: str, jobs: Sequence[dict[str, Any]]) -> tuple[list[Answer], float] | None:
-    """Return a peer's answers to jobs in the format of `star_peers`, and its resident memory (MB).
+    """Return another program's results for jobs in the format of `star_peers`, and its resident memory (MB).
 
-    Returns None if the peer is not installed.
+    Returns None if the program is not installed.
     """
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         json.dump(jobs, file)
@@ -112,7 +112,7 @@ def _one_core() -> dict[str, str]:
 
 
 def pointing_error(answer: Answer, drawn: StarList) -> float:
-    """Return the angle (rad) between the boresight of the answer and the true one."""
+    """Return the angle (rad) between the boresight of a result and the true one."""
     assert answer.boresight is not None
     true = attitude_matrix(drawn.attitude)[2]
     return float(np.arctan2(np.linalg.norm(np.cross(answer.boresight, true)), answer.boresight @ true))
@@ -226,7 +226,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     megabytes = {"flight": memory_of_index()}
     ratios = {}
     for peer in ("cedar-solve", "tetra3rs") if options.peers else ():
-        # A peer may use its whole time limit for a list that shows no part of the sky.
+        # Another program may use its whole time limit for a list that shows no part of the sky.
         shown = {
             name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()
         }
@@ -258,7 +258,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> dict[str, float]:
-    """Return the ratio of our time to the peer's on lists with a known field: median and 95th percentile."""
+    """Return the ratio of our time to another program's for known fields: median and 95th percentile."""
     known = list(ours)[: len(configurations())]
     mine, other = ([answer.ms for name in known for answer in all_of[name]] for all_of in (ours, theirs))
     return {

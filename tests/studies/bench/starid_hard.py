@@ -1,10 +1,10 @@
 """Star identification in difficult lists: `python -m tests.studies.bench starid_hard`.
 
 The lists have unknown fields of view, false stars that are all brighter than the true ones, mirrored images,
-field estimates that are 10 % wrong, or uncalibrated lenses with 2 to 8 % of distortion. Points that show no
+assumed fields that are 10 % wrong, or uncalibrated lenses with 2 to 8 % of distortion. Points that show no
 part of the sky measure the time of a refusal. The lists are drawn as in the benchmark `starid`. `wrong`
-counts incorrect answers. For a distorted lens, an answer is misleading if its error exceeds both five sigmas
-and 120 arcseconds. The exit status is 1 if an answer is wrong or misleading. `--peer` runs tetra3rs or
+counts incorrect results. For a distorted lens, a result is misleading if its error exceeds both five sigmas
+and 120 arcseconds. The exit status is 1 if a result is wrong or misleading. `--peer` runs tetra3rs or
 cedar-solve on the same lists.
 """
 
@@ -49,7 +49,7 @@ class Hardship:
         fields: range of fields of view, deg.
         distorted: whether the lens is distorted by _DISTORTION at the corner, with 0 to 5 false stars.
         hint: relative error of the given field of view.
-        strewn: whether the points are random.
+        strewn: whether the points are random and show no part of the sky.
     """
 
     kind: ListKind
@@ -97,7 +97,7 @@ def drawn_list(row: Hardship, stars: GuideStars, rng: np.random.Generator) -> St
 
 
 def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[StarMatch, float]:
-    """Return the project's answer and its time, ms."""
+    """Return the result of this project's method, and its time (ms)."""
     field = drawn.field()
     if row.hint:
         field = replace(field.rescaled(1.0 + row.hint), scale=field.scale)
@@ -127,7 +127,7 @@ def verdict(row: Hardship, drawn: StarList, found: StarMatch) -> str:
 def measured(
     name: str, lists: int, sky: SkyIndex, seed: int, peer: str | None = None, python: str = sys.executable
 ) -> dict[str, Any]:
-    """Return the figures of one row."""
+    """Return the results of one row of the table."""
     row, number = hardships()[name], list(hardships()).index(name)
     drawn = [
         drawn_list(row, sky.stars, np.random.default_rng([seed, number, place])) for place in range(lists)
@@ -144,7 +144,7 @@ def measured(
         "p95_ms": float(np.percentile(ms, 95)),
         "max_ms": max(ms),
     }
-    # A peer may use its whole time limit for a list that shows no part of the sky.
+    # Another program may use its whole time limit for a list that shows no part of the sky.
     if peer is None or row.strewn:
         return figures
     jobs = [_job(row, one) for one in drawn]

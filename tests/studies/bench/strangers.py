@@ -2,13 +2,13 @@
 
 In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
 without and with an attack. The attackers share one core. They send 30,000 datagrams a second from an address
-that is not a peer's, and open 200 TCP connections a second from a peer's address, each with bytes that form
-no frame. With `--forged N` they also send N forged frames a second from a peer's address: replayed, damaged
-and without the key. The link must examine these frames, so commands by UDP may be lost. In both flights the
-operator sends 40 commands, in turn by UDP, by a TCP connection that stays open and by a new one. The
-benchmark prints the executed commands, the rates of the attackers, and the lateness of the control cycles.
-The exit status is 1 if a command was not executed, or if the 99 % quantile of the lateness is more than twice
-that of the quiet flights (medians over the rounds).
+that the link does not accept. They also open 200 TCP connections a second from an accepted address, and send
+bytes that form no frame. With `--forged N` they also send N forged frames a second from an accepted address:
+replayed, damaged and without the key. The link must examine these frames, so commands by UDP may be lost. In
+both flights the operator sends 40 commands, alternately by UDP, by a lasting TCP connection and by a new TCP
+connection. The benchmark prints the executed commands, the rates of the attackers, and the lateness of the
+control cycles. The exit status is 1 if a command was not executed, or if the 99 % quantile of the lateness is
+more than twice that of the flights without attack (medians over the rounds).
 """
 
 from __future__ import annotations
@@ -112,12 +112,12 @@ def _wait_for_port(tcp: int) -> None:
 
 
 def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
-    """Send commands in turn by three lines; return number and reason of each that was not executed."""
+    """Send commands alternately by three connections; return number and reason of each unexecuted one."""
     packer, failures = CommandPacker(), list[str]()
     ways = (f"127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}", f"tcp:127.0.0.1:{tcp}")
     with ExitStack() as stack:
         lasting = [stack.enter_context(contextlib.closing(open_terminal(way, keys))) for way in ways[:2]]
-        for terminal in lasting:  # the gateway and the console hold such connections
+        for terminal in lasting:  # The gateway and the console also keep such connections open.
             terminal.send(packer.pack(Ping(), utc_ns()))
         for number in range(count):
             try:
@@ -164,7 +164,7 @@ def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[st
 
 
 def _datagrams(port: int, count: Any) -> None:
-    """Send datagrams from an address that is not a peer's."""
+    """Send datagrams from an address that the link does not accept."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
         line.bind((_STRANGER, 0))
@@ -177,7 +177,7 @@ def _datagrams(port: int, count: Any) -> None:
 
 
 def _connections(port: int, count: Any) -> None:
-    """Open connections from a peer's address, and leave each open until the link closes it."""
+    """Open connections from an accepted address, and leave each open until the link closes it."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     lines: list[socket.socket] = []
     for _ in _grid(1.0 / CONNECTIONS):
@@ -190,7 +190,7 @@ def _connections(port: int, count: Any) -> None:
 
 
 def _forged(port: int, a_second: int, count: Any) -> None:
-    """Send frames of an attacker without the key from a peer's address."""
+    """Send frames of an attacker without the key from an accepted address."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     chance = Random(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -205,7 +205,7 @@ def _forged(port: int, a_second: int, count: Any) -> None:
 
 
 def _grid(period: float) -> Iterator[None]:
-    """Yield once a period. Missed periods are yielded at once."""
+    """Yield once per period (s). Missed periods are yielded immediately."""
     due = time.monotonic()
     while True:
         yield

@@ -29,7 +29,7 @@ class Listed:
     purpose: str
 
     def load(self) -> Campaign:
-        """Import the campaign."""
+        """Import and return the campaign."""
         found = getattr(importlib.import_module(f"tests.studies.campaigns.{self.module}"), self.constant)
         assert isinstance(found, Campaign)
         return found
@@ -56,7 +56,7 @@ def campaigns() -> dict[str, Listed]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a campaign.
 
-    Returns 0 if it is done, 1 if the cluster is lost, 2 for wrong use, 130 if interrupted.
+    Returns 0 if the campaign is complete, 1 if the cluster is lost, 2 for wrong use, 130 if interrupted.
     """
     known = campaigns()
     listed = "\n".join(f"  {name:18} {campaign.purpose}" for name, campaign in known.items())

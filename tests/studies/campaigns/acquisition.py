@@ -1,9 +1,9 @@
-"""Campaign `acquisition`: from a slow rotation, lost in space, to a fine attitude in the loop.
+"""Campaign `acquisition`: time from a slow rotation, lost in space, to a fine attitude in the loop.
 
 Each run has its own attitude, rotation axis and position in the orbit; the receiver has a fix after a second.
 The star camera is blind while the Sun is near its field of view, or sunlit ground is in it. Runs in sunlight
-and in shadow are counted separately. Errors and claims are those of the star camera's attitude; the attitude
-of the body has the error of the mounting, too.
+and in shadow are counted separately. Errors and claimed uncertainties are those of the star camera's
+attitude. The attitude of the body also has the error of the camera's mounting.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def run(case: Case) -> Result:
 
 
 def _config(duration: float) -> OrbitConfig:
-    """Return the configuration without elements, because they fit one orbit only, and without detumbling."""
+    """Return the configuration without detumbling, and without orbital elements, which fit only one orbit."""
     config = as_orbit(configuration.load(ORBIT))
     rest = configuration.replace(config.detumble, low_rate=2.0 * SPEED, low_for=0.1)
     return configuration.replace(config, detumble=rest, elements=None, duration=duration)
@@ -87,7 +87,7 @@ def _facts(flown: Run) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return times to a fine attitude, and later errors and claims, separately for sunlight and shadow."""
+    """Return times to a fine attitude, and then errors and claimed sigmas, for sunlight and shadow."""
     facts: dict[str, Any] = {}
     for name, lit in (("sunlit", True), ("shadow", False)):
         mine = [r for r in results if r["sunlit"] is lit]

@@ -59,7 +59,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Run one case and judge its estimate."""
+    """Run one case, and evaluate its estimate."""
     rng = np.random.default_rng(case.seed)
     fault, span = case.parameters["fault"], case.parameters["span"]
     entry = FaultEntry(fault=fault, at=float(rng.uniform(4.0, 11.0)), span=span)
@@ -71,7 +71,7 @@ def run(case: Case) -> Result:
 
 
 def config_for(slews: tuple[float, float]) -> Config:
-    """Return 20 s of the demonstration without its camera, with slews at 3.5 and 12 s."""
+    """Return the configuration of 20 s of the demonstration without camera, with slews at 3.5 and 12 s."""
     first, second = (CommandStep(at=at, slew=slew) for at, slew in zip((3.5, 12.0), slews, strict=True))
     return configuration.replace(
         demo_config(DURATION, camera=False),
@@ -122,7 +122,7 @@ def estimate_beyond(flown: Run) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], Fl
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return a row for each fault."""
+    """Return a row of results for each fault."""
     del folder
     by_fault: dict[str, list[Result]] = defaultdict(list)
     for result in results:
@@ -148,7 +148,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _first(event: Any, names: Sequence[str], name: str, after: float) -> float | None:
-    """Return the mission time (s) of the first event of a name after a given time, or None."""
+    """Return the mission time (s) of the first event named `name` after a given time, or None."""
     at = event["time_ns"][np.array([one == name for one in names], bool)] / SECOND_NS - after
     return min(at[at >= 0.0].tolist(), default=None)
 

@@ -9,12 +9,12 @@ gains by one criterion: minimum power with every step settled in 9 s and oversho
 adaptive controller that is tuned by its bandwidth alone and a PID with three equal poles are added for
 comparison.
 
-Two powers are given (`knightcube.gnc.guidance.one_axis.plant`). V |I| is the power that the chopped coils
-draw from their supply of 3.4 V; it compares with the figures of the thesis. R I^2 of the mean current is the
-cost that the paths minimise.
+Two definitions of power are used (`knightcube.gnc.guidance.one_axis.plant`). V |I| is the power that the
+chopped coils draw from their supply of 3.4 V; it is comparable to the powers of the thesis. R I^2 of the mean
+current is the cost that the paths minimise.
 
-The thesis states no stiffness of its thread. On a thread of 4.2e-5 N m/rad its loop draws the 0.10 W that it
-states (as R I^2). The controllers of `STIFF` are also flown on this thread, with PID and adaptive control
+The thesis states no stiffness of its thread. On a thread of 4.2e-5 N m/rad the thesis's loop draws the stated
+0.10 W (as R I^2). The controllers of `STIFF` are also flown on this thread, with PID and adaptive control
 tuned for it.
 
 The lower bound of the power is the clairvoyant optimum, computed by direct collocation
@@ -102,7 +102,7 @@ def stiff_pid() -> TestbedConfig:
 
 
 def stiff_adaptive() -> TestbedConfig:
-    """Return adaptive control with the gains of that command; it cannot settle within 9 s on this thread."""
+    """Return adaptive control tuned for the stiff thread, on which it cannot settle within 9 s."""
     return towards_steps(tracker="adaptive", bandwidth=0.9991, adaptation=363.2, reference_bandwidth=0.526)
 
 
@@ -160,7 +160,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def world(thread: str, seed: int = 1) -> Simulation:
-    """Return the demonstration's world with one of the two threads."""
+    """Return the demonstration's simulated world with one of the two threads."""
     simulated = configuration.replace(demo_world(), seed=seed)
     return simulated if thread == OURS else configuration.replace(simulated, thread=STIFF_THREAD)
 
@@ -185,12 +185,12 @@ def run(case: Case) -> Result:
 
 
 def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
-    """Return the largest figure, or infinity if a step has none."""
+    """Return the largest value of a key over all steps, or infinity if a step has none."""
     return max(np.inf if row[key] is None else row[key] for row in rows)
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return each controller's mean power and worst figures by thread, and the lower bound."""
+    """Return each controller's mean power and worst step results by thread, and the power's lower bound."""
     facts: dict[str, Any] = {}
     for thread, names in THREADS.items():
         if own := [result for result in results if result["thread"] == thread]:
@@ -201,7 +201,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _figures(results: Sequence[Result], name: str, floor: float) -> dict[str, Any]:
-    """Return a controller's figures on one thread, with its power relative to that of this project's loop."""
+    """Return a controller's results on one thread, with its power relative to this project's loop."""
     own = [result for result in results if result["controller"] == name]
     if not own:
         return {"seeds": 0}

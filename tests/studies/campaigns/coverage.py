@@ -6,7 +6,7 @@ pitched back and forth by 90 deg (4.3), and random. The campaign reports the sha
 ... cameras have the horizon, lit or not, in view, and the share of the sunlit time in which a camera has the
 Sun in view. For UW in level attitude, the latter is given over the Sun's elevation above the orbital plane
 (beta), for three headings of the hexagon, and for the square detector and its inscribed cone, because the
-paper states none of these.
+paper states neither heading nor field shape.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def run(case: Case) -> Result:
 def _shares(
     sensors: SensorSuite, edge: FloatArray, day: BoolArray, sun: FloatArray, lit: BoolArray
 ) -> dict[str, Any]:
-    """Return the shares of time with the horizon, lit or any, in 0..n cameras, and with the Sun."""
+    """Return the shares of time with the horizon (lit, or any) in 0 to n cameras, and with the Sun in one."""
     count, count_day = np.zeros(len(lit), int), np.zeros(len(lit), int)
     seen = np.zeros(len(lit), bool)
     for camera in sensors.cameras:
@@ -125,7 +125,7 @@ def _sun(way: Pass) -> FloatArray:
 
 
 def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, float]]:
-    """Return the share of the sunlit orbit with the Sun in a camera, by heading and by shape of the field.
+    """Return the share of the sunlit orbit with the Sun in a camera, by heading and by field shape.
 
     `beta` (rad) is the Sun's elevation above the plane of a circular orbit around a sphere, positive to the
     right.
@@ -202,7 +202,7 @@ def _mean_shares(orbits: Sequence[Result]) -> dict[str, Any]:
 
 
 def _over_year(orbits: Sequence[Result], tables: Sequence[Result]) -> dict[str, float]:
-    """Return UW's mean share of the Sun over the drawn orbits, with its first camera on the Sun's side."""
+    """Return UW's mean share of time with the Sun in view, for its first camera on the Sun's side."""
     betas = [result["beta"] for result in tables]
     return {
         shape: float(

@@ -1,10 +1,10 @@
-"""Campaign `damaged-files`: an intact release starts after one flipped bit in one file of a board.
+"""Campaign `damaged-files`: whether an intact release starts after one flipped bit in one file of a board.
 
 The files are both copies of the launcher and of the safe state, the manifest and a module of the current
 release, the records that flight and link have stored, and all keys. Each flip is followed by a start of the
-flight as its unit starts it. After a flip in a record or key of the link, its associations must be complete
-and its schedule kept. After a flip in the safe state's files, its program must start. The flip is undone
-before the next one.
+flight with the command of its systemd unit. After a flip in a record or key of the link, its associations
+must be complete and its schedule kept. After a flip in the safe state's files, its program must start. The
+flip is undone before the next one.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class DamagedBoard:
         return {"file": name, "bit": bit, "flies": label, "problems": problems, "reported": said_so}
 
     def _safe_state_runs(self) -> bool:
-        """Return whether the unit of the safe state starts its program, which reports its first line."""
+        """Return whether the unit of the safe state starts its program, which then reports."""
         words = self.board.unit_words("knightcube-safe.service")
         environment = {**os.environ, "RUNTIME_DIRECTORY": "", "KNIGHTCUBE_COMMANDS": ""}
         with subprocess.Popen(

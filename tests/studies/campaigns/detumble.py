@@ -6,8 +6,8 @@ coarse attitude. The law `inertia` has the same sensors, but the body's moments 
 the described ones by up to the default accuracies. The coils are off for a twentieth of each four seconds, as
 the magnetometer needs, and before the rate is known. While the rate is uncertain, they are off for a tenth of
 each two seconds. Coils are commanded each quarter of a second, and as often as the body rotates by 0.3 rad.
-Each time is compared with a rigorous lower bound (`least_time`), which no control of these coils can beat.
-The bound assumes that the coils are never off and that a dipole of the largest strength has any direction.
+Each time is compared with a rigorous lower bound (`least_time`) for any control of these coils. The bound
+assumes that the coils are never off, and that the largest dipole can have any direction.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def least_time(
     """Return a lower bound, s, of the time in which a momentum (3,), N m s, can fall to `left` N m s.
 
     In inertial axes the momentum h obeys h' = m x B + T, whatever the inertia and the attitude are. The
-    dipole moment m of the coils is at most `reach` A m^2 long, and the torque T of all other causes at most
-    `others` N m. For any unit vector y,
+    magnitude of the coils' dipole moment m is at most `reach` (A m^2), and that of the torque T of all other
+    causes at most `others` (N m). For any unit vector y,
 
         y . (h(0) - h(t)) = integral of (m . (y x B) - y . T) <= integral of (reach |B x y| + others).
 
@@ -73,14 +73,14 @@ def least_time(
 
     The right-hand side grows with t, so each y excludes all times before the two sides are equal. The result
     is the latest such time of all directions that are tried. It is a lower bound for any set of directions,
-    because each direction alone gives one. Each of three orthogonal coils of one limit reaches that limit, so
-    their dipole moment is at most sqrt(3) times it.
+    because each direction alone gives one. Three orthogonal coils with the same limit together have a dipole
+    moment of at most sqrt(3) times this limit.
 
     Args:
         momentum: initial angular momentum (3,), N m s, inertial axes.
         field: magnetic field (n, 3), T, at the middles of n steps, in the same axes.
         step: duration of all steps or of each step (n,), s. The result is at most their sum.
-        reach: largest strength of the coils' dipole moment, A m^2.
+        reach: largest magnitude of the coils' dipole moment, A m^2.
         left: final momentum, N m s.
         others: largest torque of other causes, N m, for all steps or for each step (n,).
     """
@@ -104,7 +104,7 @@ def least_time(
 
 
 def _crossed(removed: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return the rows, with fractions, at which rising columns `removed` (n + 1, k) reach `wanted` (k,)."""
+    """Return fractional row indices (k,) where rising columns `removed` (n + 1, k) reach `wanted` (k,)."""
     row = np.sum(removed < wanted, axis=0)
     after = np.clip(row, 1, len(removed) - 1)
     column = np.arange(len(wanted))
@@ -125,9 +125,9 @@ WALK, LIGHTEST = 4.0, 1.04
 as a multiple of that at one astronomical unit.
 """
 LEAST_CYCLES = 16
-"""Smallest number of commands in a window; a flight has 152."""
+"""Smallest number of coil commands in a control window; a flight has 152."""
 HORIZON = {"knightcube": 1500.0, "cubesat_3u": 3000.0}
-"""Horizon (s) of a plan."""
+"""Planning horizon (s), by craft."""
 ATTITUDE_SIGMA = np.radians(1.0)
 """Error (rad per axis) of the coarse attitude from Sun and field."""
 FIELD_SIGMA = 2e-7
@@ -143,9 +143,9 @@ TARGETS = {
     ("cubesat_3u", "attitude"): 1500.0,
     ("cubesat_3u", "inertia"): 1500.0,
 }
-"""Required times, s."""
+"""Required detumbling times (s)."""
 OVER = {"magnetometer": 1.6, "attitude": 1.3, "inertia": 1.4}
-"""Required medians of the time divided by its lower bound, in the orbits that are not equatorial."""
+"""Required medians of time / lower bound, by law, in the orbits that are not equatorial."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -239,13 +239,13 @@ class _Bound:
         self._times_ns = [flight.time_ns]
 
     def pass_window(self) -> None:
-        """Record the field and the largest torque of other causes at the end of a window."""
+        """Record the magnetic field and the largest torque of other causes at the end of a control window."""
         self._fields.append(self._flight.body.orbit_truth().field)
         self._others.append(self._other())
         self._times_ns.append(self._flight.time_ns)
 
     def least(self) -> float:
-        """Return the lower bound of the time until the body is slow, s; it is at most the time so far."""
+        """Return the lower bound of the time (s) until the body is slow, which is at most the time so far."""
         flight, craft = self._flight, self._flight.body.craft
         fields, others = np.array(self._fields), np.array(self._others)
         currents = np.array(list(product((-1.0, 1.0), repeat=3))) * flight.limit / flight.dipole_per_ampere
@@ -266,7 +266,7 @@ class _Bound:
         )
         areas = np.array([face.area for face in craft.faces])
         arms = np.array([face.arm for face in craft.faces])
-        # The forces of the flow on the faces of a box act like one force at the centre of the box.
+        # The aerodynamic forces on the faces of a box are equivalent to one force at the centre of the box.
         middle = float(np.linalg.norm(arms.mean(axis=0)))
         speed = float(np.linalg.norm(air_flow(here)))
         force = 0.5 * DRAG_COEFFICIENT * here.density * speed**2 * float(np.linalg.norm(areas[::2]))
@@ -275,7 +275,7 @@ class _Bound:
 
 
 class _Law:
-    """Control law of the flight with the knowledge that it has; some magnetometer samples may be outliers."""
+    """The flight's control law with the sensors of its kind; some magnetometer samples may be outliers."""
 
     def __init__(self, flight: FreeFlight, wanted: dict[str, Any]) -> None:
         self._flight = flight
@@ -347,7 +347,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _cell(mine: Sequence[Result], wanted: float, over_wanted: float) -> dict[str, Any]:
-    """Return the figures of the flights of one craft and law."""
+    """Return the results of the flights of one craft and law."""
     seconds = np.array([result["seconds"] for result in mine])
     over = seconds / np.array([max(result["least"], 1.0) for result in mine])
     return {

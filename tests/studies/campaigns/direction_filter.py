@@ -3,9 +3,9 @@
 Gyros propagate the attitude, and directions correct attitude and bias. The filter is `AttitudeFilter` of
 `knightcube.gnc.estimation` for a free body in orbit. It starts from the first directions that agree and
 determine the attitude accurately enough. Then it uses each measurement of Sun, nadir and field at the time of
-the measurement. It estimates the magnetometer's bias together with the error of the field model, which
-changes as slowly, and uses the estimate from sunlight in eclipse. Flights do not use this filter; the
-campaigns `orbit-attitude` and `orbit-frames` measure it.
+the measurement. It estimates the magnetometer's bias together with the field model's error, which changes
+equally slowly. In eclipse it uses the bias that was estimated in sunlight. Flights do not use this filter;
+the campaigns `orbit-attitude` and `orbit-frames` measure it.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class DeterminationSettings:
             sqrt(s).
         start_sigma: largest standard deviation of the worst axis at the start, rad.
         start_age: largest age of directions at the start, s.
-        lost_sigma: standard deviation, rad, above which the estimate is discarded, because linearisation
-            fails.
-        fresh: longest time without accepted measurements of a sensor in use, s.
+        lost_sigma: standard deviation, rad, above which the estimate is discarded, because linearisation is
+            no valid approximation.
+        fresh: longest time without accepted measurements for which a sensor counts as in use, s.
         gate_sigma: rejection threshold of measurements, in sigma.
         longest_step: longest step of the filter, s.
     """
@@ -79,7 +79,7 @@ class Status(Enum):
     """The sensors on which the attitude is based."""
 
     ACQUIRING = "acquiring"
-    """The available directions do not determine the attitude yet."""
+    """The available directions do not yet determine the attitude."""
     OBSERVED = "observed"
     """At least two directions are in use, with or without the field."""
     AIDED = "aided"
@@ -167,8 +167,8 @@ class AttitudeDetermination:
             covariance = settings.field_sigma**2 * np.eye(3)
             self._ingest(FIELD, FieldMeasurement(time_ns, field, reference, covariance))
         else:
-            # The bias affects the first attitude, and the next sample as if it were independent: twice the
-            # bias's sigma keeps the weight of the attitude right.
+            # The bias affects the first attitude and the next sample, which the filter treats as independent.
+            # Twice the bias's sigma gives the first attitude the correct weight.
             spread = settings.field_sigma**2 + (2.0 * settings.field_bias_start) ** 2
             try:
                 self._wait(FIELD, time_ns, field_observation(field, reference, spread * np.eye(3)))
@@ -218,7 +218,10 @@ class AttitudeDetermination:
         self.starts += 1
 
     def _moved(self, waiting: _Waiting, time_ns: int) -> VectorObservation:
-        """Return a direction at `time_ns`; its covariance includes the possible body rotation since."""
+        """Return a stored direction at `time_ns`.
+
+        Its covariance includes the body rotation since its measurement.
+        """
         assert self._rate is not None
         rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
         turned = rate * (time_ns - waiting.time_ns) * 1e-9
@@ -253,10 +256,10 @@ class AttitudeDetermination:
 
 
 def begin(observations: Sequence[VectorObservation], improbable: float = 1e-4) -> AttitudeFix | None:
-    """Return the attitude from directions, or None if they do not determine it or contradict each other.
+    """Return the attitude from directions, or None if they contradict each other or do not determine it.
 
-    The angles between the directions must be those between their references: a chi-square of 2 n - 3 degrees
-    of freedom.
+    The angles between the n directions must agree with those between their references, by a chi-square test
+    with 2 n - 3 degrees of freedom.
     """
     try:
         fix = weighted_fit(observations)
@@ -277,5 +280,5 @@ def _status(in_use: frozenset[str]) -> Status:
 
 
 def _is_unit(vector: FloatArray) -> bool:
-    # A NaN also fails the comparison.
+    # A vector with a NaN also fails this comparison.
     return vector.shape == (3,) and abs(float(np.linalg.norm(vector)) - 1.0) <= _UNIT_TOLERANCE

@@ -5,7 +5,7 @@ craft that points to nadir. The bias of the simulated gyro walks as the filter a
 calibrate the bias for at least LEARNED s before the shadow. From the start of a shadow, the filter has only
 gyro and magnetometer. Orbits without a shadow of at least SHORTEST s are replaced by new draws. The cells
 `storm`, half as many as `filter`, add a field error of STORM. The cells `loop`, a tenth as many as `filter`,
-run the whole loop (`fly_loop`), and the bias of the emulated gyro is constant.
+run the whole loop (`fly_loop`) with a constant bias of the emulated gyro.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _world(path: Path, seed: tuple[int, ...], lit: float, silent: float) -> tupl
     times = np.arange(lit, lit + 1.5 * revolution)
     dark = ahead.sunlit_at(times) < 0.5
     begin = int(np.flatnonzero(dark[1:] & ~dark[:-1])[0]) + 1
-    end = begin + int(np.argmin(dark[begin:]))  # index of a time, the first of which is `lit`
+    end = begin + int(np.argmin(dark[begin:]))  # index in the array of times, which begins at `lit`
     orbit = configuration.replace(first, true_anomaly_deg=360.0 * begin / revolution)
     body = configuration.replace(body, orbit=orbit)
     body = configuration.replace(body, release=_at_nadir(_state(body, section.utc)))
@@ -113,9 +113,9 @@ def _at_nadir(state: OrbitState) -> TipOff:
 
 
 def _facts(flown: Run, settled: float, silent: float, lit: float, last: float) -> Result:
-    """Return rms errors (deg), NEES of an axis and largest errors (sigmas) by phase of the flight.
+    """Return rms errors (deg), NEES per axis and largest errors (sigmas) by phase of the flight.
 
-    The attitude is that of the star camera; that of the body also has the error of the mounting.
+    The evaluated attitude is that of the star camera. The body's attitude also has the error of the mounting.
     """
     errors, packets, truth = camera_errors(flown), flown["navigation"], flown["orbit_truth"]
     end = float(seconds(truth)[-1])
@@ -146,15 +146,16 @@ def judged(error: FloatArray, sigma: FloatArray) -> Result | None:
 
 
 LEARNED, SHORTEST, LONGEST = 3_800.0, 1_900.0, 12_000.0
-"""Shortest time (s) with star fixes, so that a revolution has passed at the end of the shadow; shortest
-shadow; longest flight.
+"""Shortest time (s) with star fixes, so that a revolution has passed when the shadow ends.
+
+Shortest duration (s) of the shadow; longest flight (s).
 """
 NOTED = 14.0
-"""Interval (s) of the recorded errors, which covers all times since the last star fix (every 10 s)."""
+"""Interval (s) between recorded errors, chosen so that all ages of the last star fix (every 10 s) occur."""
 STORM, STORM_TIME = 5e-8, 300.0
 """Standard deviation per axis (T) and time constant (s) of the Gauss-Markov field error, as configured."""
 SHARE = 0.3
-"""Fraction of the worst torques, as in the configurations."""
+"""Disturbance torques as a fraction of the worst case, as in the configurations."""
 WANTED = {"stars": 0.01, "sunlit": 0.05, "eclipse": 0.3}
 """Required attitude error (deg rms, three axes; issue 19)."""
 
@@ -212,7 +213,7 @@ class DarkFlight(PointingFlight):
         return self.end - self.dark >= shortest
 
     def error(self) -> tuple[FloatArray, FloatArray, float]:
-        """Return error and claim (3,), rad, of the attitude, and the unknown share of the residual dipole."""
+        """Return error and sigma (3,), rad, of the attitude, and the residual dipole's unknown fraction."""
         found, truth = self._filter, self.flight.body.orbit_truth()
         off = to_rotation_vector(multiply(self.flight.motion.quaternion, conjugate(found.quaternion)))
         missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
@@ -260,7 +261,7 @@ def _rms(values: FloatArray) -> float:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return errors and claims by kind, craft and phase of the flight."""
+    """Return errors and claimed uncertainties by kind, craft and phase of the flight."""
     facts: dict[str, Any] = {}
     cells = list(dict.fromkeys((r["kind"], r["craft"]) for r in results))
     for kind, craft in cells:

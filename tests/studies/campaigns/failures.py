@@ -5,11 +5,11 @@ field (3.28), and the exposure 0.2 or 1 s. A sky with fewer than five usable sta
 same motion. A star is usable if its whole streak lies at least 4 px inside the frame, and its signal exceeds
 eight standard deviations of the noise under its streak (`scenes.usable`).
 
-An answer is wrong if its error exceeds 6 of its own standard deviations (the square root of its NEES;
-probability 1 in 13 million) and 1 % of the rate, as a vector. Each condition is also counted alone. The first
-alone means that the covariance is too small. The second alone may be a consistent answer from streaks of a
-few px. Refusals are counted by their status. If the usable stars move less than the estimator's minimum
-length, the rate cannot be determined, and a refusal is correct.
+A result is wrong if its error vector exceeds both 6 claimed standard deviations (the square root of its NEES;
+probability 1 in 13 million) and 1 % of the rate. Each condition is also counted alone. The first alone means
+that the covariance is too small. The second alone may be a consistent result from streaks of a few px.
+Refusals are counted by their status. If the usable stars move less than the estimator's minimum length, the
+rate cannot be determined, and a refusal is correct.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
-# Upper limits of the classes of rotation (percent of the field) for which times and errors are reported.
+# Upper limits (% of the field) of the rotation classes for which times and errors are reported.
 TURNS = (5, 20, 35, 50)
 _FREEDOM = 3
 
@@ -55,7 +55,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Estimate the motion of one frame, and judge the answer."""
+    """Estimate the motion of one frame, and evaluate the result."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, drawn = RandomSlew(case.seed[0], case.seed[1], **case.parameters).exposed(camera)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
@@ -87,7 +87,7 @@ def _path_lengths(scene: Scene) -> FloatArray:
 
 
 def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
-    """Return the verdict, the errors of an answer, and the reasons for a refusal or a wrong answer."""
+    """Return the verdict, the errors of a result, and the reasons for a refusal or a wrong result."""
     size = float(np.linalg.norm(scene.rate))
     if found.status is not StreakStatus.RATE or found.rate is None or found.covariance is None:
         verdict = AT_REST if still else found.status.value
@@ -114,7 +114,7 @@ def _why_refused(found: MotionResult) -> str:
 
 
 def _how_wrong(found: MotionResult, scene: Scene) -> str:
-    """Return in which way an answer differs from the truth."""
+    """Return the way in which a result differs from the truth."""
     if found.rate is None:
         return _why_refused(found)
     sizes = float(np.linalg.norm(found.rate)), float(np.linalg.norm(scene.rate))
@@ -160,7 +160,7 @@ def _counts(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _nees(results: Sequence[Result]) -> dict[str, float] | None:
-    """Return the mean NEES, and the fractions of answers beyond quantiles of chi-square."""
+    """Return the mean NEES, and the fractions of results beyond quantiles of chi-square."""
     values = np.array([r["nees"] for r in results if r["nees"] is not None])
     if not len(values):
         return None

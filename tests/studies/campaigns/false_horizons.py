@@ -1,10 +1,11 @@
 """Campaign `false-horizons`: false detections in images without a limb, and detections of difficult limbs.
 
 Pictures without a limb (`limbless`) are searched by several cameras with three kinds of prior knowledge:
-none, the altitude, or that of a flight (position, Sun, coarse Sun and field of a random scene). Any nadir is
-a false detection. The campaign also renders difficult limbs: thin crescents, terminators, a third of the limb
-behind a structure, sun glint on the sea, the Sun in the frame, and a narrow camera with linear response. An
-answer to these is wrong if its error exceeds both half a degree and five of its claimed standard deviations.
+none, the altitude, or that of a flight (position, Sun, coarse Sun and field of a random scene). Any nadir
+found in these pictures is a false detection. The campaign also renders difficult limbs: thin crescents,
+terminators, a third of the limb behind a structure, sun glint on the sea, the Sun in the frame, and a narrow
+camera with linear response. A result for these images is wrong if its error exceeds both half a degree and
+five of its claimed standard deviations.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def limbless_picture(kind: str, generator: np.random.Generator) -> tuple[Image, 
 
 
 def knowledge_of(scene: EarthScene, known: str, generator: np.random.Generator) -> HorizonKnowledge:
-    """Return the prior knowledge of a scene of one kind of `KNOWN`."""
+    """Return the prior knowledge of a scene, for one of the kinds in `KNOWN`."""
     if known == "flight":
         return coarse_knowledge(scene, generator)
     height = float(np.linalg.norm(scene.position)) - 6_371e3
@@ -87,7 +88,7 @@ def _empty(kind: str, generator: np.random.Generator) -> list[Result]:
 def limb_picture(
     kind: str, generator: np.random.Generator
 ) -> tuple[Image, EarthScene, EarthCameraModel, HorizonSettings]:
-    """Return a rendered limb of a kind of `HARD`, its scene, its camera and the settings of the search."""
+    """Return a limb image of one of the kinds in `HARD`, its scene, its camera and the search settings."""
     if kind == "narrow":
         model, scene = _narrow(generator)
         return render(model, scene, generator), scene, model, HorizonSettings()

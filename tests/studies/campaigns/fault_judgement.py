@@ -1,6 +1,6 @@
 """Evaluation of a run of campaign `faults` by its log and its true states.
 
-Times follow from log and truth, not from events alone, because events are rate-limited.
+Times are determined from log and truth, not from events alone, because events are rate-limited.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PE
 
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
-"""Time (s) after the end of a fault within which its event must come: later events have another cause."""
+"""Longest time (s) after the end of a fault until its event; later events have another cause."""
 BLIND_GRACE = 0.1
 """Longest time (s) from the last measurement to zero coil current."""
 ZERO = 1e-3
@@ -29,7 +29,7 @@ ZERO = 1e-3
 FRAME_READOUT = 0.05
 """Readout time (s) of the camera."""
 DRIVEN = 6.0e-3
-"""Smallest current (A) at which the monitor can judge a driven coil."""
+"""Smallest current (A) at which the monitor can evaluate a driven coil."""
 
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
 """Absolute (A) and relative difference of two readings of the same current that can still be noise."""
@@ -40,7 +40,7 @@ searched for.
 FEW = 3
 """Largest difference in the number of IMU samples that does not count as an effect."""
 BACK_WITHIN = 2.0
-"""Longest recovery time (s) of a device once it answers again."""
+"""Longest recovery time (s) of a device after it responds again."""
 _OUT_OF_REACH = {"nack", "slow", "intermittent"}
 _KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
 
@@ -81,7 +81,7 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
 
 
 def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
-    """Return whether the part was in use while its fault lasted."""
+    """Return whether the faulty part was in use during its fault."""
     control = flown["control"]
     time = control["time_ns"] * 1e-9
     inside = (time >= at) & (time < max(end, at + 1.0))
@@ -123,7 +123,7 @@ def _is_worker_busy(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
-    """Return whether the commands differed from the stuck answer for at least a second."""
+    """Return whether the commands differed from the stuck reading for at least a second."""
     asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
     behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
@@ -131,12 +131,12 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
 
 
 def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Return whether supply currents (n,), A, differ by more than two readings of the same current can."""
+    """Return whether two supply currents (n,), A, differ by more than readings of the same current can."""
     return np.asarray(np.abs(one - other) > OFF_SURELY + GAIN_ERROR * np.maximum(one, other))
 
 
 def _is_upset(flown: Run, device: str, at: float) -> bool:
-    """Return whether a flipped bit had an effect; not in a register that is unused or soon rewritten."""
+    """Return whether a flipped bit had an effect; none is expected in unused or soon rewritten registers."""
     match device:
         case "pwm":
             obeyed = _obeyed(flown, at)
@@ -170,7 +170,10 @@ def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
 def _recovered(
     flown: Run, kind: FaultKind, at: float, end: float, reported: Sequence[tuple[float, str]]
 ) -> float | None:
-    """Return the time (s) from the end of the fault until the device's data are valid again, or None."""
+    """Return the time (s) from a fault's end until the device's data are valid again.
+
+    None if they never are.
+    """
     house = flown["housekeeping"]
     found: float | None = 0.0
     match kind.device.partition("-")[0]:
@@ -181,12 +184,12 @@ def _recovered(
         case "monitor":
             finite, time = np.isfinite(house["coil_current"]), house["time_ns"] * 1e-9
             lost = time[~finite & (time >= end) & (time < end + LOOKED)]
-            # The effects of a momentary fault begin after it.
+            # The effects of a momentary fault begin only after the fault.
             found = _first(time[finite], end)
             if kind.momentary and len(lost):
                 later = _first(time[finite], float(lost[-1]))
                 found = None if later is None else float(lost[-1]) + later - end
-            # This packet is sent four times a second, housekeeping once.
+            # This packet is sent four times a second, the housekeeping packet once.
             known = [t for t, name in reported if name == "power-recovered" and t < DURATION - CYCLE]
             back = _first(np.array(known), end)
             if back is not None:
@@ -245,7 +248,7 @@ def _blind_current(flown: Run, also_unsteered: bool) -> float:
     """Return the largest current (A) while the age of the measurements exceeds the limit.
 
     In this time the estimate may be propagated, but no coil may be driven. `also_unsteered` adds cycles in
-    which the loop has not steered for that long because the filter rejected the measurements.
+    which the loop has not controlled the body for that long, because the filter rejected the measurements.
     """
     off = flown["control"]["state"] == 0
     cycles = round(BLIND_GRACE / CYCLE)
@@ -264,7 +267,7 @@ def _carried(flown: Run) -> FloatArray:
 def _reaction_right(
     flown: Run, kind: FaultKind, at: float, end: float, warned: Sequence[tuple[float, str]]
 ) -> bool | None:
-    """Return whether the reaction of the table followed, or None if the table has none."""
+    """Return whether the reaction in the table of events followed, or None if the table has none."""
     part = part_of(kind)
     # A reversed coil is not isolated: its sign is changed.
     expected = COIL_JUDGED if part == "coil" else {REACTION.get(part)}

@@ -44,7 +44,7 @@ OWN_OF_KIND: dict[str, frozenset[str]] = {
     "imu: intermittent": OWN["imu"] | {"stream-poor"},
     "imu: cut": OWN["imu"] | {"stream-poor"},
 }
-"""Exceptions from the table, by kind of fault."""
+"""Events that report a fault, for the kinds of fault that differ from the entries of `OWN`."""
 
 REACTION: Mapping[str, str] = {
     "imu": "control-lost",
@@ -53,11 +53,11 @@ REACTION: Mapping[str, str] = {
     "coil": "coil-broken",
     "bridge": "coil-broken",
 }
-"""Event whose reaction in the table of events must follow: coils off, or isolation."""
+"""Event whose reaction in the table of events (coils off, or isolation) must follow."""
 
 
 def part_of(kind: FaultKind) -> str:
-    """Return the device name of a fault in the table, which has one row for the coils of all axes."""
+    """Return the device name that the table uses for a fault; the coils of all axes share one row."""
     return kind.device.partition("-")[0]
 
 
