@@ -58,7 +58,7 @@ def test_a_coil_reversed_in_the_tumble_is_soon_flown_with_its_sign_changed(tmp_p
 
 
 def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: Path) -> None:
-    """All three coils are driven at their limit, so that only the probe shows which coil is open."""
+    """All three coils are driven at their limit, so that only the probe of single coils shows an open one."""
     found = coil_judgement(_flown(tmp_path, 12.0, "coil-y: open"), "y")
     assert found["isolated_s"] is not None
     assert found["isolated_s"] < 10.0

@@ -51,8 +51,8 @@ class DeterminationSettings:
             sqrt(s).
         start_sigma: largest standard deviation of the worst axis at the start, rad.
         start_age: largest age of directions at the start, s.
-        lost_sigma: standard deviation, rad, above which the estimate is discarded, because linearisation is
-            no valid approximation.
+        lost_sigma: standard deviation, rad, above which the estimate is discarded, because the linearisation
+            is then invalid.
         fresh: longest time without accepted measurements for which a sensor counts as in use, s.
         gate_sigma: rejection threshold of measurements, in sigma.
         longest_step: longest step of the filter, s.

@@ -1,9 +1,9 @@
 """Campaign `faults`: every fault of the catalogue in every mode, at random times, in lock-step.
 
-Each run flies the demonstration's loop for half a minute in one mode and injects one fault at the wire, at a
-random time and for a random duration; faults of coils and bridges last to the end. The campaign then
-evaluates the log: whether a specific event reported the fault (`fault_table`), whether the reaction of the
-table followed, how long after the end of the fault the flight recovered, which currents the coils carried
+Each run flies the demonstration's loop for half a minute in one mode. It injects one fault on the device
+lines, at a random time and for a random duration; faults of coils and bridges last to the end. The campaign
+then evaluates the log: whether a specific event reported the fault (`fault_table`), whether the reaction of
+the table followed, how long after the end of the fault the flight recovered, which currents the coils carried
 without measurements, and whether the log is complete. A fault of an unused part (a coil that is not driven, a
 planner without a request) has no effect and counts as not exercised. Exercised faults that no event reported
 are listed with the number of their flight; `refly(seed, number)` repeats a flight.
@@ -41,7 +41,7 @@ _LOOKS = {"camera", "vision"}
 def faults() -> list[FaultKind]:
     """Return the faults of the testbed's devices in lock-step.
 
-    The campaign `orbit-faults` flies those of the magnetometer.
+    The campaign `orbit-faults` covers the faults of the magnetometer.
     """
     config = demo_config(30.0)
     both = [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
@@ -60,7 +60,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly one case and return its judgement."""
+    """Run one case, and return its evaluation."""
     kind, mode = CATALOGUE[case.parameters["fault"]], case.parameters["mode"]
     rng = np.random.default_rng(case.seed)
     at = 0.0 if mode == "boot" else float(rng.uniform(4.0, 11.0))

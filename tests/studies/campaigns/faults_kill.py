@@ -1,10 +1,10 @@
 """Campaign `faults-kill`: kill -9 of the flight process at random times of a real-time run.
 
-A case is a board. Its emulated devices run in a separate process all the time, and its stored state persists.
-One flight after the other is killed, a quarter of them before they are ready. After each kill the campaign
-samples the currents of the coils every few milliseconds and reads the log and the stored state, and the next
-flight must start. The last flight is stopped by SIGTERM. It must have a record of all kills, and fly in safe
-mode if the number of kills reaches the limit of its configuration.
+A case is a board whose emulated devices run in a separate process all the time, and whose stored state
+persists. Its flights are killed one after the other, a quarter of them before they are ready. After each kill
+the campaign samples the currents of the coils every few milliseconds and reads the log and the stored state,
+and the next flight must start. The last flight is stopped by SIGTERM. The last flight must have a record of
+all kills, and must be in safe mode if the number of kills reaches the limit of its configuration.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight, devices_running, write_config
 
 START_S = 1.5
-"""Time (s) from exec to READY that is assumed until the first start is measured."""
+"""Time (s) from the start of the process to READY, which is assumed until the first start is measured."""
 
 AT_MOST_S = 60.0
 
 
 @dataclass
 class Board:
-    """Devices, state and counts that outlive a flight process.
+    """Devices, stored state and counts of a board, which outlive its flight processes.
 
     Attributes:
-        boots: number of flights that have counted themselves.
+        boots: number of flights that have recorded their own start.
         start_s: time (s) until READY of the last start.
         left: processes that were children of a flight when it was killed.
     """
@@ -58,12 +58,12 @@ class Board:
 
     @property
     def state(self) -> Path:
-        """Folder of the stored state."""
+        """Folder of the flight's stored state."""
         return self.place / "state"
 
     @contextmanager
     def flight(self, number: int, target: float, crash_limit: int) -> Iterator[LiveFlight]:
-        """Start a flight to `target` in a folder of its own; end it with the block."""
+        """Start a flight to `target` in a folder of its own, and end it at the end of the `with` block."""
         folder = self.place / f"flight-{number}"
         folder.mkdir()
         config = write_config(folder)
@@ -84,11 +84,11 @@ class Board:
                     flight.process.stderr.close()
 
     def current(self) -> float:
-        """Return the largest true current (A) of the coils now."""
+        """Return the largest present true current (A) of the coils."""
         return float(np.abs(self.bus.call("currents")).max())
 
     def kept(self) -> tuple[StoredState, list[str]]:
-        """Return the stored state, and the faults of its files."""
+        """Return the stored state, and a list of faults in its files."""
         problems: list[str] = []
         state = StateStore(self.state, lambda _, text: problems.append(text)).load()
         return state, problems
@@ -96,7 +96,7 @@ class Board:
 
 LIMIT_S = 0.5
 KILLS = 16
-"""Number of kills of a board: the highest `crash_limit` that a configuration may have."""
+"""Number of kills of a board, which is the highest `crash_limit` that a configuration may have."""
 
 EARLY = 0.25
 """Fraction of the kills that come before the flight is ready."""
@@ -118,7 +118,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Kill the flights of a board one after the other; stop the last by SIGTERM."""
+    """Kill the flights of one board one after the other, and stop the last one by SIGTERM."""
     rng = np.random.default_rng(case.seed)
     begun = time.monotonic()
     kills: list[Result] = []
@@ -141,7 +141,7 @@ def run(case: Case) -> Result:
 
 
 def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
-    """Start a flight, kill it, and check coils, log and state."""
+    """Start a flight, kill it, and check coil currents, log and stored state."""
     early = bool(rng.random() < EARLY)
     share, target = float(rng.random()), float(rng.uniform(-_TARGET, _TARGET))
     with board.flight(number, target, KILLS) as flight:
@@ -169,7 +169,7 @@ def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def _current_until(board: Board, kill_ns: int) -> float:
-    """Wait for a time; return the largest current of the last tenth of a second, or of the last sample.
+    """Wait until `kill_ns`; return the largest current (A) of the last 0.1 s, or the last sample if none.
 
     One sample is not enough, because a flight switches its coils off at times to read the magnetometer.
     """
@@ -184,8 +184,9 @@ def _current_until(board: Board, kill_ns: int) -> float:
 def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
     """Return the time (s) from the kill to lasting zero current, and the largest current after the limit.
 
-    The first answer of zero counts. It can be late by the time between two samples, but not early. Coils that
-    carried current are watched beyond the limit, and others for long enough to see that they stay at zero.
+    The first sample of zero current determines the time, which can be late by one sample interval, but not
+    early. Coils that carried current are watched beyond the limit, and others for long enough to see that
+    they stay at zero.
     """
     zero_after = beyond = 0.0
     driven = before > 0.0
@@ -210,7 +211,7 @@ def _log_of(folder: Path, ready_for: float | None) -> Result:
     try:
         flown = read_run(folder)
     except UsageError as error:
-        # Without a packet on disk the log is correct only in the first moments of a flight.
+        # A log without a packet on disk is correct only in the first second of a flight.
         return {"readable": ready_for is None or ready_for < _LOGGED_S, "packets": 0, "problem": str(error)}
     packets = sum(sum(log.counts.values()) for log in flown.logs.values())
     return {"readable": _whole(flown), "packets": packets, "problem": ""}
@@ -228,8 +229,8 @@ def _whole(flown: Run) -> bool:
 def _state_of(board: Board, counted: bool) -> Result:
     """Return whether the stored state is intact and lists all kills, except perhaps an early one.
 
-    It must list every boot so far as unclean, the last by `running`, the others by name. A flight that was
-    ready must have counted itself.
+    The state must list every boot so far as unclean: the last boot by `running`, the others by name. A flight
+    that was ready must have recorded its own start.
     """
     state, problems = board.kept()
     new = state.boot_count - board.boots
@@ -242,7 +243,7 @@ def _state_of(board: Board, counted: bool) -> Result:
 def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
     """Stop a flight by SIGTERM; return whether its end and its mode are correct.
 
-    The number of kills equals the crash limit, or is one too small for safe mode.
+    The number of kills equals the crash limit, which leads to safe mode, or is one smaller.
     """
     crash_limit = int(np.clip(board.boots + rng.integers(2), 1, KILLS))
     with board.flight(number, 0.1, crash_limit) as flight:
@@ -268,7 +269,7 @@ def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return for how long the coils carried current after kills, and the other results."""
+    """Return the times for which the coils carried current after kills, and the other results."""
     del folder
     kills = [kill for result in results for kill in result["kills"]]
     ends = [result["end"] for result in results if result["end"] is not None]

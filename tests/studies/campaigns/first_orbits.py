@@ -1,9 +1,9 @@
-"""Campaign `first-orbits`: initial orbits from one pass each, with errors relative to their claims.
+"""Campaign `first-orbits`: initial orbit determination from single passes, with errors and claimed sigmas.
 
-Observer and object move in two random low orbits, which are integrated by DOP853. The object passes at 100 to
-3,000 km and rotates the line of sight by 0.05 to 0.6 deg/s in the middle of the pass. There is a sighting
-every two seconds, with an error of 0.1 px of a camera with 1024 px over 20 deg. The simulation includes light
-time and the motion of the Earth around the Sun.
+Observer and object move in two random low orbits, which are integrated by DOP853. The object passes at a
+distance of 100 to 3,000 km, and in the middle of the pass the line of sight rotates at 0.05 to 0.6 deg/s.
+There is a sighting every two seconds, with an error of 0.1 px of a camera with 1024 px over 20 deg. The
+simulation includes light time and the motion of the Earth around the Sun.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SUNWARD = np.array([0.0, 29_780.0, 0.0])
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` passes with each arc."""
+    """Return `runs` passes for each arc length."""
     return [
         Case(f"{run}/{arc:g}", (seed, run), {"arc": arc, "period": PERIOD})
         for arc in ARCS

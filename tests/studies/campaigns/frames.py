@@ -1,10 +1,10 @@
-"""Campaign `frames`: mutated, repeated and reordered telecommand frames near the limits of the counter.
+"""Campaign `frames`: altered, repeated and reordered telecommand frames near the limits of the frame counter.
 
 Each run starts a link process whose next counter is near a limit, and sends it 1,000 frames in portions:
 genuine frames in another order, repetitions, damaged frames with a wrong or a correct CRC, joined parts of
-two frames, and authentic frames whose IV of 96 bits is near a limit. The link may execute no command twice
-and no command that the ground did not make, no frame may end the process, and the link must execute the next
-genuine command.
+two frames, and authentic frames whose IV of 96 bits is near a limit. The link must not execute a command
+twice, nor a command that the ground did not send. No frame may end the process, and the link must execute the
+next genuine command.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.flight.link.vaults import frame_with
 
 FRAMES, PORTION, GENUINE, LAST = 1000, 50, 30, 9999
 EDGES = (0, 2**31, 2**32, 2**63 - 1, 2**63, 2**63 + 1, 2**64 - 1, 2**64, 2**95, 2**96 - 1)
-"""Numbers of 96 bits; the lowest 64 bits are the counter."""
+"""IV values (96 bits) near limits; the lowest 64 bits are the counter."""
 STARTS = (0, 2**31 - 5, 2**32 - 5, 2**63 - 70_000, 2**63 - 20)
 KINDS = ("repeated", "flipped", "flipped, CRC right", "cut", "joined", "edge", "noise")
 
@@ -61,7 +61,7 @@ def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
             for _ in range(PORTION):
                 kind = KINDS[draw.integers(len(KINDS))] if draw.random() > 0.04 or not waiting else "genuine"
                 kinds[kind] += 1
-                if kind == "genuine":  # one of the next three frames, in any order
+                if kind == "genuine":  # a genuine frame is one of the next three, in any order
                     link.wire.up.append(waiting.pop(int(draw.integers(min(3, len(waiting))))))
                 else:
                     past = genuine[: max(GENUINE - len(waiting), 1)]

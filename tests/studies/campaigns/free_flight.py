@@ -1,6 +1,6 @@
 """A free satellite for campaigns: the simulated world, a random orbit, and sensors with noise.
 
-The executive and the emulated devices are left out, so a flight costs only the processor time of the world.
+The simulation omits executive and emulated devices, so a flight needs only the processor time of the world.
 Control rates are lower than 40 Hz.
 """
 
@@ -18,27 +18,27 @@ from sim_hal.worlds.free_body import CRAFTS, FreeBody
 
 SECOND = 1_000_000_000
 CRAFT = {"knightcube": 0.0959, "cubesat_3u": 0.2}
-"""Limit of the dipole moment of each coil (A m^2)."""
+"""Largest dipole moment (A m^2) of each coil, by craft."""
 WATTS = {"knightcube": 54.8, "cubesat_3u": 5.0}
-"""Power of the coils per squared dipole moment, W/(A m^2)^2."""
+"""Power of the coils per squared dipole moment, W/(A m^2)^2, by craft."""
 ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6), "low": (300e3, 51.6), "equator": (500e3, 0.0)}
-"""Altitude (m) and inclination (deg)."""
+"""Altitude (m) and inclination (deg) of each orbit."""
 UTC = "2026-11-23T00:00:00Z"
 FIELD_NOISE, HARD_IRON = 1e-7, 1.5e-7
-"""Noise of a VN-100's magnetometer at 40 Hz (T), and bias of an axis after calibration (T)."""
+"""Magnetometer of a VN-100: noise (T) at 40 Hz, and bias (T) of an axis after calibration."""
 GYRO_NOISE, GYRO_BIAS, GYRO_BIAS_WALK = 6.1e-5, 5e-4, 2e-6
 """Noise (rad/s per sqrt(Hz)), bias (rad/s), and random walk of the bias (rad/s per sqrt(s)) of a VN-100's
 gyro.
 """
 FIX_SIGMA, FIX_VELOCITY_SIGMA = 10.0, 0.05
-"""Standard deviations of a fix: position (m) and velocity (m/s)."""
+"""Standard deviations of a GPS fix: position (m) and velocity (m/s)."""
 STILL = {"ring_current": 0.0, "day_bulge": 0.0, "walks": 0.0}
-"""Settings without the disturbances that other simulators lack."""
+"""Settings that switch off the disturbances that other simulators do not model."""
 _STREAM = 0xF11
 
 
 class FreeFlight:
-    """True states of one seed under the commanded dipole."""
+    """True states of a satellite, drawn by one seed, under a commanded dipole."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class FreeFlight:
         disturbances: Disturbances | None = None,
         description: DescriptionErrors = NO_ERRORS,
     ) -> None:
-        """Release the craft at time 0 on `orbit`, whose node and phase are drawn by the seed.
+        """Release the craft at time 0 on `orbit`; the seed determines node and phase.
 
         The true body differs from the described craft by `description`.
         """
@@ -102,13 +102,13 @@ class FreeFlight:
         self.time_ns = time_ns
 
     def field(self, samples: int = 1) -> FloatArray:
-        """Return the mean (3,), T, of samples of the magnetometer now; the coils must be off."""
+        """Return the mean (3,), T, of magnetometer samples at the present time; the coils must be off."""
         noise = FIELD_NOISE / np.sqrt(samples) * self.generator.standard_normal(3)
         astray = attitude_matrix(self.motion.quaternion) @ self.field_error
         return np.asarray(self.motion.field_body + self.hard_iron + astray + noise)
 
     def attitude(self, sigma: float) -> FloatArray:
-        """Return the attitude (4,) with an error of `sigma` (rad) per axis."""
+        """Return the present attitude (4,) with a random error of `sigma` (rad) per axis."""
         error = from_rotation_vector(sigma * self.generator.standard_normal(3))
         return multiply(error, self.motion.quaternion)
 

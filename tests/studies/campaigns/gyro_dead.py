@@ -1,14 +1,14 @@
-"""Campaign `gyro-dead`: the testbed's step demonstration, and an orbit, while the gyro gives no valid rate.
+"""Campaign `gyro-dead`: step demonstration and orbit flights in which the gyro gives no valid rate.
 
 The gyro fails at a random time in the first minute, in every third flight before the start. The coils disturb
-the magnetometer by 5e-4 T/A. With the camera the flight of the testbed has star attitudes and streak rates,
-without it only the magnetometer and the plant model. A step counts as reached if the true angle stays within
-0.5 deg of the target in the last 70 s of the step.
+the magnetometer by 5e-4 T/A. With its camera the testbed has star attitudes and streak rates; without it,
+only the magnetometer and the plant model. A step counts as reached if the true angle stays within 0.5 deg of
+the target in the last 70 s of the step.
 
 The cells `orbit` are flights of `config/orbit.yaml` from a tumble of 3 deg/s to nadir, at a random position
 of the orbit, with a body, coils and sensors that differ from the configuration within the stated accuracies.
 They have neither horizon cameras nor solar cells. The estimate uses star attitudes, streak rates, the
-magnetometer and the dynamic model. The error of the nadir axis counts from the end of the slew.
+magnetometer and the dynamic model. The error of the nadir axis is evaluated from the end of the slew on.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LIMIT = math.radians(0.5)
 ORBIT_SECONDS = 1_500.0
 """Duration (s) of a flight in orbit, in which the slew to nadir ends."""
 SETTLED = 30.0
-"""Time (s) after the start of a step from which the error counts."""
+"""Time (s) after the start of a step from which the error is evaluated."""
 _COILS = ((5e-4, 0.0, 0.0), (0.0, 5e-4, 0.0), (0.0, 0.0, 5e-4))
 
 
@@ -101,7 +101,7 @@ def in_orbit(case: Case) -> Result:
 
 
 def judged_in_orbit(flown: Run, at: float) -> Result:
-    """Return the errors of an orbit flight whose gyro fails at `at` s; the NEES is that of an axis."""
+    """Return the errors and the NEES per axis of an orbit flight whose gyro fails at `at` s."""
     packets, truth, names = flown["attitude"], flown["truth"], event_names(flown)
     known = np.isfinite(packets["rate"][:, 0]) & (seconds(packets) > at + 1.0)
     rate = np.column_stack([np.interp(seconds(packets), seconds(truth), one) for one in truth["rate"].T])
@@ -170,7 +170,7 @@ def judged(flown: Run, at: float) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return a row for the testbed's flights with camera, one for those without, and one for the orbits."""
+    """Return three rows: testbed flights with camera, testbed flights without it, and orbit flights."""
     del folder
     rows: list[dict[str, Any]] = []
     for camera in (True, False):

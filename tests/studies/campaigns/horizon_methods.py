@@ -1,13 +1,14 @@
-"""Campaign `horizon-methods`: the methods of the paper and the default methods for nadir, on the same frames.
+"""Campaign `horizon-methods`: the paper's methods and the default methods to find nadir, on the same frames.
 
-Meller et al. leave this evaluation open (chapter 5). Three level cameras at 120 deg (VT) see the Earth from
-380 to 800 km in random light. All methods know the lenses, and none knows the atmosphere. The attitudes are
-`level` (within 2 deg), `tilted` (within 15 deg, as far as the paper's cameras keep the horizon in view) or
-`any`. The limb is `sunlit` in the first two cameras, or the first shows the `terminator`. The default method
-and the method of all cameras together have the prior knowledge of a flight (as in the campaign `nadir`). The
-methods of the paper know the altitude; `graphic` also knows the pointing of the cameras, and `vector` the
-true nadir half a second earlier, at rates up to 2 deg/s. An answer is wrong if it is more than half a degree
-off, and far wrong if more than five.
+Meller et al. leave this evaluation open (chapter 5). Three level cameras 120 deg apart (VT) image the Earth
+from altitudes of 380 to 800 km in random illumination. All methods know the lenses, and none knows the
+atmosphere. The attitudes are `level` (within 2 deg), `tilted` (within 15 deg, as far as the paper's cameras
+keep the horizon in view) or `any`. In `sunlit` scenes the first two cameras show a sunlit limb; in
+`terminator` scenes the first camera shows the terminator. The default method and the method of all cameras
+together have the prior knowledge of a flight (as in the campaign `nadir`). The methods of the paper know the
+altitude; `graphic` also knows the pointing of the cameras, and `vector` the true nadir half a second earlier,
+at rates up to 2 deg/s. A result is wrong if its error exceeds half a degree, and far wrong if it exceeds five
+degrees.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ _MOST_DRAWS = 20_000
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` instants of each attitude in each light."""
+    """Return `runs` instants of each attitude in each illumination."""
     return [
         Case(f"{attitude}-{light}-{run}", (seed, number, place, run), {"attitude": attitude, "light": light})
         for number, attitude in enumerate(ATTITUDES)
@@ -116,7 +117,10 @@ def _cameras() -> list[MountedCamera]:
 def _draw(
     case: Case, generator: np.random.Generator, model: EarthCameraModel, cameras: Sequence[MountedCamera]
 ) -> dict[str, Any]:
-    """Return an instant whose first camera has the limb in that light; in sunlight also the second."""
+    """Return an instant whose first camera has the limb in the illumination of the case.
+
+    If sunlit, also the second.
+    """
     air, widest = random_air(generator), ATTITUDES[case.parameters["attitude"]]
     for _ in range(_MOST_DRAWS):
         position = (SEMI_MAJOR_AXIS + generator.uniform(*ALTITUDES)) * random_direction(generator)
@@ -188,7 +192,7 @@ def _methods(
         return first.in_body(circle_nadir(found.circle, lens, altitude))
 
     def graphic(lines: int) -> FloatArray | None:
-        # The camera's x axis in the body is to the right, its y axis down the body's z.
+        # The camera's x axis points to the right in body axes, and its y axis along body z.
         level = [LevelCamera(one.to_camera[0, :2], lens.ideal.centre) for one in cameras[:2]]
         try:
             one, other = (scan_horizon(frame, lens, lines).circle for frame in frames[:2])
@@ -215,7 +219,7 @@ def _methods(
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the table: each method in each light and attitude."""
+    """Return a table of each method in each illumination and attitude."""
     facts: dict[str, Any] = {}
     for attitude in ATTITUDES:
         for light in LIGHTS:

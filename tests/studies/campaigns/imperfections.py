@@ -1,7 +1,7 @@
-"""Camera imperfections of the campaign `mismatch`: how each changes optics, signal or counts.
+"""Camera imperfections of the campaign `mismatch`, each a change of optics, signal or counts.
 
-The estimator does not know an imperfection unless its name contains `described`: it assumes the ideal camera
-with a global shutter. For `rolling, unknown line time` the estimator treats the line time as unknown.
+The estimator assumes the ideal camera with a global shutter, except for imperfections whose name contains
+`described`. For `rolling, unknown line time` the estimator treats the line time as unknown.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def _jpeg(quality: int) -> Encoder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imperfection:
-    """One way in which a camera differs from the model.
+    """A difference between a camera and the estimator's model.
 
     Attributes:
         optics: lens, point spread, scintillation.
-        electrons: change before photon noise; collected: change after photon noise.
-        gain: e- per count; counts: change of the counts before `encode` rounds them.
+        electrons: change of the electrons before photon noise; collected: change after photon noise.
+        gain: electrons per count; counts: change of the counts before `encode` rounds them.
         line_time: time (s) between rows.
         known: settings of the estimator that differ from those of the ideal camera.
         top: saturation level (counts) that the camera reports, or None.

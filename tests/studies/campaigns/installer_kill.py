@@ -1,4 +1,4 @@
-"""Campaign `installer-kill`: kill -9 of the installer in an update, at a random time or step.
+"""Campaign `installer-kill`: kill -9 of the installer during an update, at a random time or system call.
 
 A case is a board that flies one release. Updates to other releases are killed repeatedly. Half of the kills
 end the installer and its child processes at a random time. The others end one process at a random system call
@@ -24,7 +24,7 @@ from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from tests.deploy.boards import FakeBoard
 
 KILLS = 10
-"""Number of kills of a board; then its update completes."""
+"""Number of kills of a board, after which its update completes."""
 _CALLS = "mkdir,mkdirat,symlink,symlinkat,rename,renameat,renameat2,unlink,unlinkat,fsync,openat"
 _MOST_CALLS = 1500
 
@@ -36,7 +36,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Kill updates of one board; let the last one complete."""
+    """Kill updates of one board repeatedly, and let the last update complete."""
     rng = np.random.default_rng(case.seed)
     with tempfile.TemporaryDirectory() as name:
         board = FakeBoard(Path(name) / "root")

@@ -1,7 +1,8 @@
 """Campaign `ionf`: the three satellites of Meller et al. in the loop, with separate attitudes.
 
-Each run flies one satellite pointing at nadir in sunlight, with four or three cameras at 2 Hz. The four
-attitudes of the paper (cameras, magnetometer, fused, filtered) and the flown one are compared with the truth.
+Each run flies one satellite pointing at nadir in sunlight, with four or three cameras at 2 Hz. The paper's
+four attitudes (cameras, magnetometer, fused, filtered) and the attitude that the flight uses are compared
+with the truth.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from tests.support.flights import fly
 SATELLITES = {"uw": "ionf", "vt": "ionf_vt", "usu": "ionf_usu"}
 METHODS = ("cameras", "magnetometer", "fused", "filtered", "flown")
 SETTLED = 30.0
-"""Time (s) after which attitudes count."""
+"""Time (s) after which attitudes are evaluated."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -78,7 +79,7 @@ def judged(flown: Run, since: float) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return the flights of each satellite."""
+    """Return a table of the results of each satellite."""
     del folder
     return summary({name: [one for one in results if one["name"] == name] for name in SATELLITES})
 

@@ -1,11 +1,11 @@
 """Campaigns `aged-elements` and `calendar`: errors and claimed errors of the predicted environment.
 
 `aged-elements` gives the flight software elements that are up to 60 days old with a B* that is wrong by up to
-100 %, and a receiver that is good, silent or false. `calendar` flies a revolution in every month from 2026 to
-2036, over the rollover of the GPS week in November 2038, and over a leap second. The fixes are those that the
-driver reads from NAV-PVT, with a date that is 1024 weeks early in every second case. Each craft flies its own
-orbit. Its attitude filter follows its own body for `FOLLOWED` seconds, by magnetometer and gyro alone after
-the first star attitudes.
+100 %, and a GPS receiver that is correct, silent or wrong. `calendar` flies a revolution in every month from
+2026 to 2036, over the rollover of the GPS week in November 2038, and over a leap second. The fixes are in the
+form that the driver reads from NAV-PVT messages; in every second case the date is 1024 weeks early. Each
+craft has its own orbit. Its attitude filter estimates its attitude for `FOLLOWED` seconds, with magnetometer
+and gyro alone after the first star attitudes.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from sim_hal.worlds.orbit import sun_position
 from tests.support.flights import CONFIG
 
 HONEST = 4.0
-"""Largest position error in units of its claim."""
+"""Largest acceptable position error, in units of its claimed sigma."""
 SPAN, STEP, USED_WITHIN = 1200, 10, 600
 """Duration (s) of a flight with old elements, time (s) between fixes, and time (s) within which the flight
 must use good fixes.
@@ -92,7 +92,7 @@ def lines(epoch: datetime, drag: float, angles: Sequence[float], motion: float) 
 
 
 class Receiver:
-    """Receiver on a true orbit; host time is zero at `begin_ns`, UTC ns since 1970."""
+    """A GPS receiver on a true orbit; host time is zero at `begin_ns`, UTC ns since 1970."""
 
     def __init__(self, true: TwoLineElements, begin_ns: int, rng: np.random.Generator) -> None:
         self.true, self.begin_ns, self._rng = true, begin_ns, rng
@@ -112,7 +112,9 @@ class Receiver:
         return GpsReading(time_ns, time_ns, utc_ns, position + 3.0 * noise[:3], velocity, 5.0, 0.05, 9, True)
 
     def error(self, known: EstimatedEnvironment, seconds: float) -> tuple[float, float] | None:
-        """Return the error (m) of the predicted position, and the error over its claim; None if unknown.
+        """Return the error (m) of the predicted position, also relative to its claimed sigma.
+
+        None if unknown.
 
         Positions are compared in ITRS, because a leap second changes UTC but not the Earth's rotation.
         """
@@ -131,13 +133,13 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 Orbit = tuple[datetime, float, Sequence[float], float]
-"""Epoch, B*, angles and mean motion of an orbit, in the form of `lines`."""
+"""Epoch, B*, angles and mean motion of an orbit, as `lines` takes them."""
 
 
 def run(case: Case) -> Result:
-    """Fly one receiver with old elements; `step` is the time (s) between two fixes."""
+    """Simulate one receiver with old elements; `step` is the time (s) between two fixes."""
     rng, kind = np.random.default_rng(case.seed), case.parameters["kind"]
-    # Field and Sun can refute another orbit only if the elements agree with them.
+    # Magnetometer and Sun can reveal a fix on another orbit only if the elements agree with them.
     age, wrong = rng.uniform(0.0, 2.0 if kind in ("field", "sun") else 60.0), rng.uniform(0.0, 1.0)
     other: Receiver | None = None
     while True:
@@ -186,7 +188,7 @@ def _orbit(rng: np.random.Generator) -> Orbit:
 
 
 def _measured(receiver: Receiver, seconds: float, *, with_field: bool = True) -> tuple[float, float]:
-    """Return the strength of the field, T, or NaN, and the visible fraction of the Sun's disc."""
+    """Return the field strength, T (NaN without `with_field`), and the visible fraction of the Sun's disc."""
     date = receiver.date(seconds)
     position = receiver.true.at(date).position
     strength = float(np.linalg.norm(magnetic_field.field(date, position))) if with_field else math.nan
@@ -199,7 +201,7 @@ def _field_sigma(strength: float) -> float:
 
 
 def _contradicts(kind: str, receiver: Receiver, other: Receiver) -> bool:
-    """Return whether field or Sun, as `kind` states, at the true position contradict the other position."""
+    """Return whether field or Sun (by `kind`) at the true position contradict the position `other`."""
     places = [(_measured(receiver, seconds), _measured(other, seconds)) for seconds in range(0, SPAN, 60)]
     if kind == "sun":
         return all(here[1] == 1.0 and there[1] == 0.0 for here, there in places)
@@ -210,7 +212,7 @@ def _contradicts(kind: str, receiver: Receiver, other: Receiver) -> bool:
 def _witness(kind: str, receiver: Receiver, seconds: int, bias: float) -> Witness:
     """Return the measurements of magnetometer and solar cells on the true orbit.
 
-    Kind "sun" has only the cells.
+    A receiver of kind "sun" has only the solar cells.
     """
     strength, share = _measured(receiver, seconds, with_field=seconds % 60 == 0 and kind != "sun")
     measured = None if math.isnan(strength) else strength + bias
@@ -218,7 +220,7 @@ def _witness(kind: str, receiver: Receiver, seconds: int, bias: float) -> Witnes
 
 
 def _sent(kind: str, receiver: Receiver, rng: np.random.Generator) -> Callable[[int], GpsReading | None]:
-    """Return the function that gives the fix of a kind of receiver at each time."""
+    """Return the function that gives the fix of the receiver `kind` at each time."""
     direction = rng.standard_normal(3)
     direction /= np.linalg.norm(direction)
     size, factor, back = 10.0 ** rng.uniform(4.0, 6.0), rng.uniform(0.0, 0.9), rng.uniform(3.0, 200.0)
@@ -360,7 +362,7 @@ class _UnlikeBody:
         self.quaternion, self._rate = quaternion / np.linalg.norm(quaternion), rng.uniform(-2e-3, 2e-3, 3)
 
     def turn(self, around: FilterEnvironment) -> None:
-        """Rotate for a filter step without currents in the coils."""
+        """Advance the body by a filter step without currents in the coils."""
         for _ in range(2 * FILTER_STEP):
             torque = self._motion.torque(self.quaternion, np.zeros(3), self._dipole, np.zeros(9), around)[0]
             change = 0.5 * self._motion.acceleration(self._rate, torque)
@@ -376,7 +378,7 @@ class _UnlikeBody:
 
 
 def _followed(config: OrbitConfig, receiver: Receiver, rng: np.random.Generator) -> Result:
-    """Return the errors of a craft's attitude; `attitude_sigmas` is the largest in units of its claim."""
+    """Return a craft's attitude errors; `attitude_sigmas` is the largest one in claimed sigmas."""
     body, unit = _UnlikeBody(config, rng), config.inertial_unit
     free = FreeFilter(config.craft.inertia_matrix(), filter_settings(config))
     known = EstimatedEnvironment(None, SimClock(receiver.begin_ns))

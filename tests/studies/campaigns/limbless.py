@@ -23,7 +23,7 @@ def spectral_noise(size: Size, slope: float, generator: np.random.Generator) -> 
     rows, columns = size
     wave = np.hypot(np.fft.fftfreq(2 * rows)[:, None] * 2 * rows, np.fft.rfftfreq(2 * columns) * 2 * columns)
     white = np.fft.rfft2(generator.standard_normal((2 * rows, 2 * columns)))
-    # The noise is cut from a field of twice the size, so that opposite borders are not alike.
+    # The noise is cut from an array of twice the size, because opposite borders of periodic noise are equal.
     noise = np.fft.irfft2(white * np.maximum(wave, 1.0) ** -slope * (wave > 0.0))[:rows, :columns]
     return np.asarray((noise - noise.mean()) / noise.std())
 
@@ -134,7 +134,7 @@ def marks(size: Size, generator: np.random.Generator) -> FloatArray:
 
 
 def flares(size: Size, generator: np.random.Generator) -> FloatArray:
-    """Return the Sun's glare and its ghost images in a dark sky without Earth."""
+    """Return the Sun's glare and its ghost images against a dark sky without the Earth."""
     rows, columns = size
     y, x = np.mgrid[0:rows, 0:columns] / max(size)
     sun, middle = generator.uniform(-0.1, 1.1, 2), np.array([0.5, 0.5])

@@ -1,11 +1,11 @@
-"""Campaign `lost-in-space`: all methods of star identification, with one difficulty at a time.
+"""Campaign `lost-in-space`: all methods of star identification, with one varied parameter at a time.
 
 Michalski's thesis proposes this survey. The nominal list has a field of 15 deg, centroid noise of 0.3 px, 2
 false stars, 10 % missing stars and magnitude errors of 0.2 mag. Each of these parameters is varied alone; the
-field of view is known. All methods solve the same lists. An answer is right if its boresight is correct to
-0.05 deg and at least four in five of the identified stars are correct. All other answers are wrong. Times are
-processor times. The method `rate` also gets velocities, of a rotation of 1 deg/s that is observed for 0.5 s.
-Half of the false points are at rest on the detector; the other half have random velocities.
+field of view is known. All methods solve the same lists. A result is right if its boresight is correct to
+0.05 deg and at least four in five of the identified stars are correct. All other results are wrong. Times are
+processor times. The method `rate` also receives the points' velocities for a rotation of 1 deg/s, observed
+for 0.5 s. Half of the false points are at rest on the detector; the other half have random velocities.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def known_sky(field_deg: float) -> KnownSky:
 
 
 def answer_of(name: str, field: StarField, sky: KnownSky, motion: StarMotion) -> StarMatch:
-    """Return the answer of a method, with all inputs that it can use."""
+    """Return the result of a method, which receives all inputs that it can use."""
     if name == "rate":
         return identify_by_rate(field, sky, motion=motion)
     return METHODS[name].identify(field, sky)
@@ -119,7 +119,7 @@ def moving(drawn: StarList, generator: np.random.Generator) -> StarMotion:
 
 
 def verdict(answer: StarMatch, drawn: StarList) -> str:
-    """Return right, wrong or refused."""
+    """Return "right", "wrong" or "refused" for a result."""
     if answer.status is not MatchStatus.IDENTIFIED or answer.fix is None:
         return "refused"
     true, found = (attitude_matrix(q) for q in (drawn.attitude, answer.fix.quaternion))

@@ -1,11 +1,11 @@
-"""Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, with an independent renderer.
+"""Campaigns `mismatch` and `vibration`: frames of cameras and motions that differ from the estimator's model.
 
 `mismatch` uses each of `imperfections.IMPERFECTIONS` at rotations of 10 and 30 % of the field. `vibration`
 adds a vibration of up to 5 px at 5 to 50 Hz with one of `SHAPES`, at exposures of 0.2 and 1 s. Pointings are
 uniform over the sky, the axis is 0 to 90 deg off the boresight, and at least five stars must be usable
 (`scenes.usable`).
 
-The error of an answer is given in its own standard deviations (the square root of its NEES) and relative to
+The error of a result is given in claimed standard deviations (the square root of its NEES) and relative to
 the rate. An error of more than 6 standard deviations counts as confidently wrong; its probability is 1 in 13
 million. The true rate of a vibrating body is its mean rate between the attitudes at the ends of the exposure.
 """
@@ -48,7 +48,7 @@ _VIBRATION_TURN = 10.0
 # Smallest and largest amplitudes of a vibration, px.
 _AMPLITUDES = ((0.2, 1.0), (1.0, 5.0))
 SHAPES = ("sine", "two sines", "decaying", "noise")
-"""Time function of a vibration. A decaying vibration loses 86 % of its amplitude during the exposure."""
+"""Time profiles of a vibration. A decaying vibration loses 86 % of its amplitude during the exposure."""
 
 
 def mismatch_cases(runs: int, seed: int) -> list[Case]:
@@ -113,7 +113,7 @@ def attitudes_of(parameters: dict[str, Any], camera: StarCameraModel, rng: np.ra
 def wave(
     shape: str, cycles: float, phase: float, rng: np.random.Generator
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return a vibration of unit amplitude as a function of time in exposures, (m,) to (m,)."""
+    """Return a vibration of unit amplitude: a function of times (m,) in units of the exposure."""
     turn = 2.0 * np.pi * cycles
     if shape == "two sines":
         return lambda t: 0.6 * np.sin(turn * t + phase) + 0.4 * np.sin(1.7 * turn * t + 2.0 * phase)
@@ -180,7 +180,7 @@ def detected(
     exposure: float,
     rng: np.random.Generator,
 ) -> Image:
-    """Return the frame of an image in electrons: photon noise, detector, analogue-to-digital conversion."""
+    """Return the frame of an image in electrons, with photon noise, detector effects and digitisation."""
     if imperfection.electrons is not None:
         electrons = imperfection.electrons(electrons, rng)
     collected = rng.poisson(electrons + camera.dark_current * exposure).astype(float)
@@ -194,13 +194,13 @@ def detected(
 
 
 def run_mismatch(case: Case) -> Result:
-    """Estimate one frame of an imperfect camera and judge the answer."""
+    """Estimate the motion of one frame of an imperfect camera, and evaluate the result."""
     imperfection = IMPERFECTIONS[case.parameters["row"]]
     return judge(case, *expose(case, imperfection), imperfection)
 
 
 def run_vibration(case: Case) -> Result:
-    """Estimate one frame of a vibrating body and judge the answer."""
+    """Estimate the motion of one frame of a vibrating body, and evaluate the result."""
     imperfection = IMPERFECTIONS["none"]
     return judge(case, *expose(case, imperfection), imperfection)
 

@@ -8,8 +8,8 @@ to 2 deg). Each view is rendered with a known atmosphere, whose limb height is k
 unknown one, whose scale height and haze are random.
 
 Errors are angles between true and measured nadir (both axes together). The NEES of the two axes is 2 if the
-covariance is correct. An accepted answer more than half a degree off is wrong. Refused and ambiguous frames
-count as unanswered.
+covariance is correct. An accepted result with an error of more than half a degree is wrong. Refused and
+ambiguous frames count as unanswered.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Find nadir in one frame and judge the answer."""
+    """Find nadir in one frame, and evaluate the result."""
     model = camera_model()
     generator = np.random.default_rng(case.seed)
     scene = random_scene(generator, model, case.parameters["view"])

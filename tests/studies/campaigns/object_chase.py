@@ -2,8 +2,8 @@
 
 The flight has the filter, the planner's job and the pointing law of `orbit_pointing_flight`. The flight's own
 `ObjectAim` chooses the target from the tracks of the flight's own `ObjectTracker`. A frame every two seconds
-gives a star attitude and a sighting, whose error is drawn at random. They arrive after two seconds, as does
-the planner's table. The object moves on its own orbit, which is integrated by DOP853.
+gives a star attitude and a sighting, whose error is drawn at random. Star attitude, sighting and the
+planner's table arrive two seconds later. The object moves on its own orbit, which is integrated by DOP853.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ SIGHTING = {
     5.0: (0.010, 0.010, 0.99),
     6.0: (0.016, 0.017, 0.99),
 }
-"""By magnitude: error and claim (px) of a sighting, and the fraction of frames that show the object.
+"""Error and claimed sigma (px) of a sighting, and fraction of frames with a sighting, by magnitude.
 
 The values are those of rendered frames (`object-passes --runs 3 --seed 22`).
 """
 GAP = 10.0
-"""Time (s) without sightings, in the flights with a gap."""
+"""Duration (s) without sightings, in the flights with a gap."""
 BORESIGHT: FloatArray = np.array([0.0, -1.0, 0.0])
 
 
@@ -166,7 +166,7 @@ class ObjectChase(PointingFlight):
         return replace(job, origin_ns=self.flight.time_ns, weights=weights)
 
     def _note(self, time: float, square: float) -> None:
-        """Record no notes here; the frames record them."""
+        """Do nothing, because the notes are recorded with the frames."""
 
     def _see_stars(self, time: float) -> None:
         """Give the filter the star attitude of the frame of the previous cycle; expose the next frame."""

@@ -1,10 +1,10 @@
 """Campaign `object-flights`: objects kept in view by coils alone, with filter, planner and pointing law.
 
 Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`). Every other flight has
-no sighting for ten seconds. From the frame in which a track is followed, the object should stay within the
-field. A linear programme (`least_deviation`) computes whether a body that starts at rest could keep it there,
-with the control authority that issue 16 states and with no more roll than the rate at which the flight
-detumbles.
+no sighting for ten seconds. From the first frame in which a track is followed, the object should stay within
+the field of view. A linear programme (`least_deviation`) computes whether a body that starts at rest could
+keep it there, with the control authority that issue 16 states and with a roll rate of at most the rate at
+which a flight changes to detumbling.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from tests.studies.campaigns.object_chase import FASTEST, FIELD, GAP, NEAREST, S
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
 
 _SIDES = 16
-"""Number of sides of the polygons around the circles of deviation and authority; the authority's polygon lies
-outside its circle.
+"""Number of sides of the polygons that replace the circles of deviation and authority.
+
+The polygon of the authority encloses its circle.
 """
 
 
@@ -37,11 +38,11 @@ def least_deviation(
     authority: float,
     roll: float,
 ) -> float:
-    """Return the smallest possible largest deviation (rad) over instants that are `seconds` apart.
+    """Return the smallest achievable maximum deviation (rad) over instants that are `seconds` apart.
 
-    `directions` (n, 3) are those of the object, and `boresight` (3,) is the one at the first instant, at
-    rest. `field` is (n, 3). All are in inertial axes. `authority` is in rad/s^2. `roll` is the fastest rate
-    (rad/s) about the boresight.
+    `directions` (n, 3) to the object, the initial `boresight` (3,) of the body at rest, and the magnetic
+    `field` (n, 3) are in inertial axes. `authority` is in rad/s^2. `roll` is the fastest rate (rad/s) about
+    the boresight.
     """
     axes, count = _carried(directions), len(directions)
     speed = np.gradient(directions, seconds, axis=0)
@@ -112,9 +113,9 @@ def _turned(directions: FloatArray, axes: FloatArray, field: FloatArray) -> Floa
 
 
 AUTHORITY = {"knightcube": 0.18, "cubesat_3u": 0.012}
-"""Angular acceleration (deg/s^2) of the coils across the field."""
+"""Angular acceleration (deg/s^2) that the coils can cause across the field, by craft."""
 BANDS = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.35), (0.35, 0.6))
-"""Bands of rates (deg/s)."""
+"""Bands of the line of sight's rate (deg/s)."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:

@@ -49,13 +49,13 @@ LONG, LONG_PERIOD = (180.0, 360.0), 5.0
 """Duration of a long pass (s, smallest and largest), and period of its frames (s)."""
 MAGNITUDES = (2.0, 3.0, 4.0, 5.0, 6.0)
 SLOWEST, FASTEST = 0.05, 0.6
-"""Slowest and fastest rate (deg/s)."""
+"""Slowest and fastest rate (deg/s) of an object."""
 JUDGED = 8
-"""Number of frames between two judgements of a track."""
+"""Number of frames between two evaluations of a track."""
 OWN_TRACK = 0.01
-"""Largest angle (rad) between the object and a track that counts as its own."""
+"""Largest angle (rad) between the object and a track that counts as the object's."""
 OWN_PX = 3.0
-"""Largest distance (px) between the object and a sighting that counts as its own."""
+"""Largest distance (px) between the object and a sighting that counts as the object's."""
 CAMERA = StarCameraModel(columns=512, rows=512)
 
 
@@ -109,9 +109,9 @@ def _times(case: Case, rng: np.random.Generator) -> FloatArray:
 
 
 def _frames(flown: Pass, still: int, rng: np.random.Generator) -> list[_Frame]:
-    """Return the frames of a pass: the camera is fixed for `still` of them, and then follows the object."""
-    # Direction in camera axes in which the object crosses the boresight; the rotation that follows it is
-    # about `axis`.
+    """Return the frames of a pass: the camera is fixed for `still` frames, and then follows the object."""
+    # Direction in camera axes in which the object crosses the boresight. The camera follows the object by a
+    # rotation about `axis`.
     towards = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.cos(towards), np.sin(towards), 0.0])
     first = attitude_matrix(from_rotation_vector(axis * math.radians(2.0)))[2]
@@ -148,7 +148,7 @@ class _Frame:
     observer: FloatArray
 
     def sighted(self, magnitude: float | None, rng: np.random.Generator) -> MeasuredObjects | None:
-        """Return the sightings and attitude that the flight's own vision finds in the frame."""
+        """Return the sightings and the attitude that the flight's own image processing finds in the frame."""
         times = np.linspace(-0.5 * EXPOSURE, 0.5 * EXPOSURE, 9)
         attitudes = np.array([multiply(from_rotation_vector(self.turn * t), self.quaternion) for t in times])
         places = self.place + times[:, None] * self.motion
@@ -214,7 +214,7 @@ def _is_own(line: LineOfSightState, frame: _Frame) -> bool:
 
 
 def _nees(line: LineOfSightState, frame: _Frame) -> list[float]:
-    """Return the NEES of direction and of rate, each with two degrees of freedom."""
+    """Return the NEES of a track's direction and of its rate, each with two degrees of freedom."""
     basis = tangent_basis(line.direction)
     found = []
     for error, part in (
@@ -244,7 +244,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _row(own: Sequence[Result]) -> Result:
-    """Return the figures of passes of one duration and magnitude."""
+    """Return the results of the passes of one duration and magnitude."""
     seen = [frame for result in own for frame in result["frames"] if "error" in frame]
     found = [result["nees"] for result in own if result["nees"] is not None]
     made = [nees for track in found for nees in track]

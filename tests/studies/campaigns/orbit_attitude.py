@@ -1,4 +1,4 @@
-"""Campaign `orbit-attitude`: attitude, sigma and NEES of a direction filter over one orbit with eclipse.
+"""Campaign `orbit-attitude`: errors, sigmas and NEES of a direction filter over one orbit with an eclipse.
 
 Each run is one revolution from sunrise to sunrise (`orbit_world`) through `direction_filter`; its last 36
 minutes are dark. Some variants lose a sensor, or all cameras, permanently after ten minutes; one has worse
@@ -28,19 +28,19 @@ from tests.support.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, 
 from tests.support.sensor_suite import SensorSuite
 
 SETTLED = 300.0
-"""Time (s) after which the sunlit figures count."""
+"""Time (s) after which the errors in sunlight are evaluated."""
 WHENS = {"both": "Sun and nadir in view", "sunlit": "all sunlight", "eclipse": "end of eclipse"}
 
 
 def variant_facts(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the figures of the runs of one variant."""
+    """Return the results of the runs of one variant."""
     parts = [_parts(np.array(result["notes"])) for result in results]
     low, high = band(len(results) * 6)
-    # Instants that all runs have, counted from the end, because all eclipses end at the end of the run.
+    # Only instants that all runs have are used. They are counted from the end, where all eclipses end.
     shortest = min(len(result["notes"]) for result in results)
     nees = np.array([np.array(result["notes"])[-shortest:, 8] for result in results])
-    # Only instants at which every run has an attitude count, because the confidence band is for this number
-    # of runs.
+    # Only instants at which every run has an attitude are used, because the confidence band is for this
+    # number of runs.
     whole = np.all(np.isfinite(nees), axis=0)
     whole[: round(SETTLED / 10.0)] = False
     settled = np.mean(nees[:, whole], axis=0) / 6.0
@@ -62,9 +62,10 @@ def variant_facts(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _parts(notes: FloatArray) -> dict[str, float]:
-    """Return rms errors of an axis (deg), claimed errors, and NEES.
+    """Return rms errors per axis (deg), claimed errors (deg), and NEES by part of the orbit.
 
-    "both" has Sun and nadir in use, "sunlit" has sunlight, "eclipse" is the last minute of the eclipse.
+    In part "both" Sun and nadir are in use, "sunlit" is all sunlight, and "eclipse" the last minute of the
+    eclipse.
     """
     seconds, sunlit = notes[:, 0], notes[:, 1] > 0.5
     error, sigma, nees = notes[:, 2:5], notes[:, 5:8], notes[:, 8] / 6.0
@@ -151,7 +152,7 @@ def settings_of(suite: SensorSuite) -> DeterminationSettings:
 
 
 def run(case: Case) -> Result:
-    """Fly one orbit."""
+    """Simulate one orbit."""
     rng = np.random.default_rng(case.seed)
     suite = _suite(case)
     truth = orbit_world.world(suite, rng, case.parameters.get("seconds"))
@@ -163,7 +164,7 @@ def run(case: Case) -> Result:
 
 
 def _suite(case: Case) -> SensorSuite:
-    """Return the case's sensors."""
+    """Return the sensor suite of a case."""
     suite = suite_of(case.parameters.get("suite", SUITE))
     walk = case.parameters.get("bias_walk")
     if walk is None or suite.gyros is None:

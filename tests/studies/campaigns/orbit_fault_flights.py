@@ -1,7 +1,7 @@
 """Flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 100 s in each of its modes.
 
-No flight begins with a release at 10 deg/s: each begins near its mode. Cameras, receiver and planner run more
-often than in a real flight, so that a fault of a few seconds affects them.
+Flights do not begin with a release at 10 deg/s, but in a state close to that of their mode. Cameras, receiver
+and planner run more often than in a real flight, so that a fault of a few seconds affects them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
 DURATION = 100.0
 """Duration (s) of each flight."""
 SPEEDS = {"detumble": 0.15, "acquire": 0.004, "safe": 0.08}
-"""Rates (rad/s) at the release; 0.001 in the other modes. SAFE detumbles first."""
+"""Body rates (rad/s) at the release by mode, 0.001 in all other modes; SAFE begins with detumbling."""
 SLEWED = math.radians(60.0)
 FRAME_PERIOD = 2.5
 WIDE_OFTEN = {"period": 2.0, "fine_period": 2.0, "max_age": 4.5}
@@ -104,7 +104,7 @@ def release_attitude() -> tuple[float, float, float, float]:
 
 @cache
 def old_elements() -> tuple[str, str]:
-    """Return the configured elements as a set that is a week old and `OLD_OFF` s off along the orbit."""
+    """Return the configured elements as a week-old set that is wrong by `OLD_OFF` s along the orbit."""
     config = _orbit()
     assert config.elements is not None
     known = Satrec.twoline2rv(*config.elements)
@@ -126,7 +126,7 @@ def old_elements() -> tuple[str, str]:
         return first, second
 
     shift = 0.0
-    for _ in range(3):  # iterate for the anomaly that gives this position under the secular rates
+    for _ in range(3):  # iterate for the mean anomaly that leads to this position with the secular rates
         found = TwoLineElements(*lines(shift)).at(_begin())
         ahead = np.cross(found.position, found.velocity)
         ahead = np.cross(ahead / np.linalg.norm(ahead), found.position)

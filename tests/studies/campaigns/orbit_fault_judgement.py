@@ -22,21 +22,21 @@ from tests.studies.campaigns.orbit_fault_flights import DURATION
 
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
-"""Time (s) after the end of a fault within which its event must come: later events have another cause."""
+"""Longest time (s) after the end of a fault until its event; later events have another cause."""
 BLIND_GRACE, FIELD_GRACE = 0.1, 5.0
 """Longest times (s) to zero current: after the last reading, and after the last valid field."""
 ZERO, DRIVEN = 1e-3, 6e-3
 """Largest current (A) of a coil that is off, and smallest current (A) of a driven coil."""
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
-"""Largest errors of a correct attitude: in claimed standard deviations, and in rad."""
+"""Largest errors of an acceptable attitude: in claimed standard deviations, and in rad."""
 DIPOLE_PER_AMPERE = 0.648
-"""Dipole moment per current (m^2) of the coils of config/orbit.yaml."""
+"""Dipole moment per current (A m^2/A) of the coils of config/orbit.yaml."""
 LOOKED, FEW = 3.0, 3
 """Time (s) after an upset in which its effect is searched for, and largest number of missing IMU samples
 without effect.
 """
 LAST = 12.0
-"""Time (s) at the end of a flight in which the body must fulfil the purpose of its mode again."""
+"""Duration (s) of the end of a flight, in which the body must fulfil the purpose of its mode again."""
 SET_UP = 0.53
 """Time (s) until the PWM chip is set up. Losses before this time are not counted."""
 ACTS, RATE_OFF = 2e-3, 0.0175
@@ -93,14 +93,14 @@ def is_own(kind: FaultKind, name: str, text: str) -> bool:
 
 
 def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> bool:
-    """Return whether the part was in use while its fault lasted."""
+    """Return whether the faulty part was in use during its fault."""
     inside = _within(flown, "attitude", at, end)
     asked = np.abs(flown["attitude"]["dipole"][inside]) / DIPOLE_PER_AMPERE
     found = True
     match part_of(kind):
         case "coil" | "bridge":
             found = kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
-        # an upset need not be reported; it counts as exercised only if the unit misses samples
+        # a bit flip need not be reported; it counts as exercised only if the unit misses samples
         case part if kind.kind == "upset":
             came = int(_within(flown, "imu", at, at + LOOKED).sum())
             found = part == "imu" and round(LOOKED / CYCLE) - came > FEW
@@ -113,7 +113,7 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
         case "camera":
             found = mode not in SPINS and end - at > 6.0
         case "planner" if kind.kind == "slow":
-            found = False  # 1.5 s of the 8 s that a plan may take
+            found = False  # a slow plan takes 1.5 s of the permitted 8 s
         case "planner" | "vision":
             jobs = flown["job_timing"]
             when = seconds(jobs)
@@ -133,7 +133,7 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
 
 
 ALWAYS = {"off", "nack", "slow", "intermittent", "garbage"}
-"""Faults that a part shows whatever its commands are."""
+"""Faults that affect a part whatever its commands are."""
 SPINS = ("detumble", "safe")
 """Modes in which the body rotates too fast for the camera at first."""
 
@@ -146,7 +146,7 @@ def _is_fine(flown: Run, at: float, end: float) -> bool:
 
 
 def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -> BoolArray:
-    """Return when a broken axis was commanded in the direction that its fault affects."""
+    """Return at which samples a broken axis was commanded in the direction that its fault affects."""
     axis = "xyz".index(kind.device[-1])
     signed = flown["attitude"]["dipole"][inside][:, axis]
     wanted = {"a-low": signed > 0.0, "b-low": signed < 0.0}.get(kind.kind, np.ones(len(signed), dtype=bool))
@@ -154,7 +154,7 @@ def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
-    """Return whether the commands (10 Hz) differed from those of the stuck answer for at least a second."""
+    """Return whether the commands (10 Hz) differed from the stuck reading for at least a second."""
     asked = np.abs(flown["attitude"]["dipole"]).sum(axis=1) / DIPOLE_PER_AMPERE
     behind = round(10.0 * (kind.parameters["delay"].default or 0.0))
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
@@ -185,8 +185,8 @@ def _is_string_lit(flown: Run, at: float, end: float) -> bool:
 def works(flown: Run, mode: str) -> bool:
     """Return whether the body fulfils the purpose of its mode at the end of the flight.
 
-    A detumbling body must brake, and know its rate if the spin packet has one, or be slow. In other modes the
-    attitude must be fine, and the body must steer if the mode points.
+    In detumbling the coils must act and the rate must be known, or the body must be slow. In other modes the
+    attitude must be fine, and in pointing modes the coils must act.
     """
     truth, known = flown["truth"], flown["navigation"]["knowledge"]
     last = seconds(truth) > DURATION - LAST
@@ -242,7 +242,7 @@ def _points(flown: Run, times: np.ndarray) -> BoolArray:
 
 
 def beyond(flown: Run) -> float:
-    """Return for how long (s) the coils were driven by a wrong attitude."""
+    """Return the time (s) for which the coils were driven on the basis of a wrong attitude."""
     errors = attitude_errors(flown)
     if not len(errors.times):
         return 0.0

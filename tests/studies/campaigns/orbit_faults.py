@@ -1,10 +1,10 @@
-"""Campaign `orbit-faults`: every fault of an orbit's devices in every mode of the satellite, in lock-step.
+"""Campaign `orbit-faults`: every fault of a satellite's devices in every mode, in lock-step.
 
 Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and injects one
-fault at the wire, at a random time and for a random duration; faults of coils and bridges last to the end.
-There are also initial conditions: an element set that is a week old, no element set, and a wall clock that is
-wrong from the start. The campaign checks whether a specific event reported the fault, whether the body
-fulfils the purpose of its mode at the end, and the current of coils that were driven without valid data,
+fault on the device lines, at a random time and for a random duration; faults of coils and bridges last to the
+end. There are also initial conditions: an element set that is a week old, no element set, and a wall clock
+that is wrong from the start. The campaign checks whether a specific event reported the fault, whether the
+body fulfils the purpose of its mode at the end, and the current of coils that were driven without valid data,
 sensor by sensor (readings, field, attitude). It also checks for how long the coils were driven by an attitude
 whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an unused part (a coil that
 is not driven, a camera that is idle) counts as not exercised. `refly(seed, number)` repeats one flight.
@@ -32,7 +32,7 @@ from tests.support.flights import fly
 LASTING = ("coil", "bridge")
 ZERO = 1e-3
 BEYOND = 1.0
-"""Time (s) for which the error of an attitude may exceed its claim while the coils act."""
+"""Longest time (s) for which an attitude error may exceed its claimed sigmas while the coils act."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly one case and return its judgement."""
+    """Run one case, and return its evaluation."""
     name, mode = case.parameters["fault"], case.parameters["mode"]
     rng = np.random.default_rng(case.seed)
     kind, at, span = _when(name, mode, rng)
@@ -87,7 +87,7 @@ def refly(seed: int, number: int) -> Result:
 def fly_with(
     kind: FaultKind, mode: str, entries: tuple[FaultEntry, ...], seed: int, elements: str = ""
 ) -> Result:
-    """Fly with faults of one start and end, evaluated as faults of `kind`."""
+    """Run a flight with faults that start and end together, and evaluate them as faults of `kind`."""
     config = config_for(mode, elements, replans=kind.device == "planner", wide_often=kind.device == "wide")
     at = entries[0].at or 0.0 if entries else 0.0
     span = entries[0].span if entries else None
@@ -98,9 +98,9 @@ def fly_with(
 
 
 def _when(name: str, mode: str, rng: np.random.Generator) -> tuple[FaultKind, float, float | None]:
-    """Return the kind to evaluate, and start and duration (s) of the fault.
+    """Return the kind of fault to evaluate, and the fault's start and duration (s).
 
-    It starts before the first plan, before the first attitude, or after both.
+    The fault starts before the first plan, before the first attitude, or after both.
     """
     condition = CONDITIONS.get(name)
     if condition is not None:

@@ -3,11 +3,12 @@
 Satellite and sensors are those of the campaign `orbit-attitude` (`orbit_world`: one revolution that ends with
 an eclipse). Sun and nadir are measured in frames of all cameras of the suite, which `sim_hal.earth_camera`
 renders with the Fuga 15d and an unknown atmosphere. At each instant the solar cells of six faces give a
-coarse Sun direction. It selects the cameras that are read for the Sun, and replaces their result if the Sun
-is in no camera. Nadir is one fit through all cameras (`nadir_of_cameras`), which are read in the order of the
-expected limb. If no limb is in view, the brightness of all cameras gives a coarse nadir, and with the Sun a
-coarse attitude; both are reported separately. Gyros at 2 Hz and the field at 1 Hz go to the filter all the
-time. Frames are taken once a minute, because rendering takes most of a run.
+coarse Sun direction. The coarse direction selects the cameras that are read for the Sun, and replaces their
+result if no camera shows the Sun. Nadir follows from one fit to the frames of all cameras
+(`nadir_of_cameras`), which are read in the order of their expected amount of limb. If no limb is in view, the
+brightness of all cameras gives a coarse nadir, and with the Sun a coarse attitude; both are reported
+separately. The filter always receives the gyros at 2 Hz and the field at 1 Hz. Frames are taken once a
+minute, because rendering takes most of a run.
 
 The variants are `level` (UW, swaying about the local vertical), `any` (UW, in a random constant attitude
 relative to it), `vt` (three cameras, in the same attitudes) and `2 Hz` (UW, level, frames at 2 Hz for a
@@ -56,7 +57,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "2 Hz": {"suite": "uw", "turned": False, "period": 0.5, "seconds": 2000.0, "until": 60.0},
 }
 EARTHLIGHT = 30.0
-"""Counts of the Fuga 15d at an intensity of 0.025: a dark sea under a low Sun."""
+"""Counts of the Fuga 15d at an intensity of 0.025, that of a dark sea under a low Sun."""
 FINE = np.radians(2.0)
 """Largest sigma (rad) of the worst axis with which the attitude selects the cameras for the limb and the
 solar cells are not used.
@@ -181,7 +182,10 @@ class _Flight:
         )
 
     def _give_sun(self, now_ns: int, sun: SunOfCameras, reference: FloatArray, fine: bool) -> None:
-        """Give the filter the Sun from a camera; that of the solar cells only while the filter knows less."""
+        """Give the filter the Sun direction of a camera.
+
+        If none, that of the solar cells while the attitude is coarse.
+        """
         if sun.direction is None or sun.covariance is None:
             return
         if sun.camera is not None:

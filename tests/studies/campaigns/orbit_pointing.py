@@ -1,13 +1,14 @@
-"""Campaign `orbit-pointing`: pointing by coils alone, the attitude estimated, all disturbances.
+"""Campaign `orbit-pointing`: pointing by coils alone, with estimated attitude and all disturbances.
 
 The craft are a 3U and the KnightCube.
 
-Cells `hold` start at nadir along the flight without learned quantities and last at least two revolutions. In
-the first revolution, which does not count, the filter learns the residual dipole and the torques.
+Cells `hold` start nadir-pointing along the flight direction without learned parameters, and last at least two
+revolutions. In the first revolution, which is not evaluated, the filter estimates the residual dipole and the
+torques.
 
 Cells `day` are the same over a day, with a quarter of the runs.
 
-Cells `heavy` are the same over half a day in the dense air of a solar maximum. They count how many star
+Cells `heavy` are the same over half a day with the strong drag of a solar maximum. They count how many star
 attitudes the filter rejected, and how many in a row.
 
 Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the described ones by
@@ -19,7 +20,7 @@ least half a revolution. `lost` counts bodies farther than LOST deg off at the e
 about that axis is small (WEIGHTS of `orbit_pointing_flight`), so only the error of three axes includes it.
 
 `share` multiplies the torques that the coils cannot cancel immediately: drag, sunlight, and the rotation of
-the principal axes. The residual dipole always has its full size.
+the principal axes. The residual dipole always has its full magnitude.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
 """Largest angle (deg) of arrival: the KnightCube is the lighter body, and issue 19 permits it a larger error.
 """
 SPIN = 0.3
-"""Rate (deg/s) at the start of a turn."""
+"""Initial rate (deg/s) in the cells `turn`."""
 HOLDS = (
     ("cubesat_3u", 0.1, 0.4),
     ("cubesat_3u", 0.3, 1.2),
@@ -57,22 +58,22 @@ HOLDS = (
     ("knightcube", 0.1, 2.0),
     ("knightcube", 0.3, 5.0),
 )
-"""Craft, share, and required rms error (deg) of issue 19."""
+"""Craft, share of the worst torques, and required rms error (deg) of issue 19."""
 UNKNOWN = {"cubesat_3u": 1.2, "knightcube": 2.0}
-"""Required rms error (deg) of the nadir axis of an unknown body, at a share of 0.3 (issue 34)."""
+"""Required rms error (deg) of an unknown body's nadir axis, for 0.3 of the worst torques (issue 34)."""
 DAYS = (("cubesat_3u", 1.0), ("knightcube", 0.3))
 """Craft and share of the cells `day`."""
 DAY = 86_400.0
 HEAVY = (("iss", 7e-12), ("low", 4e-11))
-"""Orbit, and mean density of the air (kg/m^3) during half a day at a solar maximum."""
+"""Orbit, and mean atmospheric density (kg/m^3) during half a day at a solar maximum."""
 HEAVY_SHARE = 0.3
-"""Share of the flights in dense air: the centre of pressure is 6 mm from the centre of mass."""
+"""Share of the worst torques in the cells `heavy`: the centre of pressure is 6 mm from the centre of mass."""
 TURNS = tuple((craft, share) for share in (0.1, 1.0) for craft in ("cubesat_3u", "knightcube"))
 """Craft and share of the cells `turn`."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each cell with the same orbits and starts; the targets alternate."""
+    """Return `runs` flights of each cell, with the same orbits and initial states; the targets alternate."""
     found = []
     for run in range(runs):
         turn = float(np.random.default_rng([seed, run, 0x7E]).uniform(30.0, 180.0))
@@ -206,7 +207,7 @@ def _of(results: Sequence[Result], *cell: Any) -> list[Result]:
 
 
 def _held(mine: Sequence[Result], judged: Sequence[Result], watts: float) -> dict[str, Any]:
-    """Return the errors (deg) of pointing and attitude, and of the dipole (A m^2) in sunlight."""
+    """Return the pointing and attitude errors (deg), and the residual dipole's error (A m^2) in sunlight."""
     rms = [r["rms"] for r in judged]
     return {
         "runs": len(mine),

@@ -1,10 +1,10 @@
 """One run of campaign `orbit-pointing`: a craft with its filter, planning job and control law.
 
-The planner worker's job (`pointing_job`) makes the tables. A far target begins with a slew, as in the loop.
-Then the tables of the pointing law follow. They are renewed every REPLAN s, when the body leaves its path,
-and after the body was lost and has been held still (`knightcube.gnc.control.pointing_law`). The coils pause
-for a tenth of every two seconds for the magnetometer. Star attitudes come every 10 s with a delay of two
-seconds.
+The planner worker's job (`pointing_job`) makes the tables. If the target is far, the flight begins with a
+slew, as in the loop; the tables of the pointing law follow. The tables are renewed every REPLAN s, when the
+body leaves its path, and after a body far off its path has been damped
+(`knightcube.gnc.control.pointing_law`). The coils pause for a tenth of every two seconds for the
+magnetometer. Star attitudes come every 10 s with a delay of two seconds.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ TARGETS = {
 SLEW = {"knightcube": 300.0, "cubesat_3u": 900.0}
 """Duration (s) of a slew, as in the configurations."""
 CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
-"""Body axis of the star camera, which has no exclusion cone in this campaign."""
+"""Boresight of the star camera, body axes; the camera has no exclusion cone in this campaign."""
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
 """Expected torque (N m) and its random walk (N m per sqrt(s)) in the filter, as in the configurations."""
 
@@ -85,7 +85,7 @@ class PointingFlight:
 
     `notes` has a row every 10 s: time, true rotation (3,), rad, from the target of the law, attitude error
     (rad), NEES of attitude and gyro bias, error of the residual dipole (A m^2), sunlight, and power of the
-    coils (A^2 m^4). `passed`: whether each star attitude passed the gate of the filter.
+    coils (A^2 m^4). `passed` states whether each star attitude passed the gate of the filter.
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
@@ -162,8 +162,8 @@ class PointingFlight:
         acting = flight.motion.rate
         flight.advance(round((time + CYCLE) * SECOND))
         found.advance(CYCLE - PAUSE, dipole, around)
-        # The gyro gives the mean over the cycle. The filter adds its own estimate of the curvature since
-        # `begin_mean`.
+        # The gyro measures the mean rate over the cycle. The filter adds its own estimate of the rate's
+        # curvature since `begin_mean`.
         mean = _mean(before, acting, flight.motion.rate)
         change = 0.5 * CYCLE * found.acceleration
         spread = COIL_ERROR**2 * float(change @ change) + GYRO_NOISE**2 / CYCLE
@@ -171,7 +171,7 @@ class PointingFlight:
         self._see_stars(time + CYCLE)
 
     def _is_due(self, time: float) -> bool:
-        """Return whether a plan is due; during a slew only if the body left it and was held still."""
+        """Return whether a plan is due; during a slew, only if the body left its path and was damped."""
         since = time - self._begun
         if self._law is None or (self._astray.ready and since >= AGAIN):
             return True
@@ -205,7 +205,10 @@ class PointingFlight:
         return np.asarray(dipole)
 
     def _law_at(self, time: float, quaternion: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return attitude and rate of the target at a time; a free roll is that of the attitude."""
+        """Return attitude and rate of the target at a time.
+
+        A free roll angle is that of the present attitude.
+        """
         if self._law is not None:
             wanted = self._law.wanted(time - self._begun)
             return wanted.quaternion, wanted.rate
@@ -235,14 +238,14 @@ class PointingFlight:
         self._arrives = time if table.slew is None else time + pointing_job.LEAD + table.slew.horizon
 
     def _wish(self, time: float) -> SlewRequest:
-        """Return the request for a slew at a time."""
+        """Return the request for a slew that starts at `time`."""
         craft, lit = self._wanted["craft"], self._around(time).sunlit
         return SlewRequest(SLEW[craft], np.full(3, WATTS[craft]), self._filter.residual_dipole(lit), CAMERA)
 
     def _fly(self, table: PointingTable, time: float) -> None:
-        """Use a table from now on if it is finite, as the flight does.
+        """Start to use a table if its values are finite, as the flight does.
 
-        Raises LookupError without any table.
+        Raises LookupError if the first table is not finite.
         """
         if not np.isfinite(table.dipole).all():
             if self._law is None:
@@ -282,7 +285,7 @@ class PointingFlight:
         return np.asarray(self._ahead.field_at(np.array([time - self._ahead_begun]))[0])
 
     def _see_stars(self, time: float) -> None:
-        """Give the filter the attitude that was exposed a cycle ago; expose the next one."""
+        """Give the filter the star attitude of the frame exposed a cycle ago; expose the next frame."""
         if self._stars is not None and time % STARS_EVERY < CYCLE:
             self.passed.append(self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE))
         self._stars = self.flight.attitude(STAR_SIGMA)

@@ -1,12 +1,12 @@
-"""Campaign `orbit-slews`: slews in three axes by coils alone, the attitude estimated, all disturbances.
+"""Campaign `orbit-slews`: three-axis slews by coils alone, with estimated attitude and all disturbances.
 
-A 3U rotates by 30 to 180 deg in 600 to 1,200 s, the KnightCube in 300 s, among the stars. `share` multiplies
-the worst cases of drag, sunlight and the rotation of the principal axes; all other disturbances have their
-full size. The optimum is that of the true body for the same duration.
+A 3U slews by 30 to 180 deg between inertial attitudes in 600 to 1,200 s, the KnightCube in 300 s. `share`
+multiplies the worst cases of drag, sunlight and the rotation of the principal axes; all other disturbances
+have their full magnitude. The optimum is that of the true body for the same duration.
 
 A described body is held for 1,200 s before its slew. An unknown body has moments of inertia up to 5 % and
 principal axes up to 3 deg off, and a residual dipole of 4e-3 A m^2. It flies two slews, each after 60 s: the
-`first`, and a second one with what has been learned by then (`learned`).
+`first`, and a second one with the parameters that have been estimated by then (`learned`).
 
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
@@ -50,32 +50,32 @@ from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PointingFlight
 
 SHARES = (0.1, 0.3, 1.0)
 UNKNOWN_SHARE = 0.3
-"""Multiple of the worst drag and sunlight of an unknown body, that of the shipped configurations."""
+"""Share of the worst drag and sunlight torques on an unknown body, as in the shipped configurations."""
 WANTED = {"knightcube": 2.0, "cubesat_3u": 0.5}
-"""Largest angle (deg) off the target at the end (issues 16 and 34)."""
+"""Largest angle (deg) from the target at the end of a slew, by craft (issues 16 and 34)."""
 HEAT = 1.3
 """Largest ratio of the median heat to that of the true body's optimum (issue 34)."""
 LEARN, FIRST = 1_200.0, 60.0
 """Time (s) for which a described body is held before its slew, and an unknown body before its first slew."""
 HORIZON = {"knightcube": (300.0, 300.0), "cubesat_3u": (600.0, 1200.0)}
-"""Shortest and longest requested duration of a slew, s."""
+"""Shortest and longest requested duration (s) of a slew, by craft."""
 MOMENTS, AXES_DEG, RESIDUAL = 0.05, 3.0, 4.0
 """Largest relative error of a moment of an unknown body, largest rotation (deg) of its principal axes about
 each body axis, and multiple of the residual dipole of 1e-3 A m^2."""
 EVERY = 3
-"""Number of control windows from one plan for the rest of a slew to the next."""
+"""Number of control windows between two plans for the rest of a slew."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Figures of a flown slew.
+    """Results of a simulated slew.
 
     Attributes:
         angle, horizon: angle (deg) and duration (s) of the slew.
-        off: angle (deg) off the target at the end.
+        off: angle (deg) from the target at the end.
         heat, optimum: heat (J) of the flown slew and of the optimum of the true body.
-        worst: largest angle (deg) between body and path.
-        plans: number of flown plans for the rest of the slew.
+        worst: largest angle (deg) between the body's attitude and the planned path.
+        plans: number of executed plans for the rest of the slew.
     """
 
     angle: float
@@ -88,7 +88,7 @@ class Flown:
 
 
 def unknown_body(craft: str, seed: int) -> DescriptionErrors:
-    """Return the errors of the description of a craft, drawn uniformly; impossible moments are redrawn."""
+    """Return random uniform errors of a craft's description; impossible moments of inertia are redrawn."""
     generator = np.random.default_rng([seed, 34])
     described = np.diag(CRAFTS[craft].inertia)
     while True:
@@ -139,7 +139,7 @@ class SlewFlight(PointingFlight):
         return found
 
     def _slew(self, first: int) -> tuple[Flown, int]:
-        """Slew from cycle `first` on; return the figures and the number of the cycle after the slew."""
+        """Slew from cycle `first` on; return the results and the number of the first cycle after the slew."""
         start, square, watts = first * CYCLE, self.flight.square, WATTS[self._wanted["craft"]]
         self._target = _inertial(self._end)
         path = self._begin(start)
@@ -166,12 +166,12 @@ class SlewFlight(PointingFlight):
         return Flown(self._angle, path.horizon, *facts), k
 
     def _plan(self, time: float) -> None:
-        """Plan while the body is held."""
+        """Make a plan of the pointing law, unless a slew has begun."""
         if not self._slews:
             super()._plan(time)
 
     def _slew_job(self, time: float) -> PointingJob:
-        """Return the job of the slew."""
+        """Return the planning job of the next slew."""
         return replace(self._job(), slew=replace(self._wish(time), seconds=self._horizon))
 
     def _begin(self, time: float) -> SlewPath:

@@ -1,9 +1,9 @@
 """Campaign `process-kill`: kill -9 and SIGSTOP of workers, guardian and flight, in real time.
 
 A case is one flight with active planner and vision, on devices in a separate process. Workers and guardian
-are killed or stopped at random times; the log must report each, and each must be replaced. Finally the flight
-process itself is killed or stopped. The coils must come to zero current, and no process and no file of the
-flight may remain in the folder for temporary files or in shared memory.
+are killed or stopped at random times; the log must report each event, and each process must be replaced.
+Finally the flight process itself is killed or stopped. The coils must come to zero current, and no process
+and no file of the flight may remain in the folder for temporary files or in shared memory.
 
 The emulated devices and the process that samples the coils represent hardware, which needs no processor. Both
 run under SCHED_FIFO if it is permitted, so that a busy machine delays only the flight.
@@ -37,11 +37,12 @@ from tests.support.process_watch import answering, below, command
 
 LIMIT_S = 0.35
 ACTS = 10
-"""Number of kills and stops of workers and guardian in one flight; the last one hits the flight itself."""
+"""Number of kills and stops in one flight: of workers and guardian, and at last of the flight itself."""
 _LOAD = Load(600.0, camera_period=1.0, replan_period=0.5)
 _NOTICED_S = 8.0
-"""Time (s) within which a death must be on disk: noticed within two seconds and stored a second later, with a
-margin for busy machines.
+"""Time (s) within which the end of a process must be in the log on disk.
+
+It is detected within two seconds and stored a second later, and the rest is a margin for busy machines.
 """
 _HARDWARE = 70
 """SCHED_FIFO priority of the processes that represent hardware, above that of the flight."""
@@ -130,7 +131,8 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
         time.sleep(0.02)
     gone_after = _GONE_S - (deadline - time.monotonic())
     orphans = [child for child in children if lives(child)]
-    for child in orphans:  # already counted; a stopped one would keep the flight's pipe open
+    # These processes are already counted; a stopped process would keep the flight's pipe open.
+    for child in orphans:
         with suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
     return {
@@ -143,7 +145,7 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
 
 
 def _reported(folder: Path) -> dict[str, int]:
-    """Return the number of deaths of each process in the log."""
+    """Return the number of ended processes that the log reports, by process."""
     log = read_run(folder)["event"]
     died = log["code"] == events.WORKER_DIED.code
     found = Counter(text.decode().partition(":")[0] for text in log["text"][died].tolist())

@@ -1,16 +1,16 @@
 """Campaign `rate-change`: frames in which the rate changes by up to 200 % of its mean, and by more.
 
 The fields are random, theta is 0 to 90 deg, streaks have 16 to 90 px, exposures are 0.2 and 1 s. The rate
-changes linearly along its axis by 0 to 200 % of its mean, up or down; in a third of the frames by 200 %, from
-rest or to rest.
+changes linearly along its axis by 0 to 200 % of its mean, up or down; in a third of the frames the change is
+200 %, so the motion starts or ends at rest.
 
 Half as many additional frames have rotations that reverse within the exposure: 220 to 400 % in half of them,
 and up to 4,000 % in the others, over paths of the same lengths. The model does not include reversals, so a
 refusal is correct. Beyond 4,000 % both directions of the path coincide to a pixel, and no frame distinguishes
 the rotation from one that begins at rest.
 
-The frames are summed instant by instant (`row_exposure`), not by the estimator's model. An answer is right if
-its error is within 6 of its own standard deviations, or within 1 % of the rate.
+The frames are summed instant by instant (`row_exposure`), not by the estimator's model. A result is right if
+its error is within 6 claimed standard deviations, or within 1 % of the rate.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ FROM_REST = 2.0
 FROM_REST_SHARE = 1 / 3
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
-# Changes of the rate (percent of its mean), upper limits of the classes.
+# Upper limits of the classes of rate change (% of the mean rate).
 CHANGES = (50, 100, 150, 199, 200, 300, 400, 4000)
-# Change from which a reversal is visible, and largest change of each half of the reversing frames.
+# Smallest change with a visible reversal, and largest change in each half of the frames with a reversal.
 REVERSING = (2.2, 4.0, 40.0)
 
 
@@ -65,7 +65,7 @@ def _reversing(run: int, seed: int) -> Case:
     path = float(np.exp(draw.uniform(*np.log(LENGTHS))))
     parameters = {
         "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
-        # Length at the mean rate; the longer direction of the path is a multiple of it.
+        # This is the length at the mean rate. The longer branch of the reversing path is a multiple of it.
         "length": path / (0.5 * change * (0.5 + 1.0 / change) ** 2),
         "exposure": float(draw.choice(EXPOSURES)),
         "change": change * float(draw.choice([-1.0, 1.0])),

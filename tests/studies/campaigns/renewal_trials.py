@@ -1,9 +1,9 @@
-"""Campaign `renewal-trials`: good, damaged and unflyable renewals over the link, killed at random times.
+"""Campaign `renewal-trials`: valid, damaged and unusable updates over the link, killed at random times.
 
 A case is a board that flies a release and a configuration. The ground sends one bundle, activates it, and may
 confirm it. Every second run of the privileged program is killed with all its child processes at a random
-time; the link is restarted at random. After the trial period the old or the new version must fly, and the old
-one if the bundle had a flaw. The link must execute a command.
+time; the link is restarted at random. After the trial period the old or the new version must be in use, and
+the old one if the bundle had a flaw. The link must still execute a command.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 @cache
 def _made() -> RenewedBoard:
-    """Return a board from which the boards of the cases are copied."""
+    """Return the template board, which is copied for each case."""
     return RenewedBoard.make(Path(tempfile.mkdtemp(prefix="renewal-")) / "board", linked_text())
 
 

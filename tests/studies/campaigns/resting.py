@@ -1,12 +1,12 @@
-"""Campaign `resting`: attitudes from frames whose stars hardly move, of cameras unlike the model.
+"""Campaign `resting`: attitudes from frames with slow star motion, of cameras that differ from the model.
 
 The frames have each of `imperfections.IMPERFECTIONS`, streaks of 0, 1 and 3 px, an exposure of 0.2 s and the
-priors of a flight. `supersampled` renders them. The error of an attitude is given in its own standard
-deviations (the square root of its NEES): more than 6 is confidently wrong. A displaced optical axis, or a
-point spread function with a displaced centroid, rotates all attitudes by the same angle. A flight calibrates
-this rotation, as part of its mounting, with the same stars. From these rows (`SHIFTED`) the median error is
-subtracted, and the axis is in the prior. The row `none` has an exactly known lens; all others have the
-default uncertainty of an uncalibrated lens.
+priors of a flight. `supersampled` renders them. The error of an attitude is given in claimed standard
+deviations (the square root of its NEES). More than 6 counts as confidently wrong. A displaced optical axis,
+or a point spread function with a displaced centroid, rotates all attitudes by the same angle. A flight
+calibrates this rotation, as part of its mounting, with the same stars. In these rows (`SHIFTED`) the median
+error is subtracted, and the prior includes the displaced axis. The row `none` has an exactly known lens; all
+others have the default uncertainty of an uncalibrated lens.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Solve one frame of an imperfect camera and judge its attitude."""
+    """Solve one frame of an imperfect camera, and evaluate its attitude."""
     return look_at(case, IMPERFECTIONS[case.parameters["row"]], 0.0)
 
 
 def look_at(case: Case, imperfection: Imperfection, about: float) -> Result:
-    """Solve one frame whose stars move by `trail` px in its centre, and judge its attitude.
+    """Solve one frame whose stars move by `trail` px in its centre, and evaluate its attitude.
 
     The rotation about the boresight is up to `about` times that across it.
     """
@@ -109,7 +109,7 @@ def expose(
 def job(
     pixels: Image, imperfection: Imperfection, middle: FloatArray, turn: FloatArray, rng: np.random.Generator
 ) -> FrameJob:
-    """Return a flight's job with the model's camera and priors whose errors are their claims."""
+    """Return a flight's job with the model's camera, and priors with errors of their claimed sigma."""
     known: dict[str, Any] = {"gain": CAMERA.gain, "psf_sigma": CAMERA.psf_sigma, "line_time": 0.0}
     known |= {"saturation": imperfection.top} | imperfection.known
     detection = DetectionSettings(
@@ -118,7 +118,7 @@ def job(
     lens = EXACT if imperfection is IMPERFECTIONS["none"] else CameraKnowledge()
     off, faster = rng.normal(scale=_PRIOR, size=(2, 3))
     x, y = imperfection.optics.offset
-    # the mounting as a flight calibrates it: it includes the displaced axis
+    # the prior includes the displaced axis, because a flight calibrates it as part of the mounting
     off = off + np.array([y, -x, 0.0]) / CAMERA.pinhole.focal_length
     return FrameJob(
         pixels,
@@ -149,7 +149,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _judged(results: Sequence[Result]) -> list[Result]:
-    """Return the results of a row with NEES, and error and claim across the boresight (px per axis)."""
+    """Return a row's results with NEES, and error and claimed sigma across the boresight (px per axis)."""
     errors = np.array([result["error"] for result in results if result["error"] is not None])
     shift = np.zeros(3)
     if len(errors) and results[0]["row"] in SHIFTED:

@@ -1,9 +1,9 @@
-"""Campaign `restored-keys`: backups of key folders are restored, and all recorded frames are sent again.
+"""Campaign `restored-keys`: restored backups of key folders, while an attacker repeats all recorded frames.
 
-An order is a random series of commands, key changes, restarts, backups and restored backups at both ends of
-a link. After each step an attacker sends all recorded command frames again. No frame may be admitted twice,
-and no nonce may be used twice with a key. A satellite whose primary key is outdated must refuse its commands
-until a command of the reserve SPI has set a new key.
+An `Order` is a random sequence of commands, key changes, restarts, backups and restored backups at both ends
+of a link. After each step an attacker sends all recorded command frames again. No frame may be admitted
+twice, and no nonce may be used twice with a key. A satellite whose primary key is outdated must refuse its
+commands until a command of the reserve SPI has set a new key.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Order:
         self._start()
 
     def run(self) -> None:
-        """Take all steps, and end with a reachable satellite."""
+        """Run all steps, and then make the satellite reachable again."""
         for _ in range(STEPS):
             self._step(str(self._rng.choice(_ACTIONS, p=_ODDS)))
             for frame in self._recorded:
@@ -100,13 +100,14 @@ class Order:
                     present = self._vault.read(spi)
                     if present is not None:
                         Vault(folder).write(Association(spi, present.generation, 0, present.key))
-            elif self._rng.random() < 0.7:  # otherwise the running link does not notice the change
+            # The link is restarted; otherwise it does not read the restored keys.
+            elif self._rng.random() < 0.7:
                 self._start()
 
     def _command(self, spi: int) -> bool:
-        """Send a command; if the primary key is refused, set a new one by the reserve SPI.
+        """Send a command; if the primary key is refused, set a new key by the reserve SPI.
 
-        Return the success.
+        Return whether the command succeeded.
         """
         if self._send(spi):
             return True
@@ -168,7 +169,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Take the steps of one order."""
+    """Run all steps of one order."""
     with tempfile.TemporaryDirectory() as name:
         order = Order(Path(name), case.seed)
         order.run()

@@ -2,15 +2,15 @@
 
 Each run draws a world: inertia within 20 %, field and coil resistance within 10 %, a thread stiffness of 0 to
 3 times that of the demonstration (which the loop does not model), a gyro bias, noise of up to 3 times,
-readings that are one to three cycles late, an inertial unit that is silent for up to a second in a slew and
-in a hold, and 5 % of damaged packets. Every controller of `COMPARED` flies the same worlds. All are tuned in
-the modelled world by one criterion. Each flight runs the whole loop in lock-step on the emulated devices. It
-has two of the demonstration's steps, the slew from the release and the first tenth, 65 s each. All figures
-are those of the true body.
+readings that are one to three cycles late, 5 % of damaged packets, and an IMU that is silent for up to a
+second, once in a slew and once in a hold. Every controller of `COMPARED` flies the same worlds. All
+controllers are tuned by one criterion in the world that the loop models. Each flight runs the whole loop in
+lock-step on the emulated devices. A flight has two steps of the demonstration, 65 s each: the slew from the
+release, and the first change of q2 by 0.1. All results refer to the true body.
 
-While the unit is silent the coils are at zero, and the thread alone rotates the body: by k theta t^2 / (2 J),
-up to half a degree in a second. This is the excursion. The steady state excludes the silent intervals and
-`RECOVERY` s after each.
+While the unit is silent the coils are at zero, and the thread alone rotates the body by k theta t^2 / (2 J),
+up to half a degree in a second. This rotation is called the excursion. The steady state excludes the silent
+intervals and `RECOVERY` s after each.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def draw(seed: tuple[int, ...]) -> dict[str, Any]:
-    """Return one world; values without a unit in their name are factors on those of the demonstration."""
+    """Return one world; values without a unit in their name are factors of the demonstration's values."""
     rng = np.random.default_rng(seed)
 
     def about_one(share: float) -> float:
@@ -111,7 +111,8 @@ def disturb(rigged: Rigged, drawn: dict[str, Any]) -> None:
     def become(faults: LineFaults) -> None:
         wire.faults = faults
 
-    # Only after the release, because late samples of the held body would look like samples of the flight.
+    # Delays begin after the release, because late samples of the held body would look like samples of the
+    # flight.
     rigged.at(0.5, lambda: become(usual))
     for begin, span in drawn["dropouts_s"]:
         rigged.at(begin, lambda: become(LineFaults(silent=True)))
@@ -119,13 +120,13 @@ def disturb(rigged: Rigged, drawn: dict[str, Any]) -> None:
 
 
 def run(case: Case) -> Result:
-    """Fly one world under one controller."""
+    """Run a flight in one world with one controller."""
     name = case.parameters["controller"]
     return {"controller": name, **fly_world(draw(case.seed), CONTROLLERS[name]())}
 
 
 def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
-    """Fly the two steps in a drawn world with the loop of `config`; return the figures."""
+    """Run the two steps in a drawn world with the loop of `config`; return the results."""
     config = configuration.replace(config, steps=STEPS, duration=DURATION)
     with tempfile.TemporaryDirectory() as place:
         flown = fly(
@@ -138,7 +139,7 @@ def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
         names = event_names(flown)
     slew, tenth = summary["steps"]
     excursion = _worst(slew["steady_state_deg"], tenth["steady_state_deg"])
-    # None stands for a band that was never entered, or an attitude beyond all limits.
+    # None means that a tolerance band was never entered, or that an attitude exceeded all limits.
     figures = {
         "steady_state_deg": _steady_state(flown, drawn["dropouts_s"]),
         "excursion_deg": excursion,
@@ -156,7 +157,7 @@ def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
 
 
 def _steady_state(flown: Run, dropouts: Sequence[Sequence[float]]) -> float:
-    """Return the largest error (deg) in the last half minutes of the steps, without disturbed intervals."""
+    """Return the largest error (deg) in the last 30 s of each step, excluding disturbed intervals."""
     time = flown["truth"]["time_ns"] * 1e-9
     angle = 2.0 * np.arcsin(np.clip(flown["truth"]["quaternion"][:, 1], -1.0, 1.0))
     judged = np.zeros(len(time), dtype=bool)
@@ -175,7 +176,7 @@ def _worst(*values: float | None) -> float:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return median, 95th percentile and worst of each figure by controller."""
+    """Return median, 95th percentile and worst value of each result by controller."""
     facts: dict[str, Any] = {}
     for name in COMPARED:
         mine = [result for result in results if result["controller"] == name]

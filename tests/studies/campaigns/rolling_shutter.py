@@ -2,8 +2,8 @@
 
 The fields are random, theta is 0 to 90 deg, streaks have 20 to 300 px, exposures are 0.2 and 1 s, and line
 times 10 to 50 us. Each frame is estimated twice: with a prior, which gives the direction of time, and without
-one. The frames are summed row by row (`row_exposure`), not by the estimator's model. An answer without a
-prior may have the opposite sign; its covariance must span both directions. The bound is that of a global
+one. The frames are summed row by row (`row_exposure`), not by the estimator's model. A result without a prior
+may have the opposite sign; its covariance must include both directions. The bound is that of a global
 shutter.
 """
 
@@ -111,7 +111,7 @@ def _row(judged: Sequence[Result]) -> dict[str, Any]:
         "beyond_sigmas": int(np.count_nonzero(nees > WRONG_SIGMAS**2)),
         "nees": float(np.mean(nees)),
         "over_bound": float(np.sqrt(np.mean(over))),
-        # The median of chi-square over its number of degrees of freedom, 3, is 0.789.
+        # The median of chi-square with 3 degrees of freedom, divided by 3, is 0.789.
         "median_over_bound": float(np.sqrt(np.median(over) / 0.789)),
         "worst": float(np.max(vector)),
     }

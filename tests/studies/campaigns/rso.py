@@ -1,4 +1,4 @@
-"""Scenes of an object among stars, and the search for it, for the campaign `rso-orbits` and its plots."""
+"""Scenes of an object among stars, and the object search, for the campaign `rso-orbits` and its plots."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SLEW_RATE = 0.05
 TRACK_RATE = float(np.deg2rad(2.0))
 STAR_LIMIT = 8.5
 MATCH_PX = 4.0
-# Smallest distance (px) of an object from the border; the thesis also uses complete streaks.
+# Smallest distance (px) of an object from the border, because the thesis also uses only complete streaks.
 MARGIN_PX = 20.0
 # Slowest and fastest motion (rad/s) of an object among the stars: streaks of 9 to 87 px.
 SLOWEST, FASTEST = 0.006, 0.06
@@ -35,7 +35,7 @@ SLOWEST, FASTEST = 0.006, 0.06
 class Sky:
     """A scene without noise: attitudes (k, 4) at times (k,), s, and the object's directions at these times.
 
-    `rate` (3,) is the camera's in rad/s, `path` (k, 2) the object's in px.
+    `rate` (3,) is the camera's rate in rad/s, and `path` (k, 2) the object's path in px.
     """
 
     rate: FloatArray
@@ -53,7 +53,7 @@ class Sky:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Detections of a report: error (px) of the true object's ends, None if missed, and false detections.
+    """Detections in one report: error (px) of the true object's ends, or None if it was missed.
 
     `false` counts detections of objects that do not exist.
     """
@@ -73,7 +73,7 @@ def draw_sky(camera: StarCameraModel, generator: np.random.Generator, tracked: b
     while True:
         place = pinhole.unit_vectors(generator.uniform(MARGIN_PX, camera.columns - MARGIN_PX, (1, 2)))[0]
         motion = rate if tracked else _motion(generator, place)
-        # Axes of the middle attitude: a camera that rotates by `motion` follows the object.
+        # In the axes of the middle attitude, a camera that rotates by `motion` follows the object.
         among_stars = np.swapaxes(attitude_matrix(from_rotation_vector(since * motion)), 1, 2) @ place
         directions = among_stars @ attitude_matrix(middle)
         seen = (attitude_matrix(attitudes) @ directions[..., None])[..., 0]
@@ -135,5 +135,5 @@ def by_magnitude(results: Sequence[Result], magnitude: float) -> dict[str, Any]:
 
 
 def number(value: float | None, digits: int) -> str:
-    """Return a number as text, a dash for none."""
+    """Return a number as text, or a dash if the number is missing."""
     return "-" if value is None else f"{value:.{digits}f}"

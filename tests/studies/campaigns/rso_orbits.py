@@ -1,13 +1,13 @@
-"""Campaign `rso-orbits`: the ten orbits of Table 4.3, Table 4.4, and the faintest detected object.
+"""Campaign `rso-orbits`: ten orbits as in the thesis (Tables 4.3 and 4.4), and the faintest detected object.
 
 The camera rotates at 0.05 rad/s about its y axis for ten orbits, with a frame every second. The frames in
 which the object is observable are the opportunities. Run 0 starts as the thesis does; the others start at a
 random angle about that axis, and all have independent noise. The default detector, which uses the pixels, is
-compared with each indicator alone, by the thesis's strict 2.5 sigma of the frame and with the lower bounds
-that the thesis requires. The streak that an indicator selects is correct if it is the object, an overlap if
-other stars lie on it, and otherwise false. Table 4.4 is also counted with the 7,000 brightest stars alone (to
-V 6.3). The rates of the ten orbits are estimated by Harris's corners with OLAE, as in the thesis, and by the
-default method.
+compared with each indicator alone, by the thesis's strict rule of 2.5 sigma of the frame, and with the lower
+bounds that the thesis requires. The streak that an indicator selects is correct if it is the object, an
+overlap if other stars lie on it, and otherwise false. Table 4.4 is also counted with the 7,000 brightest
+stars alone (to V 6.3). The rates of the ten orbits are estimated by Harris's corners with OLAE, as in the
+thesis, and by the default method.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from tests.support.opportunities import (
 )
 from tests.support.scenes import BRIGHTEST, FIELD, catalogue, faintest
 
-# 2026-05-18 0 h TT: with a frame a second and with Sun and Earth outside half the field (2.17 and
-# 2.19), this epoch gives the thesis's number of opportunities.
+# 2026-05-18 0 h TT. With one frame per second, and with Sun and Earth at least half a field of view from the
+# boresight (2.17 and 2.19), this epoch gives the thesis's number of opportunities.
 EPOCH = 2_461_178.5
 CADENCE = 1.0
 HALF_ANGLE = 0.5 * FIELD
@@ -60,7 +60,7 @@ WANTED = 0.95
 # FAINTER.
 NEAR_PX = 6.0
 FAINTER_MAG = 4.0
-# Table 4.4 of the thesis: correct, overlapping and false streaks.
+# Table 4.4 of the thesis: correct, overlapping and false streaks of each indicator.
 THESIS = ((12, 0, 3), (10, 2, 0), (12, 2, 0))
 RULES = ("strict", "bounded")
 ESTIMATORS = ("harris", "likelihood")
@@ -92,7 +92,7 @@ def flown(seed: tuple[int, ...], run: int) -> tuple[Scenario, tuple[Opportunity,
 
 
 def run(case: Case) -> Result:
-    """Fly ten orbits and look for the object at every opportunity."""
+    """Simulate ten orbits, and search for the object at every opportunity."""
     scenario, times = flown(case.seed, case.parameters["run"])
     return {
         **case.parameters,
@@ -131,7 +131,10 @@ def corner_rate(pixels: Image, camera: StarCameraModel, prior: FloatArray) -> Fl
 
 
 def rate_error(rate: FloatArray | None, truth: FloatArray = RATE) -> list[float] | None:
-    """Return the relative error of a rate's magnitude and the error of its axis in deg; None without one."""
+    """Return the relative error of a rate's magnitude, and the error of its axis (deg).
+
+    None without a rate.
+    """
     if rate is None:
         return None
     size, true = float(np.linalg.norm(rate)), float(np.linalg.norm(truth))
@@ -192,7 +195,7 @@ def count_indicators(
 
 
 def _strict(deviations: FloatArray) -> BoolArray:
-    """Return which deviations (n, 3) are beyond 2.5 standard deviations of the frame from its mean."""
+    """Return which deviations (n, 3) differ from the frame's mean by more than 2.5 standard deviations."""
     away = np.abs(deviations - deviations.mean(axis=0))
     return np.asarray(away > 2.5 * deviations.std(axis=0))
 
@@ -213,7 +216,7 @@ def _overlap(streak: FloatArray, ends: FloatArray, magnitudes: FloatArray) -> bo
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return Table 4.4, detection over magnitude, and the pictures."""
+    """Return Table 4.4, the detection rate by magnitude, and the figures."""
     whole = [result for result in results if result.get("stars") is None]
     frames = [frame for result in whole for frame in result["frames"]]
     rows = [by_magnitude(frames, magnitude) for magnitude in MAGNITUDES]
@@ -251,7 +254,7 @@ def table_4_4(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def weakest(rows: Sequence[dict[str, Any]]) -> float | None:
-    """Return the faintest magnitude down to which 95 % are detected at every magnitude."""
+    """Return the faintest magnitude up to which at least 95 % of objects are detected at every magnitude."""
     found = None
     for row in rows:
         if not row["frames"] or row["found"] < WANTED * row["frames"]:

@@ -1,11 +1,11 @@
-"""Campaign `safe-sun`: sun acquisition in SAFE mode by solar cells, gyro and magnetometer, and its hold.
+"""Campaign `safe-sun`: Sun acquisition and pointing in SAFE mode by solar cells, gyro and magnetometer.
 
 Both craft fly alternately in two orbits for two revolutions of 97 min, from a random attitude and a rate of
 0.5 deg/s, at which detumbling ends. Drag, sunlight and the rotation of the principal axes are `share` of the
-worst case; gravity gradient and residual dipole have their full size. The solar cells have gain errors and
-see the sunlit Earth. `found` is the time at which the axis first comes within NEAR deg of the Sun. `rms` is
-the angle of the axis off the Sun in sunlight after SETTLED s, including the time after each eclipse. `again`
-is the longest time from the end of an eclipse until the axis is within NEAR deg.
+worst case; gravity gradient and residual dipole have their full magnitude. The solar cells have gain errors
+and also receive light from the sunlit Earth. `found` is the time at which the axis first comes within NEAR
+deg of the Sun. `rms` is the rms angle between axis and Sun in sunlight after SETTLED s, including the time
+after each eclipse. `again` is the longest time from the end of an eclipse until the axis is within NEAR deg.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 SPEED = math.radians(0.5)
 SECONDS, SETTLED = 11_600.0, 1_800.0
 NEAR = 20.0
-"""Largest angle (deg) off the Sun at which it counts as found."""
+"""Largest angle (deg) between axis and Sun at which the Sun counts as found."""
 SHARES = (0.3, 1.0)
 CYCLES = 6
-"""Number of commands in a window; the flight has 72."""
+"""Number of coil commands in a control window; the flight has 72."""
 GAIN_ERROR, STRING_NOISE = 0.02, 2e-3
-"""Relative gain error of the solar cells, and noise (A) for a peak current of one."""
+"""Relative gain error of the solar cells, and noise (A) for a peak current of 1 A."""
 _STREAM = 0x5AFE
 
 
@@ -60,7 +60,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 class SafeFlight:
     """One craft with its sun acquisition.
 
-    `notes` has a row for each window: time, angle (deg) off the Sun, sunlight and rate (deg/s).
+    `notes` has a row for each window: time, angle (deg) between axis and Sun, sunlight and rate (deg/s).
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
@@ -124,7 +124,7 @@ def run(case: Case) -> Result:
 
 
 def judged(notes: FloatArray, settled: float) -> Result:
-    """Return the figures of notes (n, 4); those of a light condition that did not occur are None."""
+    """Return the results of `notes` (n, 4); results for sunlight or eclipse are None if it did not occur."""
     times, off, lit, rate = notes.T
     near, sunlit = off <= NEAR, lit > 0.5
     later = times > settled
@@ -163,7 +163,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _figures(mine: Sequence[Result]) -> dict[str, Any]:
-    """Return the figures of one cell."""
+    """Return the results of one cell."""
     lit = np.array([result["rms"] for result in mine if result["rms"] is not None])
     dark = [result["rms_dark"] for result in mine if result["rms_dark"] is not None]
     return {

@@ -42,7 +42,7 @@ FRAMES = 14
 SHIFTED = 24
 """Number of frames of a run in the row `shift`."""
 LEARNED = 10
-"""Number of frames after which a lens counts as learned."""
+"""Number of frames after which a lens counts as estimated."""
 SIZE, EXPOSURE, BOUND_STARS, WRONG_SIGMAS = 512, 0.2, 30, 6.0
 _CAMERA = StarCameraModel(columns=SIZE, rows=SIZE, field_of_view=FIELD)
 
@@ -124,7 +124,7 @@ def expose(lens: TrueLens, rng: np.random.Generator) -> tuple[Image, FloatArray,
 
 
 def described(row: str) -> tuple[FrameJob, LensKnowledge]:
-    """Return the job without a frame, and the lens, of the camera as a row describes it."""
+    """Return the job (without a frame) and the lens of a camera as a row of the table describes it."""
     known = CameraKnowledge(distortion=0.02 if row == "distortion" else 0.005)
     spread = 0.05 if row == "field" else 0.0
     solve = SolveSettings(
@@ -141,7 +141,7 @@ def described(row: str) -> tuple[FrameJob, LensKnowledge]:
 
 
 def run(case: Case) -> Result:
-    """Estimate one lens; judge each frame, and the lens after each frame."""
+    """Estimate one lens; evaluate each frame, and the lens after each frame."""
     rng, row = np.random.default_rng(case.seed), case.parameters["row"]
     job, lens = described(row)
     known = job.tracker.solve.lens if job.tracker is not None else None
@@ -161,7 +161,7 @@ def run(case: Case) -> Result:
 
 
 def _judged(found: FrameFound, rate: FloatArray, bound: FloatArray) -> dict[str, Any]:
-    """Return status, NEES, and the claimed uncertainty as a multiple of the bound."""
+    """Return status, NEES, and the ratio of the claimed uncertainty to the bound."""
     motion, solved = found.motion, found.solution is not None and found.solution.fix is not None
     if motion.status is not StreakStatus.RATE or motion.rate is None or motion.covariance is None:
         return {"status": motion.status.value, "solved": solved}

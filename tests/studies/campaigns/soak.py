@@ -1,11 +1,11 @@
 """Campaign `soak`: hours of simulated operation in lock-step with repeated faults.
 
-Each run is some hours of the demonstration's loop without a break. A new target attitude comes every 50 to
-150 s. About once a minute a fault of the catalogue is injected at the wire for some seconds. A command puts
-isolated axes back into use. Memory and files may not grow beyond their budget, no coil may carry more than
-its limit, and after a last minute without faults the body must point to its target. `--hours 24` is four
-flights of six hours: long enough to show growing memory, and short enough that an interrupted campaign loses
-little.
+Each run is some hours of the demonstration's loop without a break. A new target attitude is commanded every
+50 to 150 s. About once a minute a fault of the catalogue is injected on the device lines for some seconds. A
+command puts isolated axes back into use. Memory and files may not grow beyond their budget, no coil may carry
+more than its limit, and after a last minute without faults the body must point to its target. `--hours 24` is
+four flights of six hours: long enough to show growing memory, and short enough that an interrupted campaign
+loses little.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def broken(result: Result) -> list[str]:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return the worst of each figure, and the flights that exceeded a limit."""
+    """Return the worst value of each result, and the flights that exceeded a limit."""
     del folder
     worst: dict[str, Any] = {
         key: max(result[key] for result in results)

@@ -1,10 +1,10 @@
 """Campaign `start`: each system call of a board's start fails once, and the board must still fly.
 
 A point is one call of the main thread, numbered from the start of its process, with one error that strace
-injects into it. The list of points is all calls of a traced start times all errors. Their number varies
-slightly between starts. The seed determines the order of the list. It alternates between calls after and
-calls before the opening of the configuration, as long as both remain, because nearly all earlier calls only
-read modules. With as many runs as points, the campaign covers the whole list.
+injects into it. The list of points is all calls of a traced start times all errors. The number of calls
+varies slightly between starts. The seed determines the order of the list. The order alternates between calls
+after and before the opening of the configuration, as long as both remain, because nearly all calls before it
+only read modules. With as many runs as points, the campaign covers the whole list.
 
 A case is a board whose emulated devices run in a separate process. Its flight starts repeatedly, each time
 with one point. The campaign replaces the service manager: it restarts a process that ends, without the fault,
@@ -93,7 +93,8 @@ def cases(runs: int, seed: int) -> list[Case]:
 def run(case: Case) -> Result:
     """Start the flight of one board repeatedly, with one fault each time."""
     with _board() as board:
-        board.trace()  # leaves state and an archive, which every board except a new one has
+        # The traced start leaves stored state and an archive, which every board except a new one has.
+        board.trace()
         faults = [
             {"fault": f"{call} {number}: {error}", "begun": begun}
             | board.start(f"{call}:error={error}:when={number}")
@@ -108,7 +109,7 @@ def _board() -> Iterator[Board]:
     if shutil.which("strace") is None:
         raise UsageError("the campaign start needs strace")
     _check_injection()
-    # The path of a socket must be short.
+    # A temporary folder is used, because the path of a socket must be short.
     with tempfile.TemporaryDirectory(prefix="kc-") as name:
         place = Path(name)
         (place / "devices").mkdir()
@@ -156,7 +157,7 @@ class Board:
         }
 
     def trace(self) -> tuple[Counter[str], Counter[str]]:
-        """Return the numbers of calls by kind: all, and those before the configuration."""
+        """Return the numbers of calls by kind: of all calls, and of those before the configuration."""
         path = self._place / "trace"
         strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)
@@ -217,7 +218,7 @@ class Board:
         return False
 
     def _end(self, begun: subprocess.Popen[str]) -> str:
-        """End a flight, of which the guardian ends last; return its standard error."""
+        """End a flight, whose guardian ends last; return its standard error."""
         if begun.poll() is None:
             os.killpg(begun.pid, signal.SIGKILL)
         said = begun.communicate()[1] or ""

@@ -1,4 +1,4 @@
-"""Campaign `streaked`: attitudes from frames of streaks, of cameras unlike the model.
+"""Campaign `streaked`: attitudes from frames of streaks, of cameras that differ from the model.
 
 The frames have the imperfections of the campaign `resting`, and streaks of 10, 20 and 40 px in the centre.
 The rotation about the boresight is at most that across it. Additional cameras have rolling shutters of 0, 20
@@ -36,7 +36,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Solve one frame of streaks and judge its attitude."""
+    """Solve one frame of streaks, and evaluate its attitude."""
     return look_at(case, ROWS[case.parameters["row"]], _ABOUT)
 
 

@@ -2,15 +2,15 @@
 
 A cell is one theta (axis to boresight) and one rotation in percent of the field (3.28). All estimators get
 the same frames. The error of the magnitude is the thesis's metric for the rate. The error of the vector has
-its own column; it is larger, because the component about the boresight is poorly determined. The attitude is
-that at an end of the exposure by ESOQ2 with the true identifications; its error is given in px by 3.29,
+its own column; it is larger, because the component about the boresight is poorly determined. The attitude at
+an end of the exposure is computed by ESOQ2 with the true identifications. Its error is given in px by 3.29,
 across the boresight and in total.
 
-`streaks-thesis` has the thesis's camera, bilinear spots and uniform noise (2.5-2.11). Its bound, given for
+`streaks-thesis` has the thesis's camera, bilinear spots and uniform noise (2.5-2.11). The bound, given for
 comparison, is that of a camera with Poisson noise. As in the thesis (3.28), the exposure determines the
 length of its streaks, at 0.05 rad/s. The biases of the detected ends are those of the thesis's spots
-(`measured_bias`). Its sky has the 7,000 brightest stars. With the whole catalogue, streaks would cross at 50
-% of the field, which displaces ends by up to 1 px.
+(`measured_bias`). Its sky has the 7,000 brightest stars. With the whole catalogue, streaks would cross at
+rotations of 50 % of the field, which would displace ends by up to 1 px.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LIKELIHOOD = "likelihood"
 NO_BIAS: Mapping[str, float] = {}
 THESIS_CAMERA = StarCameraModel(field_of_view=FIELD, psf="bilinear", noise="uniform")
 THESIS_RATE = 0.05
-"""Rate (rad/s) of the thesis's camera, at which the exposure gives the rotation: that of its chapter 4."""
+"""Rate (rad/s) of the thesis's camera (chapter 4), from which the exposure for a rotation follows."""
 THESIS_BIAS: dict[str, float] = {
     "harris": -0.07,
     "minimum-eigenvalue": 0.36,
@@ -58,7 +58,8 @@ ESTIMATORS = (*DETECTOR_NAMES, LIKELIHOOD)
 BOUND_STARS = 30
 MATCH_PX = 6.0
 WRONG = 25.9
-# Table 3.1: rate error (%) at 10 and 50 %, attitude error (px) at 10 and 50 %, smallest theta (deg).
+# Table 3.1 of the thesis, by estimator: rate errors (%) at rotations of 10 and 50 % of the field, attitude
+# errors (px) at the same rotations, smallest theta (deg).
 THESIS = {
     "harris": (0.69, 0.07, 0.10, 0.10, 20),
     "minimum-eigenvalue": (1.20, 0.19, 0.19, 0.20, 30),
@@ -141,7 +142,7 @@ def _nearest(ends: FloatArray, true: FloatArray) -> tuple[FloatArray, IntArray]:
 
 
 def _bound(scene: Scene, camera: StarCameraModel) -> list[float] | None:
-    """Return the relative bounds (1 sigma) of magnitude and vector, or None if undetermined."""
+    """Return the relative bounds (1 sigma) of the rate's magnitude and vector, or None if undetermined."""
     pinhole = camera.pinhole
     places = (scene.start, scene.middle, scene.end)
     seen = np.flatnonzero(np.any([pinhole.contains(place) for place in places], axis=0))
@@ -181,7 +182,10 @@ def _errors(found: Any, scene: Scene, camera: StarCameraModel) -> Result:
 
 
 def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float | None, float | None]:
-    """Return the mean attitude error of the two ends in px (3.29), in total and across; None without one."""
+    """Return the mean attitude error of the two ends in px (3.29), total and across.
+
+    None without an attitude.
+    """
     ends = found.endpoints[found.used]
     true = np.stack([scene.start, scene.end], axis=1)
     distance, star = _nearest(ends, true)
@@ -238,7 +242,7 @@ def _cell(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _overall(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return the likelihood estimator's figures by rotation, over all theta.
+    """Return the likelihood estimator's results by rotation, over all theta.
 
     A rate is wrong if its normalised squared error exceeds the 1 - 1e-5 quantile (chi-square of 3 degrees of
     freedom).

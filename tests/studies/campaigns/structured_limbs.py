@@ -1,6 +1,6 @@
 """Campaign `structured-limbs`: sunlit limbs behind the spacecraft's structure, with a wrong field of view.
 
-A boom, panel or rim of random shape and brightness (dark, grey, or lit and textured) covers 5 to 20 % of the
+A boom, panel or edge of random shape and brightness (dark, grey, or lit and textured) covers 5 to 20 % of the
 frame and at most half of the visible limb. The mask is `configured` as a polygon, `learned` from 30 earlier
 frames of the same camera at random attitudes, or `none`. The focal length has a normal error of 5 %, which is
 known as its uncertainty. Altitudes, atmosphere and cameras are those of the campaign `nadir`. The kind `real`
@@ -35,7 +35,7 @@ MASKS = ("configured", "learned", "none")
 KNOWN = ("nothing", "altitude", "flight")
 FIELD_SIGMA = 0.05
 EARLIER = 30
-"""Number of frames from which a mask is learned."""
+"""Number of earlier frames from which a mask is learned."""
 PHOTOGRAPH = Path(__file__).resolve().parents[4] / "shared/data/limb/opssat1_2020-08-16T062350.png"
 PHOTOGRAPH_FIELD, PHOTOGRAPH_ALTITUDE = np.radians(12.8), 515e3
 
@@ -73,7 +73,7 @@ def structure(size: tuple[int, int], generator: np.random.Generator) -> BoolArra
 
 
 def _corners(generator: np.random.Generator) -> FloatArray:
-    """Return corners (n, 2) of a panel, a boom or a rim, relative to the frame, from a random side."""
+    """Return corners (n, 2) of a panel, a boom or an edge, relative to the frame, from a random side."""
     low, high = np.sort(generator.uniform(-0.2, 1.2, 2))
     deep, slope = generator.uniform(0.1, 0.9), generator.uniform(-0.3, 0.3)
     ends = (low + slope, high + slope * generator.uniform(0.0, 1.0))
