@@ -50,7 +50,7 @@ class FrameSightings:
         directions: unit vectors (n, 3) to the objects, ICRS, corrected for stellar aberration.
         covariance: covariance (n, 3, 3) of the directions due to errors of the image positions, ICRS axes,
             rad^2; the attitude error is not included.
-        magnitudes: magnitudes (n,) of the objects, calibrated by the stars in the frame; NaN if unknown.
+        magnitudes: magnitudes (n,) of the objects, calibrated by the stars in the frame, or NaN if unknown.
         attitude: covariance (3, 3) of the attitude error, which rotates all directions of the frame, ICRS
             axes, rad^2.
         observer: position (3,) of the observer from the Earth's centre, ICRS, m, or None on the ground or if
@@ -268,13 +268,13 @@ class Track:
         seen_ns: time of the last sighting of the object, ns.
         sightings: number of sightings assigned to the track.
         frames: number of frames since the start of the track.
-        magnitude: mean magnitude of the last sightings; NaN if unknown.
+        magnitude: mean magnitude of the last sightings, or NaN if unknown.
         magnitude_sigma: standard deviation of the mean magnitude, computed from the scatter, or NaN before
             the second sighting. The common error of all magnitudes due to the colours of the stars is not
             included.
         history: one bit per frame, which is set if the frame contains a sighting; the lowest bit is for the
             newest frame.
-        measured: direction (3,) of the sighting in the newest frame; NaN without a sighting.
+        measured: direction (3,) of the sighting in the newest frame, or NaN without a sighting.
         measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.
         chi_square: chi-square of the sightings relative to the predictions, with two degrees of freedom per
             sighting after the first sighting.
@@ -318,7 +318,7 @@ class ObjectTracker:
         return tuple(sorted((t for t in self._tracks if t.confirmed), key=lambda track: track.number))
 
     def predicted(self, number: int, time_ns: int) -> LineOfSightState | None:
-        """Return the predicted line of sight of a confirmed track; None if it has ended."""
+        """Return the predicted line of sight of a confirmed track, or None if the track has ended."""
         for track in self._tracks:
             if track.number == number > 0 and time_ns >= track.line.time_ns:
                 return predict(track.line, time_ns, self._settings.motion)

@@ -84,7 +84,7 @@ from knightcube.astro.quaternion import (
 
 _MAXIMUM_STEPS = 100
 _MINIMUM_SLOPE = 1e-13
-"""Minimum product of the three differences between the largest eigenvalue of Davenport's K and the others.
+"""Minimum product of the differences between the largest and the three other eigenvalues of Davenport's K.
 
 In a narrow field of view, two of the three eigenvalue differences are of the order of one.
 """
@@ -299,7 +299,7 @@ PROFILE_METHODS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "quest": quest,
     "svd": singular_values,
 }
-"""Functions by name that return the optimal quaternion (4,) of an attitude profile matrix (3, 3)."""
+"""Functions, by name, that return the optimal quaternion (4,) for an attitude profile matrix (3, 3)."""
 
 
 def _profile_solver(method: Callable[[FloatArray], FloatArray]) -> Solver:

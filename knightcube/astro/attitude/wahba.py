@@ -169,8 +169,8 @@ def half_rotation(component: int) -> tuple[FloatArray, FloatArray]:
     """Return the matrix diagonal (3,) and the quaternion (4,) of a 180 deg rotation about a coordinate axis.
 
     The index `component` is 0, 1 or 2 for the axes x, y and z, and 3 for the identity. The 180 deg rotation
-    moves the component of a quaternion with this index into the scalar part. If the moved component is the
-    largest component, the remaining rotation is at most 120 deg.
+    moves the quaternion component with this index into the scalar part. If the moved component is the largest
+    component, the remaining rotation is at most 120 deg.
     """
     return _SIGNS[component], _HALF_ROTATIONS[component]
 

@@ -48,7 +48,8 @@ _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""Exceptions that a damaged table can raise. RuntimeError indicates unknown compression or encryption."""
+"""Exceptions that can be raised while a damaged table is read. RuntimeError indicates unknown compression or
+encryption."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

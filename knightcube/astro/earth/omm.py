@@ -33,7 +33,8 @@ from knightcube.errors import UsageError
 
 _SGP4_EPOCH = datetime(1949, 12, 31, tzinfo=UTC)
 _ANY_NUMBER, _LARGEST_NUMBER = 999_999_999, 339_999
-"""Largest satellite number of an OMM, and largest number in two-line elements, above which 0 is written."""
+"""Largest satellite number in an OMM (first value) and in two-line elements (second value), in which 0 is
+written for a larger number."""
 _FIXED = {
     "CENTER_NAME": ("EARTH",),
     "REF_FRAME": ("TEME",),

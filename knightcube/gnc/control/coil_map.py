@@ -30,7 +30,8 @@ _STEPS = 200
 _PARALLEL = 1e-6
 """Sine of the angle between two coil axes below which the coils count as parallel."""
 _NEWTON_STEPS, _EXACT = 60, 1e-9
-"""Largest number of Newton steps for limited currents, and relative accuracy of their dipole moment."""
+"""Largest number of Newton steps for limited currents, and relative accuracy of the resulting dipole
+moment."""
 _SATURATED = 1e-4
 """Weight of a coil at its limit in the Newton matrix, relative to a coil below its limit."""
 

@@ -184,7 +184,7 @@ class Detumbler:
 
     @property
     def rate(self) -> FloatArray | None:
-        """The rate (3,) across the field from the last two windows, body axes, rad/s; None before."""
+        """Rate (3,), rad/s, across the field from the last two windows, body axes, or None if unknown."""
         return self._rate
 
     def _close_window(self) -> None:

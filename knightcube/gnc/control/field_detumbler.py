@@ -23,13 +23,13 @@ to at most r within the time T if and only if every vector y satisfies
 
     h . y <= L integral of |B x y| over T + r |y|,
 
-The minimum time is the smallest T for which every y satisfies this inequality, and the planned costate is the
-y for which the inequality holds with equality. For the planned costate y, A(y) y is parallel to h, where A is
+The minimum time is the smallest T for which every vector y satisfies this inequality, and the planned costate
+is the vector y for which both sides are equal. For the planned costate y, A(y) y is parallel to h, where A is
 the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The planned costate is found by iteratively
 reweighted least squares: the matrix A is computed with the last costate, and then the next costate from A.
 Momentum along the field can be removed only after the field has rotated. The minimum-time plan may first add
-momentum across the field, which is removed later. The plan leaves a residual momentum r, because removing the
-last momentum along a slowly rotating field would take most of the time.
+momentum across the field, which is removed later. The plan leaves a residual momentum r, because the removal
+of the last momentum along a slowly rotating field would take most of the time.
 
 If a body spins along the field, the minimum-time plan first accelerates the body about an axis across the
 field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy.
@@ -449,12 +449,12 @@ class FieldDetumbler:
 
     @property
     def rate(self) -> FloatArray | None:
-        """Body rate (3,), rad/s; None before it is known."""
+        """Body rate (3,), rad/s, or None while the rate is unknown."""
         return self._filter.rate if self.trusted else None
 
     @property
     def field(self) -> FloatArray | None:
-        """Estimated present field (3,) in body axes, T; None before it is known."""
+        """Estimated present field (3,) in body axes, T, or None while the rate is unknown."""
         return self._filter.field if self.trusted else None
 
     @property

@@ -109,7 +109,7 @@ class SlewRequest:
         residual: residual dipole moment (3,) of the satellite, A m^2.
         camera: body axis (3,) of the camera.
         angles: half angles of the camera's exclusion cones for `sun`, `earth` and `moon`, rad.
-        limit: mean dipole limit of slews along each body axis (3,), A m^2; None for that of the job.
+        limit: mean dipole limit of slews along each body axis (3,), A m^2, or None for the limit of the job.
         planner: `collocation` (`slew_plan`) or `vmc`, virtual motion camouflage (`slew_vmc`).
     """
 
@@ -137,7 +137,7 @@ class SlewStart:
     Attributes:
         quaternion, rate: attitude (4,) and body rate (3,), rad/s, at the first of `times`.
         times: equally spaced times (m,) of table and preview, s.
-        kept: number of steps in the pointing table.
+        kept: number of time steps in the pointing table.
         inertia: (3, 3) kg m^2.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
@@ -462,7 +462,8 @@ class PointingJob:
         areas: relative areas (3,) of the faces on which air and sunlight act.
         slew: parameters of slews, or None if the body always approaches the attitude law without a slew.
         running: the slew in progress whose remaining part is replanned, or None if a new path is planned.
-        sight: the sighted object to which to point instead of `target`; None for the target.
+        sight: the sighted object at which the body points instead of `target`, or None if it points at
+            `target`.
     """
 
     number: int

@@ -245,7 +245,7 @@ class PathConditions:
         wanted: motion commanded by the attitude law.
         field, position: magnetic field (T) and position (m), each (n + 1, 3), ICRS.
         pressures: pressure vectors of air and sunlight, to which the torques are proportional.
-        sizes: estimated sizes (9,) of the disturbance torques, N m.
+        sizes: estimated components (9,) of the disturbance torques, N m.
         inertia, inverse: inertia tensor (3, 3) in body axes, kg m^2, and the inverse of this tensor.
         limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
     """
@@ -407,8 +407,8 @@ def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) ->
     """Return the motion from which the first linear-quadratic sweep starts.
 
     The motion is propagated with the given gains, or without control if the motion diverges with the gains.
-    The torque along the field is not limited, so far from the motion `rest` the gains may rotate the body by
-    several revolutions in a step.
+    Far from the motion `rest`, the gains may rotate the body by several revolutions in a step, because the
+    torque along the field is not limited.
     """
     nothing = MotionGains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
     for tried in (gains, nothing):

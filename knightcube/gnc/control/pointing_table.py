@@ -169,11 +169,11 @@ def best_course(
 ) -> tuple[PlannedMotion, MotionGains] | None:
     """Return the best motion over all instants from the first state of `initial`, with feedback gains.
 
-    The initial guess `initial` (n + 1,) ends on the attitude law and covers the part that will be flown. The
+    The initial guess `initial` (n + 1,) ends on the attitude law and covers the duration of the table. The
     weights `state` (6, 6) of the errors and `dipole` of the dipole moment are computed by `step_costs`.
     Returns None if no motion is found within `STEPS` iterations or if the motion exceeds the limit of the
-    coils. The result is also None if the body rotates faster than `fastest` (rad/s) in the part that will be
-    flown.
+    coils. The result is also None if the body rotates faster than `fastest` (rad/s) within the duration of
+    the table.
     """
     count, first = len(expected.field) - 1, len(initial.times)
     quaternion = np.concatenate([initial.quaternion, expected.wanted.quaternion[first:]])

@@ -1,9 +1,9 @@
 """Alignment of a body axis with the Sun by solar cells, gyro and magnetometer, without an attitude estimate.
 
-The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
-the gyro. The law demands the torque J (w^2 e - 2 z w rate), with bandwidth w, damping ratio z, and the
-rotation e from the body axis to the Sun. The coils can produce only the component of the demanded torque
-across the field (Lovera & Astolfi 2004, Automatica 40(8)). A torque about the direction of the Sun is
+The direction s of the Sun and the field B are measured in body axes, and propagated between measurements with
+the gyro rate. The control law demands the torque J (w^2 e - 2 z w rate), with bandwidth w, damping ratio z,
+and the rotation e from the body axis to the Sun. The coils can produce only the component of the demanded
+torque across the field (Lovera & Astolfi 2004, Automatica 40(8)). A torque about the direction of the Sun is
 therefore added, such that the sum has no component along the field. A torque about the Sun disturbs the
 pointing of the body axis least. Unless the field is normal to the direction of the Sun, both axes across this
 direction are controlled simultaneously, while the body may roll about the direction. The added torque about
@@ -57,7 +57,7 @@ class PropagatedSun:
 
     def __init__(self) -> None:
         self.direction: FloatArray | None = None
-        """Direction (3,) of the Sun in body axes at the last gyro reading; None if unknown."""
+        """Direction (3,) of the Sun in body axes at the last gyro reading, or None if unknown."""
         self.bias: FloatArray = np.zeros(3)
         """Gyro bias (3,), rad/s."""
         self._measured_ns = self._propagated_ns = 0
@@ -201,12 +201,12 @@ class SunAcquisition:
 
     @property
     def field(self) -> FloatArray | None:
-        """Magnetic field (3,) in body axes at the last reading, T; None before it is known."""
+        """Magnetic field (3,) in body axes at the last reading, T, or None while it is unknown."""
         return self._field
 
     @property
     def sun(self) -> FloatArray | None:
-        """Direction (3,) of the Sun in body axes at the last reading; None if unknown."""
+        """Direction (3,) of the Sun in body axes at the last reading, or None if unknown."""
         return self._sun.direction
 
     def update_sun(self, time_ns: int, sun: FloatArray) -> None:

@@ -1,25 +1,27 @@
 """A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
-Each measurement is applied at its own time. A late measurement is inserted at its own time, and all later
-measurements are applied again. The later measurements are applied in one call, or a few in each call while
-the filter continues without the late measurement (module `replay`). The rate from a streaked image is the
-mean rate during the exposure. The filter therefore keeps the attitude at the start of an exposure until the
-exposure ends. The filter can also estimate the age of the inertial unit's samples (module `mekf`). For a body
-that hangs on the testbed's thread, the filter uses only the component of each measurement about the thread.
-The torsion and the damping of the thread are known or estimated. The filter can distinguish the thread's
-torques from the estimated disturbance, because these torques depend on the angle and the rate.
+The filter applies each measurement at the time for which the measurement is valid. If a measurement arrives
+late, it is inserted at its measurement time, and all later measurements are applied again. These later
+measurements are applied either in a single call, or a few in each call while the filter continues without the
+late measurement (module `replay`). The rate from a streaked image is the mean rate during the exposure. The
+filter therefore stores the attitude at the start of an exposure until the exposure ends. The filter can also
+estimate the age of the inertial unit's samples (module `mekf`). For a body that hangs on the testbed's
+thread, the filter uses only the component of each measurement about the thread. The torsion and the damping
+of the thread are known or estimated. The filter can distinguish the thread's torques from the estimated
+disturbance, because these torques depend on the angle and the rate.
 
 The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
 broken, the model predicts an acceleration that does not occur. With a broken coil, the innovations of the
 gyro exceed their covariance within a few samples. While the coils work, the innovations of the gyro stay
-within their covariance. After such innovations, the filter treats the coil currents as unknown and follows
-the gyro. The currents of the last half second are also treated as unknown. A change of the rate that no coil
-current can cause is not evidence of wrong coil currents, because the gyro may be faulty. The commands are
-trusted again when the rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the
-last second, where c is the change of the rate that the commands should cause. The commands are confirmed if
-the response g is well determined and is 1 within its uncertainty, and if the residuals are white. While the
-coils are not driven, the commands therefore cannot become trusted again. If the gyro is noisier than assumed,
-the check widens its limits and does not raise an alarm.
+within their covariance. If the innovations exceed their covariance, the filter treats the coil currents as
+unknown and follows the gyro. The coil currents of the last half second before the detection are also treated
+as unknown. A change of the rate that no coil current can cause is not evidence of wrong coil currents,
+because the gyro may be faulty. The commands are trusted again when the rate follows the commands. The model z
+= b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate that the
+commands should cause. The commands are confirmed if the response g is well determined and is 1 within its
+uncertainty, and if the residuals are white. While the coils are not driven, the response is not determined,
+so the commands cannot become trusted again. If the gyro is noisier than assumed, the check widens its limits
+and does not raise an alarm.
 """
 
 from __future__ import annotations
@@ -465,7 +467,7 @@ class AttitudeFilter:
         return used
 
     def measure_late(self, late: Sequence[Measurement], applied: OnApplied) -> None:
-        """Insert late measurements at their own times, some of them at each call of `catch_up`.
+        """Insert late measurements at their measurement times, some of them at each call of `catch_up`.
 
         The estimate continues without the late measurements until all are inserted. At the end of the replay,
         the callback `applied` receives, for each late measurement, whether the measurement passed the gate.
@@ -535,7 +537,7 @@ class AttitudeFilter:
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
         """Apply measurements in order of time to the newest checkpoint.
 
-        Return whether the measurement `asked` passed the gate.
+        Returns whether the measurement `asked` passed the gate.
         """
         replay = Replay(self._model, self._history.newest, measurements)
         replay.advance()

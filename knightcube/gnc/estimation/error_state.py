@@ -63,8 +63,8 @@ class ErrorState:
     Attributes:
         sizes: number of elements of each block by name, in order.
         size: number of elements of the error state.
-        prior: covariance (size, size) at the start; zero for fixed blocks.
-        walks: variances (size,) of the random walks per second; zero for fixed blocks.
+        prior: initial covariance (size, size), with zeros for fixed blocks.
+        walks: variances (size,) of the random walks per second, with zeros for fixed blocks.
         considered: flags (size,) of the elements of considered blocks, or None without such a block.
     """
 

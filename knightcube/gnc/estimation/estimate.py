@@ -104,7 +104,7 @@ class FilterState(NamedTuple):
     field_bias: Vector = (0.0, 0.0, 0.0)
 
     def kept_index(self, measurement: MeanRateMeasurement) -> int:
-        """Return the index in `kept` of the attitude at the start of an exposure."""
+        """Return the index, in `kept`, of the attitude at the start of an exposure."""
         return next(index for index, (owner, _) in enumerate(self.kept) if owner is measurement)
 
 

@@ -236,10 +236,10 @@ class FreeFilterSettings:
     Each pair of values contains the initial standard deviation and the random walk per sqrt(s).
 
     Attributes:
-        gyro: standard deviation and random walk of the gyro bias, rad/s.
-        dipole, sunlit: standard deviation and random walk of the residual dipole in shadow, and of its
-            increase in sunlight, A m^2.
-        magnet: standard deviation and random walk of the magnetometer bias, T.
+        gyro: initial standard deviation and random walk of the gyro bias, rad/s.
+        dipole, sunlit: initial standard deviation and random walk of the residual dipole in shadow
+            (`dipole`), and of its increase in sunlight (`sunlit`), A m^2.
+        magnet: initial standard deviation and random walk of the magnetometer bias, T.
         field: initial standard deviation of the field model's error, T per axis.
         field_memory: correlation time of the field model's error, s.
         torque: expected magnitude and random walk of the aerodynamic torque, N m. The expected magnitudes of
@@ -427,9 +427,10 @@ class FreeFilter:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
         If the rate was not measured by the gyro, its covariance is `spread` (3, 3), rad^2/s^2. If `by_stars`
-        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slow
-        states are kept. If the previous estimate was contradicted (`doubted`), the covariance of the slow
-        states is reset to that of the settings, and implausible values of slow states are set to zero.
+        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slowly
+        varying states keep their estimated values. If the previous estimate was contradicted (`doubted`), the
+        covariance of the slow states is reset to that of the settings, and implausible values of slow states
+        are set to zero.
         """
         self.changes += 1
         if doubted:

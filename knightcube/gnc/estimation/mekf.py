@@ -9,12 +9,12 @@ later measurements need are appended to the state (stochastic cloning, Roumeliot
 The filter estimates the age that the inertial unit's samples have at their time stamps. A sample is older
 than its time stamp because of the delays of the serial line, the driver's buffer and the filters inside the
 inertial unit. Between sample and time stamp, the attitude changes by rate times age, and the rate changes by
-acceleration times age. The innovations therefore depend on the age. Only attitude samples correct the
-estimated age. Rate samples do not correct the age, because the acceleration is mostly caused by the coils,
-which respond to the noise of earlier samples. An estimate of the age from rate samples would be a closed-loop
-identification and would drift with the noise while the attitude is held. A rate sample therefore treats the
-age as a considered parameter (Schmidt 1966): its variance and correlations enter the gains of all other
-states.
+acceleration times age. The innovations of the inertial unit's samples therefore depend on the age of the
+samples. Only attitude samples correct the estimated age. Rate samples do not correct the age, because the
+acceleration is mostly caused by the coils, which respond to the noise of earlier samples. An estimate of the
+age from rate samples would be a closed-loop identification and would drift with the noise while the attitude
+is held. A rate sample therefore treats the age as a considered parameter (Schmidt 1966): its variance and
+correlations enter the gains of all other states.
 """
 
 from __future__ import annotations
@@ -162,10 +162,10 @@ def innovation(
 
 
 def _mean_rate(state: FilterState, measurement: MeanRateMeasurement, size: int) -> tuple[Vector, FloatArray]:
-    """Return innovation and Jacobian of the mean rate between the kept attitude and the present attitude.
+    """Return innovation and Jacobian of the mean rate between the stored and the present attitude.
 
-    The rotation vector p between the two attitudes changes by Jr^-1(p) (e - A e_0), where e and e_0 are the
-    errors of the present and the kept attitude.
+    The rotation vector p between the stored and the present attitude changes by Jr^-1(p) (e - A e_0), where e
+    and e_0 are the errors of the present and the stored attitude.
     """
     span = (measurement.time_ns - measurement.since_ns) * 1e-9
     index = state.kept_index(measurement)
@@ -262,7 +262,7 @@ def keep_attitude(
 def release_attitude(
     state: FilterState, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[FilterState, FloatArray]:
-    """Return state and covariance without the attitude that was kept for a finished exposure."""
+    """Return state and covariance without the attitude that was stored for a finished exposure."""
     index = state.kept_index(measurement)
     first = SIZE + 3 * index
     pick = [*range(first), *range(first + 3, len(covariance))]

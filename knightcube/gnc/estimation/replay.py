@@ -219,7 +219,7 @@ class Replay:
         return not self._pending
 
     def add(self, measurement: Measurement) -> None:
-        """Append a measurement that is not older than the others and is not a mean rate."""
+        """Append a measurement that is not older than the previous measurements and is not a mean rate."""
         self._pending.append(measurement)
 
     def advance(self, maximum: int | None = None) -> None:
@@ -280,7 +280,7 @@ _TIME = attrgetter("time_ns")
 
 
 class CheckpointHistory:
-    """The checkpoints of the last `history_ns` nanoseconds; empty before the filter starts."""
+    """The checkpoints of the last `history_ns` nanoseconds, an empty history before the filter starts."""
 
     def __init__(self, history_ns: int) -> None:
         self._history_ns = history_ns

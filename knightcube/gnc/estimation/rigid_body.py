@@ -1,12 +1,12 @@
 """The motion of a rigid body as the filters model it: Euler's equation and propagation with covariance.
 
 The equation of motion is J w' = -w x J w + m x A(q) B + thread torque (Sease, eq. (5.2), corrected), where m
-is the dipole moment of the coils. A body on the testbed's thread rotates only about its y axis. A torque T
-then causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta - c w (Sease, eq.
-(5.4)).
+is the dipole moment of the coils. A body on the testbed's thread rotates only about its y axis. For such a
+suspended body, a torque T causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta
+- c w (Sease, eq. (5.4)).
 
 The function `propagate` integrates state and covariance. The attitude error is a small rotation about the
-body axes. Accelerations that the model does not contain are random walks.
+body axes. Unmodelled angular accelerations are represented by random walks.
 
 Without torque the angular acceleration is a quadratic form of the rate, w' = Q p(w), where p are the six
 products of the rate's components. Errors of the inertia tensor, and of the gyro's scale and alignment, only
@@ -247,7 +247,7 @@ def propagate(
     steps = max(1, math.ceil(duration / longest_step - 1e-9))
     dt = duration / steps
     half = 0.5 * dt
-    for _ in range(steps):  # propagate with the midpoint rule; attitudes kept for exposures do not change
+    for _ in range(steps):  # midpoint rule; the attitudes stored for exposures do not change
         wx, wy, wz = state.rate
         middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
         model = body.linearise(middle, state.rate, state.parameters, torquing, half)

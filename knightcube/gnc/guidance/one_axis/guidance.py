@@ -30,7 +30,7 @@ and in the rate (rad/s)."""
 
 
 class GuidanceState(StrEnum):
-    """The kind of motion that `PathGuidance` commands: a path, a held attitude, or none yet."""
+    """The kind of motion that `PathGuidance` commands: a path, a held attitude, or no motion."""
 
     NONE = "none"
     FOLLOWING = "following"
@@ -100,7 +100,7 @@ class PathGuidance:
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path that is followed or whose end attitude is held; None without one."""
+        """The path that is followed or whose end attitude is held, or None without a path."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
@@ -158,7 +158,7 @@ class PathGuidance:
         return PlanVerdict(True)
 
     def sample(self, now_ns: int) -> PathSample | None:
-        """Return the commanded motion at `now_ns`; None without a path."""
+        """Return the commanded motion at `now_ns`, or None without a path."""
         path = self._path
         if path is None:
             return None
@@ -168,7 +168,7 @@ class PathGuidance:
         return self._sampled[2]
 
     def state(self, now_ns: int) -> GuidanceState:
-        """Return whether a path is being followed or the end of a path is held now."""
+        """Return whether a path is being followed or its end attitude is held at `now_ns`."""
         if self._path is None:
             return GuidanceState.NONE
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING

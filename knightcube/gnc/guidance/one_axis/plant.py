@@ -4,8 +4,9 @@ The plant is a rigid body that hangs on a thread and is rotated by one torque co
 field. The equation of motion is Sease 2013, eq. (5.4), with the thread and a constant disturbance d added: J
 (w' - d) = n A B I cos(theta) - k theta - c w. The angle theta of the body about the thread defines the
 quaternion component q2 = sin(theta/2). Planner, tracker and estimator use the same equations of motion, so
-that the tracker can follow the planned path. Functions with singular names (`current`) take floats and use
-`math` because they run in the 40 Hz loop; functions with plural names (`currents`) take arrays of one shape.
+that the tracker can follow the planned path. Functions with singular names (`current`) accept floats and use
+`math`, because they run in the 40 Hz control loop. Functions with plural names (`currents`) accept arrays of
+equal shape.
 
 The coils are driven by pulse-width modulation with a period of 20 ms (Sease thesis, chapter 5). The time
 constant L/R of a coil, 0.1 ms, is short compared with the period, so the coil current is V/R while the
@@ -329,10 +330,10 @@ class PolynomialPath:
 
     Attributes:
         origin_ns: monotonic time of the start of the path, ns.
-        horizon: duration of the path, s; zero for a held attitude.
+        horizon: duration of the path, s, which is zero for a held attitude.
         series: Chebyshev coefficients of q2, q2' (1/s) and q2'' (1/s^2), highest degree first.
         end_angle: angle at the end of the path, rad.
-        end_rate: rate that is kept after the end of the path, rad/s; zero holds the attitude.
+        end_rate: constant rate after the end of the path, rad/s, which is zero if the end attitude is held.
     """
 
     origin_ns: int

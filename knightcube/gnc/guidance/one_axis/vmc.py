@@ -555,8 +555,8 @@ def plan_step(
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
-        time_cost: cost of time, W; the duration is then optimised for minimum energy plus `time_cost` times
-            duration. None keeps the horizon.
+        time_cost: cost of time, W. If a cost is given, the duration is optimised for minimum energy plus
+            `time_cost` times duration. If it is None, the duration is fixed.
         minimise: "heat" to minimise the integral of R I^2, or "supply" to minimise the integral of V |I|,
             which is the energy taken from the supply with pulse-width modulation.
         nodes: number of nodes of the path, 8 to 40.

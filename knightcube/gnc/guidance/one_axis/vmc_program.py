@@ -9,8 +9,8 @@ differentiation matrix D (Sease, eq. (5.11), corrected). N - 4 path control para
 The prey path is an affine function of the duration T (`horizon`), and for a fixed prey path the path is an
 affine function of v - 1. Paths are therefore parametrised as prey(T) + M y with a matrix M and parameters y.
 Each column of the matrix M is a whitened change of the path, scaled by (q_p - q_r), that preserves the values
-and slopes at both ends. Trajectories are therefore affine functions of the optimisation variables, and the
-variables are well conditioned.
+and slopes at both ends. Paths are therefore affine functions of the optimisation variables, and the
+optimisation is well conditioned.
 
 Two programs have the same energy and limits: one minimises the energy for a fixed duration, the other
 minimises the energy plus the time cost of a free duration. The limits hold at every time and not only at the
@@ -379,7 +379,7 @@ class PathProgram:
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
     def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
-        """Return the minimum-energy path within the limits, from `start`; None when none was found.
+        """Return the minimum-energy path within the limits, found from `start`, or None if none is found.
 
         If `free` is given, the duration is also optimised, and the time cost is added to the energy.
         """

@@ -14,12 +14,12 @@ because A(q) v is a quadratic form of q whose second derivatives are twice Daven
 Paths are cubic Hermite curves (de Boor 1978, chapter IV), evaluated here because scipy.interpolate would take
 20 MiB of memory in each process that flies or plans a slew.
 
-The end of a slew is an attitude, which gives three equations, or the direction of a boresight with a free
-roll, which gives two. The body rate at the end gives three more equations. All end conditions are quadratic
-in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the Sun, that a
-body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon are computed
-along a predicted orbit. Times of a slew are relative to its start, which is `begin` s after the start of the
-ephemeris.
+The end of a slew is either an attitude, which gives three equations, or the direction of a boresight with a
+free roll, which gives two equations. The body rate at the end gives three more equations. All end conditions
+are quadratic in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the
+Sun, that a body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon
+are computed along a predicted orbit. Times of a slew are relative to its start, which is `begin` s after the
+start of the ephemeris.
 """
 
 from __future__ import annotations
@@ -144,8 +144,8 @@ class SlewDynamics:
     """The equations of motion of a satellite at n times, with times in `scale` s and dipoles in `unit` A m^2.
 
     The state derivative x' is a constant plus the quadratic form z^T H z / 2 of z = (m + residual, b, e, w,
-    q), where b and e are quadratic in q. One matrix product therefore gives the derivatives at all times at
-    once.
+    q), where b and e are quadratic in q. A single matrix product therefore gives the derivatives at all
+    times.
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
@@ -536,8 +536,8 @@ than 0.1 % and the shortest duration by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
-"""Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected, and rate (rad/s)
-below which an end attitude counts as inertially fixed."""
+"""Depth (rad) of the end attitude inside an exclusion cone above which the task is rejected (first value),
+and rate (rad/s) below which an end attitude counts as inertially fixed (second value)."""
 MINIMUM_TIME = math.inf
 """Value of `time_cost` that requests a minimum-time slew, for which only the duration is minimised."""
 

@@ -310,7 +310,7 @@ class SlewOrder:
         craft: model of the satellite, in body axes.
         axes: body axis that points to the targets, and body axis from which a roll is measured.
         camera: body axis (3,) that stays outside the exclusion cones.
-        start: pointing target that is held until the slew begins; a free roll is taken as zero.
+        start: pointing target that is held until the slew begins; a free roll is set to zero.
         goal: pointing target at the end; with a free roll, only the direction of the target counts.
         horizon, longest: requested and longest permitted duration of the slew, s.
         window: length of the time interval in which the slew may begin, s.
@@ -481,7 +481,7 @@ def plan_slew(
         heat: heating power of the coils per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         elements: two lines of the two-line element set of the orbit.
         time: UTC at the start of the slew or of the window, as a datetime without a time zone.
-        start: pointing target that is held until the slew begins; a free roll is taken as zero.
+        start: pointing target that is held until the slew begins; a free roll is set to zero.
         goal: pointing target at the end; with a free roll, only the direction of the target counts.
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
@@ -494,7 +494,7 @@ def plan_slew(
         pointing_axis: unit vector (3,) of the body axis that points to the targets.
         across_axis: unit vector (3,) of the body axis from which a roll is measured, normal to
             `pointing_axis`.
-        camera_axis: unit vector (3,) of the body axis that stays outside the exclusion cones; None for
+        camera_axis: unit vector (3,) of the body axis that stays outside the exclusion cones, or None for
             `pointing_axis`.
         cones: half angles of the exclusion cones about the Sun and the Moon, and angle from the Earth's limb,
             rad.

@@ -5,9 +5,9 @@ so the derivative of the inertial angular momentum is always normal to the field
 torque is normal to the field is linear, so every momentum curve that reaches the end is the sum of a fixed
 curve and weighted modes. The attitude follows from the momentum by integration. A least-squares fit of about
 a dozen mode amplitudes finds momentum curves that end at the target, stay outside the cones and cause little
-heat. The fit of the mode amplitudes is started from many random amplitudes at once. Gravity gradient and
-other disturbance torques are neglected in the initial guesses. The random starts of the fit are the same in
-every call.
+heat. The fit of the mode amplitudes is started simultaneously from many random amplitudes. Gravity gradient
+and other disturbance torques are neglected in the initial guesses. The random starts of the fit are the same
+in every call.
 
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
 (a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A
@@ -256,7 +256,7 @@ def guesses(
     """Return initial guesses for a slew with the duration `scale` (s), the most promising guess first.
 
     The slew leads from the state `start` (7,) to the end conditions `end`. The environment `around` is given
-    at 2 k + 1 times. The guesses avoid the exclusion cones `kept`.
+    at 2 k + 1 times. The guesses avoid the exclusion cones of the constraints `kept`.
     """
     curves = _curves(craft, around, start, end, scale)
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
@@ -320,7 +320,7 @@ def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
 
 
 class _MomentumFit:
-    """A Levenberg-Marquardt fit of the modes of momentum curves, from many random starts at once."""
+    """A Levenberg-Marquardt fit of the modes of momentum curves, simultaneously from many random starts."""
 
     def __init__(
         self,
@@ -414,7 +414,7 @@ def _unit(q: FloatArray) -> FloatArray:
 ENOUGH = 3
 """Number of paths without the dipole limit from which the best path is chosen."""
 LONGER = 1.0, 1.4, 2.0, 2.8
-"""Factors by which the requested duration is multiplied in turn until a path is found."""
+"""Factors by which the requested duration is multiplied, one after the other, until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
 """Ratios of successive durations while a slew is shortened: in the first step, and at which shortening ends.
 The three pairs are for the coarse grid, for the fine grid, and for slews without a time cost on the fine
@@ -458,7 +458,7 @@ class HorizonContinuation:
     def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
         """Return the best path found by shortening the slew as long as this reduces energy plus time cost.
 
-        The continuation starts from those paths in `relaxed` that keep the dipole limit at the shortest
+        The continuation starts from those paths in `relaxed` that satisfy the dipole limit at the shortest
         durations.
         """
         best: SolvedPath | None = None
