@@ -3,12 +3,13 @@
 Telecommands are CCSDS space packets of type 1. The field `time_ns` of the secondary header must be unique per
 command, for example the sender's UTC, so that a packet duplicated by the network is executed only once.
 Ground and satellite check the arguments of a command against the states and ranges in its packet definition.
-The command line `knightcube command` takes its words from the same definitions.
+The words of the command `knightcube command` follow from the same definitions.
 
-The receive queue of a socket is short, so that an unknown sender could fill it between two polls and commands
-from known peers would be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel drop
-datagrams that come from unknown senders or do not begin with the packet identifier of a command. The data
-that the filter can inspect begin with the UDP header for UDP sockets, and with the payload for UNIX sockets.
+The receive queue of a socket is short, so that an unknown sender could fill it between two polls, and
+commands from known senders would be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel
+drop datagrams that come from unknown senders or do not begin with the packet identifier of a command. The
+data that the filter can inspect begin with the UDP header for UDP sockets, and with the payload for UNIX
+sockets.
 """
 
 from __future__ import annotations
@@ -449,7 +450,7 @@ def command_of_words(text: str, stored: bool = False) -> Command:
 
 
 def _by_fields(words: list[str], stored: bool) -> list[str]:
-    """Return the words after `point` in the order and units of its fields."""
+    """Return the arguments of `point` in the order and units of the packet's fields."""
     goal, numbers = words[:1], words[1:]
     is_attitude = goal == [Goal.INERTIAL.label]
     keyword = next((at for at, word in enumerate(numbers) if word in {"roll", "--roll"}), None)

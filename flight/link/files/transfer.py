@@ -583,7 +583,7 @@ class Receiver:
 
 
 SATELLITE, GROUND, FOREIGN = 1, 2, 3
-"""CFDP entity numbers of the satellite, our ground station and a foreign ground station (Yamcs)."""
+"""CFDP entity numbers of the satellite, the project's ground station and an external one (Yamcs)."""
 MOST_OPEN = 8
 """Maximum number of open transfers in each direction."""
 LONGEST_FILE = (1 << 32) - 1

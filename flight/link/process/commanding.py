@@ -9,10 +9,10 @@ otherwise.
 
 The schedule of time-tagged commands is stored in two copies, so that one valid copy exists even if the
 process is killed while writing. A schedule entry is deleted from disk before its command is executed, so that
-no command is executed twice. A command that is more than ten seconds late, for example because the board was
-off, is reported as failed and not executed. A scheduled command also fails in mode SAFE, because only the
-ground may decide how to leave SAFE. After a start, no scheduled command is executed until telemetry has shown
-the current mode.
+no command is executed twice. A command that is more than ten seconds late, for example because the flight
+computer was off, is reported as failed and not executed. A scheduled command also fails in mode SAFE, because
+only the ground may decide how to leave SAFE. After a start, no scheduled command is executed until telemetry
+has shown the current mode.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ _PORTION = 1 << 20
 
 
 class Filing:
-    """Executor of the file commands and owner of the file transfers on board. Not thread-safe."""
+    """Executes the file commands and manages the file transfers on board. Not thread-safe."""
 
     def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
         """Continue the stored transfers.

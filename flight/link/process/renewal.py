@@ -63,8 +63,8 @@ class Renewal:
     def request(self, directive: Privileged, done: Report, now_ns: int) -> str:
         """Store a request for the privileged part. Return the reason for a failure, or an empty text.
 
-        The request to activate an artefact contains the UTC (s) by the receiver, if a fix was used since the
-        start of the link. The host's clock may be wrong, so expiry dates are not compared with it.
+        The request to activate an artefact contains the UTC (s) from the GPS receiver, if a fix was used
+        since the start of the link. The host's clock may be wrong, so expiry dates are not compared with it.
         """
         if not self._status.exists():
             return "this board has no renewal: deploy/install.sh installs it"
@@ -83,7 +83,7 @@ class Renewal:
         return "" if self._write(name, encoded(values)) else "the request could not be stored"
 
     def followed(self, packet: bytes, now_ns: int, *, live: bool) -> None:
-        """Note a fault, a refused configuration, or a reaction to SAFE, in a packet of telemetry.
+        """Note a fault, a refused configuration, or a reaction to SAFE that a telemetry packet reports.
 
         The time of a used GPS fix is also noted if the packet was just written (`live` is true).
         """
@@ -93,7 +93,7 @@ class Renewal:
                 self._fault = to_text(row["reason"])[:64] or _REACTION
         elif packet[:2] == _EVENT_LAYOUT.identifier.to_bytes(2, "big"):
             (row,) = _EVENT_LAYOUT.array(packet)
-            # A flight that refuses the new configuration flies its last good one.
+            # A flight that refuses the new configuration uses its last valid configuration.
             fails = row["severity"] == Severity.FAULT or row["code"] == CONFIG_DAMAGED.code
             if fails and not self._fault:
                 self._fault = f"{to_text(row['name'])}: {to_text(row['text'])}"[:64]

@@ -488,8 +488,8 @@ class StationSettings:
         spacecraft: spacecraft identifier in all frames.
         frame_bytes: length of a telemetry frame, bytes.
         rate: data rate of the telemetry, bytes/s.
-        command_loss: time without an authentic frame after which the board returns to an earlier version, s;
-            0 for never.
+        command_loss: time without an authentic frame after which the flight computer returns to an earlier
+            version, s; 0 for never.
         renewal: status file that `deploy/renewal.py` writes.
         idle_rate: data rate (bytes/s) up to which frames of idle data are sent.
         encrypted: whether telemetry is encrypted in addition to its authentication.
@@ -571,7 +571,7 @@ class Station:
         return self._gate.admitted - self._refused_commands
 
     def report_problem(self, name: str, text: str) -> None:
-        """Report a problem of the start to the ground under the name of a part of the software."""
+        """Report a problem during the start to the ground, with the name of the affected software part."""
         self._report(Report(0, 0, Stage.FAILED, name, text))
 
     @property

@@ -1,10 +1,10 @@
 """Definitions of all telemetry packets, and of the parameters that an operator can change in flight.
 
 The encoder, the decoder, the ground database, the CSV export and the documentation are generated from these
-definitions. The existing fields of a packet that has flown are never changed. New fields are appended, and
-the version of the packet is increased. All parameters are loaded at once, as one table. Until a table is
-loaded, the parameters have the values of the configuration. Loaded values must also satisfy the bounds of the
-configuration schema.
+definitions. The existing fields of a packet that was used in a flight are never changed. New fields are
+appended, and the version of the packet is increased. All parameters are loaded at once, as one table. Until a
+table is loaded, the parameters have the values of the configuration. Loaded values must also satisfy the
+bounds of the configuration schema.
 """
 
 from __future__ import annotations

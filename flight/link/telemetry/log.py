@@ -7,9 +7,9 @@ and their number is reported. Measured execution times depend on the machine and
 separate performance log. The flight log of a lock-step simulation is reproducible bit for bit.
 
 Each boot creates a new run folder such as `run-000042`, into which no later boot writes. Runs are ordered by
-number, because the wall clock of the board may be wrong. The oldest runs are deleted if the archive exceeds
-its budget or the disk is full, but the last run is never deleted. If the disk cannot be written, the flight
-continues without a log.
+number, because the wall clock of the flight computer may be wrong. The oldest runs are deleted if the archive
+exceeds its budget or the disk is full, but the last run is never deleted. If the disk cannot be written, the
+flight continues without a log.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ class SegmentStore:
 
 
 MOST_RUNS = 1000
-"""Maximum number of runs, for example of a board that crashes at every start and so creates many runs."""
+"""Maximum number of runs, which limits the runs of a flight computer that crashes at every start."""
 
 LEAST_FREE_BYTES = 64 << 20
 """Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""
