@@ -193,7 +193,7 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
 
 
 def opened(kind: str, config: Config, rig: Rig, stack: ExitStack) -> Any:
-    """Return the open device of a section through its driver, or None if it is not configured."""
+    """Open the device of a section by its driver, and return it, or None if it is not configured."""
     section = getattr(config, kind)
     return None if section is None else _opened(kind, section, rig, stack, kind)
 
@@ -488,7 +488,7 @@ files_nmea: Callable[[Gps], Sequence[str]] = files_ublox
 
 
 def open_ads1115(rig: Rig, section: SolarStringsSection) -> AdsSolarStrings:
-    """Return the driver of the converters of the solar cells."""
+    """Return the driver of the analogue-to-digital converters that measure the solar cells."""
     wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in section.strings]
     bus = rig.wires.i2c(section.bus)
     return AdsSolarStrings(bus, rig.clock, wired, round(section.period * SECOND_NS))

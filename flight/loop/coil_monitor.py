@@ -805,7 +805,7 @@ class CoilMonitor:
         self._reset()
 
     def _begin_comparison(self, axis: int, fault: CoilFault, now_ns: int) -> bool:
-        """Probe another coil, and return whether the probe began.
+        """Probe another coil for comparison, and return whether the probe began.
 
         If the current monitor measures the current of the other coil, the monitor works, and its reading of
         the suspected coil is trusted.

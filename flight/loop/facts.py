@@ -341,7 +341,7 @@ class StreamWatch:
         self._valid = True
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings, and measure the rate and the wait for a reading from `time_ns` on."""
+        """Discard earlier readings; the rate, and the time without a reading, count from `time_ns` on."""
         self._times.clear()
         self._begin_ns = self._since_ns = time_ns
 
@@ -403,7 +403,7 @@ class Streams:
         self._watches = {row.name: StreamWatch(row, 0) for row in rows}
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings, and measure rates and the wait for readings from `time_ns` on."""
+        """Discard earlier readings; rates, and the times without a reading, count from `time_ns` on."""
         for watch in self._watches.values():
             watch.begin(time_ns)
 

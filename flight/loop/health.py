@@ -271,7 +271,7 @@ class GroupsAndWorkers:
         self._progress = {group: (group.completed, 0) for group in groups}
 
     def begin(self, time_ns: int) -> None:
-        """Measure progress from `time_ns` on."""
+        """Start the supervision of progress at `time_ns`."""
         self._progress = {group: (completed, time_ns) for group, (completed, _) in self._progress.items()}
 
     def stalled(self, now_ns: int) -> list[str]:
@@ -509,7 +509,7 @@ class HealthWatch:
         self._monitor.adopt(limits)
 
     def begin(self, time_ns: int) -> None:
-        """Measure progress and ages from `time_ns` on."""
+        """Start the supervision of progress and of the ages of readings at `time_ns`."""
         self._progress.begin(time_ns)
 
     def close(self) -> None:

@@ -71,7 +71,7 @@ class HorizonCameraTask:
         self._job: tuple[int, int, int] | None = None
 
     def begin(self, time_ns: int) -> None:
-        """Measure the ages of frames from `time_ns` on, when the first trigger is due."""
+        """Count the ages of frames from `time_ns`, when the first trigger is due, until frames arrive."""
         self._triggered_ns = time_ns - self._settings.fine_period_ns
         self._seen_ns = [time_ns] * len(self._cameras)
 

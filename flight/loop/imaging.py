@@ -661,7 +661,7 @@ class Imaging:
         return self._shed, self._late
 
     def begin(self, time_ns: int) -> None:
-        """Measure the age of the newest frame from `time_ns` on."""
+        """Count the age of the newest frame from `time_ns` until the first frame arrives."""
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:

@@ -253,7 +253,7 @@ class Navigation:
 
         The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
         An estimate that is only propagated by the model is recorded, but not used for steering. Without a
-        gyro, the estimate must also be accurate enough for the body.
+        gyro, the estimate must also satisfy the body's accuracy limits (`is_accurate`).
         """
         return self.is_accurate(estimate) and self._is_fresh(self._agreed_ns, now_ns)
 
@@ -394,7 +394,7 @@ class Positioning:
         self._link_recorded_ns: int | None = None
 
     def begin(self, time_ns: int) -> None:
-        """Measure the age of the newest fix from `time_ns` on."""
+        """Count the age of the newest fix from `time_ns` until the first fix arrives."""
         self._fixed_ns = time_ns
 
     def run(self, now_ns: int) -> None:
@@ -484,7 +484,7 @@ class SunSensing:
         self._read_ns = 0
 
     def begin(self, time_ns: int) -> None:
-        """Measure the age of the newest reading from `time_ns` on."""
+        """Count the age of the newest reading from `time_ns` until the first reading arrives."""
         self._read_ns = time_ns
 
     def run(self, now_ns: int) -> None:

@@ -801,7 +801,7 @@ class Entity:
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
         """Open an incoming transfer.
 
-        If too many are open, cancel the transfer without data for the longest time.
+        If too many transfers are open, cancel the transfer that has received no data for the longest time.
         """
         if len(self._in) >= MOST_OPEN:
             stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
