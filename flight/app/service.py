@@ -173,7 +173,7 @@ class InhibitedError(FlightError):
 class SeparationInhibit:
     """Keeps coils and transmitter off for a configured time after the first power-up.
 
-    Launch providers require this time. The CubeSat Design Specification allows no transmission within 45
+    Launch providers require this inhibit. The CubeSat Design Specification allows no transmission within 45
     minutes after the deployment. The time with power is counted in a file, so that a restart neither ends the
     inhibit nor begins it again. Flight and link count the time separately, each in its own folder.
 
@@ -307,7 +307,7 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Reset the count of starts of the release, because its flight ended regularly."""
+        """Reset the count of starts of the release, because its flight ended normally."""
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))

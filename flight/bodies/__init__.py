@@ -1,1 +1,1 @@
-"""The bodies that the loop can fly, each behind the same Protocols."""
+"""The bodies that the loop can control, all of which implement the same Protocols."""

@@ -636,7 +636,7 @@ class DatagramChannel:
     def _look(self, path: Path) -> None:
         """Bind the socket again if its file was removed or replaced.
 
-        After a failure the next check retries.
+        After a failure, the next check tries to bind the socket again.
         """
         if self._file is not None and _identity(path) == self._file:
             return

@@ -574,7 +574,7 @@ class SolarStringsSection(Section, frozen=True, kw_only=True):
 
 
 class WideCamera(Section, frozen=True, kw_only=True):
-    """A wide-angle camera for Sun and horizon.
+    """A wide-angle camera, which measures the directions of the Sun and of the horizon.
 
     A logarithmic `response` maps `decades` decades of intensity to the counts above `pedestal`; all
     wide-angle cameras must have the same response. The polygons `structure` and the image file

@@ -151,7 +151,7 @@ class PointingPaths:
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
         """Accept the rotation (3,) between path and body and the rate (3,) of the body.
 
-        Return whether the path is followed further.
+        Return whether the body continues to follow the path.
         """
         self.off = float(np.linalg.norm(turn))
         self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)

@@ -103,7 +103,7 @@ class PropagatedEstimate(Estimate):
             object.__setattr__(self, name, value)
 
     def __reduce__(self) -> tuple[type[Estimate], tuple[Any, ...]]:
-        """Make copies and pickles an `Estimate`, because a function cannot be pickled."""
+        """Copy and pickle this object as a plain `Estimate`, because a function cannot be pickled."""
         return Estimate, tuple(getattr(self, one.name) for one in fields(self))
 
     @property

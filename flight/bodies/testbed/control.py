@@ -268,7 +268,7 @@ class Planning:
         """Return the angle (rad) that the target has at present, or None before the target is due.
 
         A target is due at the end of the first path to it, even if later paths end at another time. The
-        strategy STEP has no plans, so its targets are due one horizon after the command.
+        strategy STEP has no plans, so its targets are due one planning horizon after the command.
         """
         if self._due_ns is None or now_ns < self._due_ns:
             return None

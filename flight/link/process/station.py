@@ -1,9 +1,9 @@
 """Link process: communication lines to the ground, and the loop that receives frames and sends telemetry.
 
-The lines are UDP, TCP and serial. The loop runs at 50 Hz in one thread, and no call on a line blocks. A flood
-of received frames is processed in portions, so that telemetry is not delayed. The counter of an accepted
-frame is stored before the command in the frame is executed. A link process that is killed at any moment
-therefore executes no command twice.
+The communication lines use UDP, TCP or a serial port. The loop runs at 50 Hz in one thread, and no call on a
+line blocks. A flood of received frames is processed in portions, so that telemetry is not delayed. The
+counter of an accepted frame is stored before the command in the frame is executed. A link process that is
+killed at any moment therefore executes no command twice.
 """
 
 from __future__ import annotations
