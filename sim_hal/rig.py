@@ -1,7 +1,7 @@
-"""The simulator's only interface to the flight application, which opens emulated devices and their faults.
+"""Interface of the simulator to the flight application, which opens emulated devices with their faults.
 
 In lock-step the devices run in the flight process and advance while the flight loop sleeps. The clock then
-jumps from event to event, and runs repeat exactly. In real time the devices run in a server process
+jumps from event to event, and repeated runs are identical. In real time the devices run in a server process
 (`sim_hal.serving.server`), with bus and cameras on a socket and the serial lines on pseudo-terminals.
 """
 
@@ -61,7 +61,7 @@ from sim_hal.settings import CageTruth, FreeBodySection, Simulation
 from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 PATIENCE_S = 5.0
-"""Time (s) after which the device server ends if the flight process has died."""
+"""Time (s) from the death of the flight process until the device server ends."""
 BENCH_COIL_FIELD = 5.0e-4
 """Field (T/A) of a coil along its axis at the magnetometer, if neither field nor position is configured."""
 _START_S = 20.0
@@ -76,11 +76,11 @@ class SimulationRequest:
 
     Attributes:
         config_path: path of the configuration file.
-        text: text of the configuration as flown, with any injected corruption.
+        text: text of the configuration that is used, including injected corruption.
         out: folder of the run, in which the log of the true state is written.
         realtime: whether the devices run in a server process.
         seed: random seed that replaces the seed of the configuration, or None.
-        devices: facts file of a device server that runs already, or None to start a server.
+        devices: facts file of a running device server, or None to start a server.
         faults: faults that are injected in addition to the faults of the configuration.
     """
 
@@ -168,7 +168,7 @@ def check_elements(request: SimulationRequest, config: Config) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PosedCamera:
-    """A star camera, its clock, and a function from time (ns) to its attitude (4,), ICRS into camera."""
+    """A star camera, its clock, and a function from a time (ns) to its attitude (4,), ICRS into camera."""
 
     clock: Clock
     frames: FrameSource
@@ -207,13 +207,16 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
 
 @dataclass(frozen=True, slots=True)
 class EmulatedBench:
-    """The rig of a body on a bench, and the hand that turns the body and covers the lens of the camera."""
+    """Rig of a body on a bench, and the emulated hand that rotates the body and covers lenses."""
 
     rig: Rig
     hardware: Hardware
 
     def turn(self, axis: FloatArray, angle: float, seconds: float) -> None:
-        """Turn the upright body about `axis` (3,) by `angle` rad from now on. An angle of 0 puts it back."""
+        """Rotate the upright body about `axis` (3,) by `angle` rad, beginning now.
+
+        0 restores the upright attitude.
+        """
         held: Any = self.hardware.world
         held.turn(axis, angle, self.rig.clock.now_ns(), seconds)
 
@@ -228,17 +231,17 @@ class EmulatedBench:
             camera.fault = cap if on else ""
 
     def light(self, normal: FloatArray) -> None:
-        """Shine a lamp onto the panel with the outward `normal` (3,), body axes; zeros are darkness."""
+        """Illuminate the panel with the outward `normal` (3,), body axes; zeros switch the lamp off."""
         cells = self.hardware.orbit.cells
         if cells is not None:
             cells.lamp = normal
 
 
 def open_bench(request: SimulationRequest, config: Config) -> EmulatedBench:
-    """Return the emulated devices of a configuration on a bench, in lock-step, with the configured faults.
+    """Return the emulated devices of a configuration for a bench, in lock-step, with the configured faults.
 
-    The noise of the inertial unit is that of its data sheet plus the errors that `simulation.imu` adds. A
-    coil makes a field at the magnetometer even if the section does not describe this field.
+    The noise of the inertial unit is that of its data sheet plus the errors that `simulation.imu` adds. Each
+    coil produces a field at the magnetometer even if the section does not describe this field.
     """
     section = request.section()
     check(section.faults, config, False)
@@ -260,7 +263,7 @@ def fault_catalogue() -> tuple[str, str]:
 
 
 def injected_faults(request: SimulationRequest) -> tuple[str, ...]:
-    """Return the faults of a flight as text, with those of the configuration first."""
+    """Return the faults of a flight as texts, beginning with those of the configuration."""
     faults = (*schedule.schedule(request.section().faults), *map(schedule.parse, request.faults))
     return tuple(map(str, faults))
 
@@ -285,9 +288,9 @@ def with_host_faults(rig: Rig, section: Simulation) -> Rig:
 
 @dataclass(frozen=True, slots=True)
 class LockStep:
-    """Lock-step devices. The flight uses `rig`; only faults and tests use more.
+    """Emulated devices in lock-step. The flight uses only `rig`; faults and tests also use other attributes.
 
-    The `line` is the serial line of the inertial unit, if that has one.
+    The attribute `line` is the serial line of the inertial unit, if it has one.
     """
 
     clock: SimClock
@@ -339,7 +342,7 @@ def opened_lockstep(config: Config, section: Simulation, folder: Path) -> Iterat
 
 
 class SimulatedUtcClock(SystemClock):
-    """Clock of the machine whose UTC is that of a simulated orbit."""
+    """Monotonic clock of the computer with the UTC of a simulated orbit."""
 
     def __init__(self, offset_ns: int) -> None:
         """`offset_ns` is the simulated UTC minus CLOCK_MONOTONIC, ns."""
@@ -352,10 +355,13 @@ class SimulatedUtcClock(SystemClock):
 
 
 class RemoteFrameSource:
-    """Client of a camera in the server process, which announces frames whose pixels are read from files."""
+    """Client of a camera in the server process.
+
+    The server announces frames, and pixels are read from files.
+    """
 
     def __init__(self, path: Path, clock: SystemClock, number: int = 0) -> None:
-        """Connect to the camera `number`, 0 for the star camera and 1 or more for a horizon camera."""
+        """Connect to the camera `number`: 0 for the star camera, 1 or more for a horizon camera."""
         self._number = number
         self._link = DeviceLink(path)
         self._folder = path.parent
@@ -413,7 +419,10 @@ class ServedWires:
         return port
 
     def i2c(self, bus: int | str | None = None) -> RemoteI2cBus:
-        """Return an emulated I2C bus; None means the bus of the coils. Raises NotResponding."""
+        """Return the emulated I2C bus with a number or device file; None means the bus of the coils.
+
+        Raises NotResponding.
+        """
         name = self._coil_bus if bus is None else device_file(bus)
         opened: RemoteI2cBus = self._kept(name, lambda: RemoteI2cBus(self._path, name))
         return opened
@@ -460,7 +469,7 @@ def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Serve
         [*command, "--seed", str(seed), "--patience", str(PATIENCE_S)],
         stdout=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C reaches only the flight process, which then ends the server
+        start_new_session=True,  # Ctrl-C must reach only the flight process, which then ends the server
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )
     assert process.stdout is not None
@@ -483,7 +492,7 @@ def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Serve
 
 @contextmanager
 def running_server(facts_path: Path) -> Iterator[Served]:
-    """Connect to a device server that runs already, and leave the server running.
+    """Connect to a running device server, which continues to run afterwards.
 
     `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote. Raises UsageError for
     an invalid file and NotResponding if no server answers.

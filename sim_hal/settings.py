@@ -1,7 +1,7 @@
 """The `simulation` section of a configuration: the true properties of the world.
 
-A true constant that the `simulation` section omits is taken from the flight configuration. A constant given
-here makes the world differ from the flight software's model. All values are in SI units unless the name of
+A true constant that the `simulation` section omits is taken from the flight configuration. A constant in this
+section makes the world differ from the flight software's model. All values are in SI units unless the name of
 the key states another unit. In `free_body`, each disturbance is given as a multiple of its worst case, and
 zero switches the disturbance off.
 """
@@ -44,7 +44,7 @@ class CraftSection(Section, frozen=True, kw_only=True):
     """True values of the craft that differ from its description in the flight configuration.
 
     The craft is a box of `size` (3,), m. The vector `centre_of_mass` (3,), m, leads from the centre of the
-    box to the centre of mass, in body axes. `inertia`, kg m^2, holds the moments of inertia (3,) about the
+    box to the centre of mass, in body axes. `inertia`, kg m^2, contains the moments of inertia (3,) about the
     body axes, or the inertia tensor (3, 3). The residual dipole in shadow is `residual_dipole` (3,), A m^2,
     plus that of the section `disturbances`. The list `windings` describes the coils. An omitted value equals
     that of the flight configuration.
@@ -72,12 +72,12 @@ class TipOff(Section, frozen=True, kw_only=True):
 class Disturbances(Section, frozen=True, kw_only=True):
     """Disturbances as multiples of their worst cases, and the errors of the coils.
 
-    The unit of `drag` and `solar_pressure` is the torque on a box whose true centre of mass is as far from
-    the described one as `craft.accuracy.centre_of_mass` permits, in a random direction. The worst case of
-    `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a random walk of
-    5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours. `day_bulge`
-    scales the variation of the air density between day and night. `walks` scales the random walks of air
-    density and residual dipole. The angle between body axes and principal axes is at least a third of
+    The worst case of `drag` and `solar_pressure` is the torque on a box whose true centre of mass is
+    displaced from the described one in a random direction, by the distance `craft.accuracy.centre_of_mass`.
+    The worst case of `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and
+    a random walk of 5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours.
+    `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
+    of air density and residual dipole. The angle between body axes and principal axes is at least a third of
     `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
     deviations of the coils' scale errors and axis tilts.
     """
@@ -100,8 +100,8 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
     The craft is that of the flight configuration, with the differences in `craft`, or one of the two crafts
     in `sim_hal.worlds.free_body.CRAFTS` if `craft` is a name.
 
-    `errors` is the largest error of the description of body, coils and sensors in the flight configuration,
-    as a multiple of the accuracies that the configuration states (`sim_hal.description_errors`).
+    `errors` is the largest error of the configured description of body, coils and sensors, as a multiple of
+    the configured accuracies (`sim_hal.description_errors`).
     """
 
     craft: Literal["knightcube", "cubesat_3u"] | CraftSection | None = None
@@ -162,7 +162,7 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class CageTruth(Section, frozen=True, kw_only=True):
-    """The magnetic field of the simulated cage for an `orbit`, which is that at simulation time zero.
+    """Magnetic field of the simulated cage, which reproduces the field along `orbit` (elements at time 0).
 
     `gain` is the ratio of the cage's field to the commanded field. `ring_current` scales the mean field of
     the ring current, 20 nT.
@@ -197,7 +197,7 @@ class SkySection(Section, frozen=True, kw_only=True):
 
 
 class Tumble(Section, frozen=True, kw_only=True):
-    """A sinusoidal variation of the brightness by +-`amplitude` magnitudes with a period of `period` s."""
+    """A sinusoidal variation of an object's brightness by +-`amplitude` magnitudes every `period` s."""
 
     period: Positive
     amplitude: Annotated[float, Meta(ge=0.0, le=5.0)]
@@ -205,7 +205,7 @@ class Tumble(Section, frozen=True, kw_only=True):
 
 
 class LineOfSight(Section, frozen=True, kw_only=True):
-    """A motion along a great circle among the stars; the position is given for mission time `at` (s).
+    """A motion along a great circle among the stars, with the position at mission time `at` (s).
 
     `rate_deg` (deg/s) is the rate towards the position angle `towards_deg`, counted from north through east.
     `acceleration_deg` (deg/s^2) is the acceleration along the great circle.
@@ -229,7 +229,7 @@ class ObjectState(Section, frozen=True, kw_only=True):
 class SkyObject(Section, frozen=True, kw_only=True):
     """An object in the sky of the star camera, with either a `line_of_sight` or the `state` of an orbit.
 
-    `magnitude` is the Johnson V magnitude, which for an object in orbit holds in full sunlight.
+    `magnitude` is the Johnson V magnitude; for an object in orbit, it applies to full sunlight.
     """
 
     magnitude: Annotated[float, Meta(ge=-10.0, le=20.0)]
@@ -269,8 +269,8 @@ class PowerTruth(Section, frozen=True, kw_only=True):
     """The true power system of a configuration with a section `power`.
 
     The battery starts at the state of charge `charge`. `battery` is the true battery, by default the
-    configured one. `load` (W) is the constant power of board, sensors and radio, and `frame` (J) the energy
-    that the star camera and its processing use for one frame. The coils draw their current from 5 V. The
+    configured battery. `load` (W) is the constant power of board, sensors and radio, and `frame` (J) the
+    energy that the star camera and its processing use for one frame. The coils draw their current at 5 V. The
     `panels` need a world with an orbit.
     """
 
@@ -293,10 +293,10 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 
 
 class Simulation(Section, frozen=True, kw_only=True):
-    """The section `simulation`, whose `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
+    """Section `simulation`; the value `world` is a key of `sim_hal.worlds.world.WORLDS` or `module:factory`.
 
-    The three rows of `coil_field`, T/A, map the coil currents to the coils' field at the magnetometer in body
-    axes. A row has one value for each coil.
+    The three rows of `coil_field`, T/A, map the coil currents to the components of the coils' field at the
+    magnetometer, body axes. Each row has one value for each coil.
     """
 
     seed: Annotated[int, Meta(ge=0)] = 1

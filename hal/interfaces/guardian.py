@@ -52,7 +52,7 @@ class CoilReach:
         return [f"0x{number:02x}" for write in self.writes for number in write]
 
     def note(self, folder: Path) -> None:
-        """Write the bus and the writes durably to a file in `folder`, for the script `deploy/coils-off`.
+        """Write the bus and the writes to a synced file in `folder`, for the script `deploy/coils-off`.
 
         The file also contains the SHA-256 of its text, as a checksum. Never raises.
         """

@@ -1,4 +1,7 @@
-"""Emulated DRV8830 bridges with their coils (TI SLVSAB2). The coil current is the output voltage over R."""
+"""Emulated DRV8830 bridges with their coils (TI SLVSAB2).
+
+The coil current is the output voltage divided by the coil's resistance.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from knightcube.astro.arrays import FloatArray
 
 
 class EmulatedDrv8830:
-    """One bridge with its registers CONTROL and FAULT; the function `changed` is called after a write."""
+    """One bridge with its registers CONTROL and FAULT; the function `changed` is called after each change."""
 
     def __init__(self, address: int, changed: Callable[[], None]) -> None:
         self.address = address
@@ -36,7 +39,7 @@ class EmulatedDrv8830:
             self._pointer += 1
 
     def read(self, count: int) -> bytes:
-        """Return registers from the pointer on."""
+        """Return register contents, beginning at the register pointer."""
         return bytes((*self.registers, *bytes(count))[self._pointer : self._pointer + count]).ljust(
             count, b"\0"
         )
@@ -48,11 +51,11 @@ class EmulatedDrv8830:
 
 
 class BridgeCircuit:
-    """Coils on DRV8830 bridges. The coil currents are drawn with noise at each write.
+    """Coils on DRV8830 bridges. At each write, random errors are added to the coil currents.
 
     Attributes:
         parts: the bridges.
-        chip: None, because no PWM chip drives the coils.
+        chip: always None, because the coils have no PWM chip.
     """
 
     chip = None
@@ -65,9 +68,9 @@ class BridgeCircuit:
         noise: float,
         supply: float,
     ) -> None:
-        """Make one bridge for each coil.
+        """Create one bridge for each coil.
 
-        `noise` (A) bounds the error of a driven current, and `supply` (V) is the voltage of the supply.
+        `noise` (A) is the largest random error of a coil current, and `supply` (V) is the supply voltage.
         """
         self.parts = [EmulatedDrv8830(address + n, self._update) for n in range(len(truth.coils))]
         self._truth, self._generator, self._noise, self._supply = truth, generator, noise, supply

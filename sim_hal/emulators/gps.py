@@ -81,7 +81,7 @@ class EmulatedGps:
         clock_ns: error of the reported time that a fault adds, ns.
         blind: whether a fault blocks the signals of all satellites.
         frozen: whether a fault makes the receiver repeat its last fix.
-        protocol: protocol version, from 27 on of a receiver that accepts CFG-VALSET only.
+        protocol: protocol version; a receiver with version 27 or later accepts only CFG-VALSET.
         obeys: whether the receiver executes commands.
     """
 
@@ -93,7 +93,7 @@ class EmulatedGps:
         errors: GpsErrors,
         now_ns: int = 0,
     ) -> None:
-        """Connect a receiver that has had power for a long time."""
+        """Connect a receiver that has been on for a long time, so that it has a fix at once."""
         self.shift: FloatArray = np.zeros(3)
         self.clock_ns = 0
         self.blind = False
@@ -137,7 +137,7 @@ class EmulatedGps:
             self._line.write(data, sent_ns)
 
     def _message(self, epoch_ns: int) -> bytes:
-        """Return the message about the fix at `epoch_ns`."""
+        """Return the message for the fix at `epoch_ns`: NAV-PVT if enabled, otherwise NMEA sentences."""
         return frame(NAV_PVT, self._measure(epoch_ns).packed()) if self._enabled else NMEA
 
     def _power(self, now_ns: int, start: float) -> None:

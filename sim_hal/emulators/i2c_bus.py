@@ -1,8 +1,8 @@
 """Emulated I2C bus in memory, with emulated chips, bus faults and SMBus transfers.
 
 A transaction is one message or several messages joined by repeated STARTs, as in Linux's ioctl I2C_RDWR. The
-duration of a transaction (0.6 ms for 24 bytes at 400 kHz) is not modelled, except that a hang lasts until the
-timeout of the bus.
+duration of a transaction (0.6 ms for 24 bytes at 400 kHz) is not modelled, except that a hanging bus delays
+the transaction until the timeout.
 
 SMBus transfers are emulated by I2C messages, as in a Linux adapter without SMBus hardware. The transfer codes
 and the data layout are those of linux/i2c.h (union i2c_smbus_data), with little-endian words. Block reads
@@ -71,7 +71,10 @@ class EmulatedI2cBus:
         parts: Sequence[I2cPart] = (),
         wait: Callable[[int], None] | None = None,
     ) -> None:
-        """Connect the chips. If given, the function `wait` advances time by the timeout (ns) of a hang."""
+        """Connect the chips.
+
+        The function `wait`, if given, advances time by the timeout (ns) when the bus hangs.
+        """
         self._parts = list(parts)
         self._wait = wait
         self._faults: list[_Fault] = []
@@ -86,7 +89,7 @@ class EmulatedI2cBus:
             self._parts.append(part)
 
     def detach(self, part: I2cPart) -> None:
-        """Remove a chip from the bus, so that the chip's address is not acknowledged any more."""
+        """Remove a chip from the bus, so that its address is not acknowledged."""
         with self._lock:
             self._parts.remove(part)
 
@@ -133,7 +136,7 @@ class EmulatedI2cBus:
         self._closed = True
 
     def send(self, address: int, data: bytes) -> None:
-        """Write raw bytes to an address; the single byte 0x06 to address 0 is the software reset."""
+        """Write raw bytes to an address; the byte 0x06 to address 0 resets the chips (software reset)."""
         self.transfer((Message(address, data),))
 
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
@@ -177,8 +180,8 @@ class EmulatedI2cBus:
         """Make a chip, or all chips if `address` is None, refuse transactions.
 
         The fault acts `times` times, or until it is removed if `times` is None. A write is refused after
-        `after` bytes, of which the register byte is the first. If the function `chance` is given, the fault
-        acts only when `chance` returns True. Returns the function that removes the fault.
+        `after` bytes, including the register byte. If the function `chance` is given, the fault acts only
+        when `chance` returns True. Returns the function that removes the fault.
         """
         return self._add(
             _Fault(errno.EREMOTEIO, "no acknowledge", address, times, after=after, chance=chance)
@@ -195,11 +198,11 @@ class EmulatedI2cBus:
         )
 
     def lose_arbitration(self, times: int | None = 1) -> Callable[[], None]:
-        """Make transactions lose the arbitration to another master."""
+        """Make transactions fail because another master wins the arbitration."""
         return self._add(_Fault(errno.EAGAIN, "arbitration lost", None, times))
 
     def flip_bits(self, address: int, index: int, mask: int, times: int | None = 1) -> Callable[[], None]:
-        """Invert the bits of `mask` in byte `index` of the data written or read, without an error."""
+        """Invert the bits `mask` in byte `index` of the written or read data, without reporting an error."""
         return self._add(_Fault(0, "bits flipped", address, times, index=index, mask=mask))
 
     def clear_faults(self) -> None:
@@ -212,7 +215,7 @@ class EmulatedI2cBus:
             self._faults.append(fault)
 
         def remove() -> None:
-            with self._lock:  # compared by identity, because equal faults are distinct
+            with self._lock:  # faults are compared by identity, because two faults may be equal
                 self._faults = [other for other in self._faults if other is not fault]
 
         return remove
@@ -247,13 +250,16 @@ class EmulatedI2cBus:
 
     @staticmethod
     def _deliver(parts: list[I2cPart], address: int, data: bytes) -> None:
-        if data:  # An empty write only tests whether the address is acknowledged.
+        if data:  # A write without data only tests whether the address is acknowledged.
             for part in parts:
                 part.write(address, data)
 
 
 def _flipped(data: bytes, fault: _Fault | None, first: int) -> bytes:
-    """Return the data with the bits flipped by a fault, whose index counts from byte `first`."""
+    """Return the data with the bits flipped by a fault.
+
+    The byte index of the fault counts from byte `first`.
+    """
     if fault is None or first + fault.index >= len(data):
         return data
     index = first + fault.index
@@ -274,7 +280,7 @@ FUNCTIONS = 0x00000001 | 0x00FF0000 | 0x02000000 | 0x0C000000
 def smbus(
     bus: EmulatedI2cBus, address: int, reading: bool, command: int, size: int, data: bytes = b""
 ) -> bytes:
-    """Execute one transfer of ioctl I2C_SMBUS, and return the new content of the union, empty for a write.
+    """Execute a transfer of ioctl I2C_SMBUS, and return the new content of the union (empty for a write).
 
     Raises OSError for bus errors, and with EOPNOTSUPP or EINVAL as a Linux adapter does.
     """

@@ -1,4 +1,4 @@
-"""Emulated GPS receiver that sends NMEA 0183 sentences by itself and obeys no commands."""
+"""Emulated GPS receiver that sends NMEA 0183 sentences by itself and ignores commands."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """An emulated PCA9685 PWM chip, whose registers determine the outputs as in the NXP data sheet.
 
-Accesses that the data sheet forbids or leaves undefined have the smallest possible effect and are recorded in
+Accesses that the data sheet forbids or does not define have as little effect as possible and are recorded in
 `violations`. The oscillator's tolerance and the phase of the counter are not modelled. A register change
 takes effect at the STOP of the I2C transaction.
 """
@@ -35,7 +35,7 @@ _ALL_CALL = 0x01
 _INVERT = 0x10
 _UPDATE_ON_ACK = 0x08
 _ALL_CHANNELS = (1 << CHANNELS) - 1
-# Registers SUBADR1 to 3 and ALLCALLADR, and the MODE1 bits that enable their addresses.
+# Registers SUBADR1 to SUBADR3 and ALLCALLADR, each with the MODE1 bit that enables its address.
 _EXTRA_ADDRESSES = ((0x02, 0x08), (0x03, 0x04), (0x04, 0x02), (0x05, _ALL_CALL))
 
 
@@ -47,7 +47,7 @@ _WRITABLE[0x02:0x06] = b"\xfe" * 4
 _WRITABLE[LED0_ON_L:_LED_END] = b"\xff\x1f\xff\x1f" * CHANNELS
 _WRITABLE[PRE_SCALE] = 0xFF
 _WITHOUT_PULSES = SLEEP | EXTERNAL_CLOCK
-"""Bits of MODE1 of which each stops the outputs."""
+"""Bits of MODE1, each of which stops the PWM outputs."""
 
 _POWER_ON = bytearray(256)
 """Content of each register after power-on."""
@@ -76,7 +76,7 @@ class EmulatedPca9685:
         self._now_ns = now_ns
         self._registers = bytearray()
         self._addresses: set[int] = set()
-        self._halted = 0  # channels that sleep has stopped until RESTART or a new write
+        self._halted = 0  # bit mask of channels that sleep mode has stopped until RESTART or a new write
         self._power_on()
 
     def brown_out(self) -> None:
@@ -113,7 +113,7 @@ class EmulatedPca9685:
         return self._awake_ns
 
     def high(self, channel: int) -> tuple[int, int]:
-        """Return the high time of an output in a PWM period, as first count and number of counts."""
+        """Return the part of a PWM period in which an output is high: first count and number of counts."""
         if not self.output_enable:
             return 0, 0
         start, length = self._pulse(channel)
@@ -186,7 +186,7 @@ class EmulatedPca9685:
 
     def _store_run(self, pointer: int, values: bytes) -> int:
         end = pointer + len(values)
-        # One long number instead of a loop over the bytes.
+        # All bytes are masked at once as one long integer, which is faster than a loop.
         writable = int.from_bytes(_WRITABLE[pointer:end], "big")
         kept = int.from_bytes(values, "big") & writable
         self._registers[pointer:end] = kept.to_bytes(len(values), "big")

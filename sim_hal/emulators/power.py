@@ -1,9 +1,9 @@
 """The simulated power system: battery, solar panels and loads on one unregulated bus, with two monitors.
 
-The loads draw a constant power each, so the current of the bus follows from its voltage. The panels deliver
-their power in proportion to the cosine of the angle of incidence and the visible fraction of the Sun's disc;
-light from the Earth is neglected. A full battery takes no current. An empty battery keeps the voltage of an
-empty cell, because the simulated board cannot lose its supply.
+Each load draws constant power, so the bus current depends on the bus voltage. The power of the panels is
+proportional to the cosine of the angle of incidence and to the visible fraction of the Sun's disc; light from
+the Earth is neglected. A full battery accepts no current. An empty battery keeps the voltage of an empty
+cell, because the simulated board cannot lose its supply.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from sim_hal.settings import PowerTruth
 from sim_hal.worlds.world import OrbitingWorld
 
 PERIOD_NS = 250_000_000
-"""Period (ns) of the simulation, within the time over which the coils' supply current is known."""
+"""Period (ns) of the steps, shorter than the time over which the coils' supply current is recorded."""
 FRAME_POWER = 1.0
-"""Power (W) of the star camera and its processing, until the energy of a frame is used."""
+"""Power (W) that the star camera and its processing draw until the energy of each frame is used."""
 Supply = Callable[[int, int], tuple[float, float]]
-"""Function from the begin and end of a time window (ns) to the coils' mean supply voltage (V) and current."""
+"""Function from begin and end of a time window (ns) to the coils' mean supply voltage (V) and current (A)."""
 
 
 class Rail:
@@ -46,7 +46,7 @@ class Rail:
         self._shown = (0.0, 0.0)
 
     def measure(self, *_: int) -> tuple[float, float]:
-        """Return the measured voltage (V) and current (A) of any time window."""
+        """Return the measured voltage (V) and current (A), whatever the time window."""
         if not self.stuck:
             self._shown = (self.gain * self.values[0], self.gain * self.values[1])
         return self._shown
@@ -59,7 +59,7 @@ class EmulatedPower:
         charge: state of charge, from 0 to 1.
         rails: measured supply lines of battery and bus.
         cells_lost: number of cells without voltage.
-        weakness: factor of the internal resistance, and divisor of the capacity.
+        weakness: factor by which the internal resistance is multiplied and the capacity is divided.
         lost_panel: number of the panel that gives no power, 0 for all panels, or None.
     """
 
@@ -81,7 +81,8 @@ class EmulatedPower:
         normals = np.array([panel.normal for panel in truth.panels]).reshape(-1, 3)
         self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         self._peaks = np.array([panel.peak for panel in truth.panels])
-        self._frames, self._unused = 0, 0.0  # number of exposures, and energy (J) of frames not yet drawn
+        # Number of exposures, and energy (J) of frames that has not been drawn yet.
+        self._frames, self._unused = 0, 0.0
         self._due_ns = start_ns + PERIOD_NS
         self._powers = dict.fromkeys(("solar_power", "load_power", "coil_power"), 0.0)
         self._connect(truth.load, 0.0)
@@ -119,11 +120,11 @@ class EmulatedPower:
         self._powers = {"solar_power": solar, "load_power": load, "coil_power": coils}
 
     def _connect(self, load: float, solar: float) -> float:
-        """Compute voltage and currents for powers (W), and return the solar power that is used, W."""
+        """Compute voltage and currents for the given powers (W), and return the used solar power, W."""
         battery, resistance = self._battery, self._battery.resistance * self.weakness
         open_circuit = battery.voltage(self.charge) * (1.0 - self.cells_lost / battery.cells)
         solar = min(solar, load) if self.charge >= 1.0 else solar
-        # The battery delivers P = (U - R I) I, of which the solution with the smaller current is stable.
+        # The current solves P = (U - R I) I; of the two solutions, the smaller one is stable.
         root = math.sqrt(max(open_circuit**2 - 4.0 * resistance * (load - solar), 0.0))
         current = (open_circuit - root) / (2.0 * resistance)
         voltage = open_circuit - resistance * current
@@ -132,7 +133,7 @@ class EmulatedPower:
         return solar
 
     def _solar(self, time_ns: int) -> float:
-        """Return the power (W) that the panels can deliver."""
+        """Return the maximum power (W) that the panels can deliver."""
         if self._world is None or self.lost_panel == 0:
             return 0.0
         to_body = attitude_matrix(self._world.motion(time_ns).quaternion)

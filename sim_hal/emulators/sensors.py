@@ -1,4 +1,4 @@
-"""Emulated gyros, magnetometers and accelerometers at the registers: ICM-20948, LIS3MDL and ADIS16470.
+"""Gyros, magnetometers and accelerometers emulated by their registers: ICM-20948, LIS3MDL and ADIS16470.
 
 The sensors measure at their data rates with the white noise of their data sheets. A configuration names the
 emulator of another sensor as `module:function`, which takes `Measurements` and the sensor's section, and
@@ -35,7 +35,7 @@ _TURN = math.radians(1.0)
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """The quantities that an ideal sensor measures in sensor axes, with white noise added on request.
+    """Quantities that an ideal sensor measures in sensor axes, with white noise added on request.
 
     Attributes:
         sense: function from a time (ns) to the motion at the sensor, body axes.
@@ -50,7 +50,7 @@ class Measurements:
     now_ns: Callable[[], int]
 
     def of(self, quantity: str, deviation: float) -> FloatArray:
-        """Return a quantity (3,) in rad/s, T or m/s^2, with white noise of a standard deviation."""
+        """Return a quantity (3,), rad/s, T or m/s^2, with white noise of the sigma `deviation`."""
         motion = self.sense(self.now_ns())
         true = {
             "gyro": motion.rate,
@@ -87,7 +87,7 @@ class Registers(ABC):
 
     @abstractmethod
     def latch(self) -> None:
-        """Make a new sample if one is due, before registers are read."""
+        """Store a new sample in the registers if one is due; called before registers are read."""
 
     @abstractmethod
     def store(self, register: int, value: int) -> None:
@@ -106,7 +106,7 @@ class EmulatedLis3mdl(Registers):
     _SLOW_HZ = (0.625, 1.25, 2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
     _FAST_HZ = (1000.0, 560.0, 300.0, 155.0)
     _NOISE_T = 0.35e-6
-    """RMS noise (T) in ultra-high performance at 12 gauss, which doubles with each lower performance mode."""
+    """RMS noise (T) in the mode ultra-high performance at 12 gauss; each lower mode doubles the noise."""
 
     def __init__(self, address: int, measured: Measurements) -> None:
         super().__init__(address)
@@ -154,7 +154,7 @@ class EmulatedIcm20948(Registers):
     _COUNTS_PER_G = (16384, 8192, 4096, 2048)
     _FIELD_STEP_T, _FIELD_NOISE_T = 0.15e-6, 0.3e-6
     _GYRO_BANDWIDTH_HZ = (229.8, 187.6, 154.3, 73.3, 35.9, 17.8, 8.9, 376.5)
-    """Noise bandwidths (Hz) of the gyro filter; without the filter it is 12.1 kHz."""
+    """Noise bandwidths (Hz) of the gyro's filter settings; without a filter the bandwidth is 12.1 kHz."""
     _FORCE_BANDWIDTH_HZ = (265.0, 265.0, 136.0, 68.8, 34.4, 17.0, 8.3, 499.0)
 
     def __init__(self, address: int, measured: Measurements) -> None:
@@ -177,7 +177,7 @@ class EmulatedIcm20948(Registers):
         self._held[self._bank, register] = value
         if (self._bank, register) == (0, 0x06) and value & 0x80:
             self.reset()
-        if (self._bank, register) == (3, 0x15) and value & 0x80:  # a transfer through slave 4
+        if (self._bank, register) == (3, 0x15) and value & 0x80:  # start of a transfer through slave 4
             self._transfer()
 
     def load(self, register: int) -> int:
@@ -221,7 +221,7 @@ class EmulatedIcm20948(Registers):
 
 
 class EmulatedAdis16470:
-    """An ADIS16470 on an SPI bus, whose answers come one frame after the requests."""
+    """An ADIS16470 on an SPI bus, which sends each answer one frame after the request."""
 
     _GYRO_DENSITY, _FORCE_DENSITY = 0.008 * _TURN, 100e-6 * STANDARD_GRAVITY
 
@@ -232,7 +232,7 @@ class EmulatedAdis16470:
         self._answer = b"\0\0"
 
     def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
-        """Execute the request in each frame of two bytes, and return each answer to the request before."""
+        """Execute the request in each frame of two bytes, and return the answer to the preceding request."""
         return [self._frame(data) for data in frames]
 
     def _frame(self, data: bytes) -> bytes:
@@ -247,7 +247,7 @@ class EmulatedAdis16470:
         return answer
 
     def _latch(self) -> None:
-        """Make a new sample if one is due."""
+        """Store a new sample in the registers if one is due."""
         rate = SAMPLE_HZ / (1 + self._held[DEC_RATE])
         number = int(self._measured.now_ns() * rate // SECOND_NS)
         if number == self._number:

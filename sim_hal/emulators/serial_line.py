@@ -3,7 +3,7 @@
 Each direction of a line is a `Wire`. In memory, the host's end is a `hal.interfaces.wires.SerialPort` and the
 device's end is a `sim_hal.clock.SerialEnd`. A line in memory is deterministic for a given random generator. A
 `PtyLine` serves any client on a pseudo-terminal in real time at the line's baud rate. The client's baud rate
-is read from the terminal, so a wrong baud rate garbles the bytes as on a cable.
+is read from the terminal, so a wrong baud rate corrupts the bytes as on a real line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class LineFaults:
-    """Faults of a wire, which act on bytes that are sent afterwards.
+    """Faults of a wire, which affect bytes that are sent after the faults begin.
 
     Attributes:
         silent: whether a fault loses all bytes.
@@ -37,7 +37,7 @@ class LineFaults:
         cut_probability: probability that a message loses a random run of its bytes.
         flip_probability: probability that a bit arrives inverted.
         delay_ns: additional delay of each byte.
-        thinned: number n of a fault in which only every n-th message arrives.
+        thinned: number n; only every n-th message arrives.
     """
 
     silent: bool = False
@@ -61,7 +61,7 @@ class _Message:
     taken: int = 0
 
     def crossed_ns(self, count: int) -> int:
-        """Return the time (ns, rounded up) at which the first `count` bytes have arrived."""
+        """Return the time (ns, rounded up) at which the first `count` bytes of this message have arrived."""
         return self.start_ns - (-count * _BITS * _SECOND_NS // self.baud_rate)
 
     def crossed(self, now_ns: int) -> int:
@@ -102,10 +102,10 @@ class Wire:
         if faults is not SOUND:
             data = self._disturb(data, faults)
             start_ns += faults.delay_ns
-        # Bytes keep their order after a delay is removed.
+        # This keeps the order of the bytes when a delay fault ends.
         start_ns = max(start_ns, self._last_ns)
         if data and sender_baud != receiver_baud:
-            # A receiver with a lower baud rate reads fewer characters, all of them random.
+            # A receiver with a lower baud rate receives fewer characters; all are random.
             data = self._rng.bytes(max(1, len(data) * min(receiver_baud, sender_baud) // sender_baud))
         room = self._capacity - self._waiting
         self.lost_bytes += max(0, len(data) - room)
@@ -121,7 +121,7 @@ class Wire:
         self.push(self._rng.bytes(count), now_ns, baud_rate, baud_rate)
 
     def pull(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return the chunks that have arrived by `now_ns` as (time of the last byte, bytes), oldest first."""
+        """Return the data received by `now_ns` as tuples (time of the last byte, bytes), oldest first."""
         chunks: list[tuple[int, bytes]] = []
         while self._messages:
             message = self._messages[0]
@@ -136,7 +136,7 @@ class Wire:
         return chunks
 
     def next_arrival_ns(self) -> int:
-        """Return the time at which the message in transmission will have arrived, or NEVER."""
+        """Return the time (ns) at which the present message will have arrived completely, or NEVER."""
         if not self._messages:
             return NEVER
         message = self._messages[0]
@@ -251,7 +251,7 @@ class PtyLine:
         to_host_rng, to_device_rng = rng.spawn(2)
         self.to_host = Wire(to_host_rng)
         self.to_device = Wire(to_device_rng)
-        # The client's side stays open, because a pseudo-terminal without a client reports errors.
+        # The client's side stays open, because reading from a pseudo-terminal without a client raises errors.
         self._near, self._far = os.openpty()
         tty.setraw(self._far)
         self._set_speed(baud_rate)
@@ -302,7 +302,7 @@ class PtyLine:
         return self._near
 
     def wait(self, now_ns: int, until_ns: int) -> None:
-        """Wait until the host writes, a message for the host is complete, or `until_ns` has come."""
+        """Wait until the host writes, a message for the host is complete, or the time is `until_ns`."""
         due_ns = min(until_ns, self.to_host.next_arrival_ns())
         select.select([self._near], [], [], max(0, due_ns - now_ns) * 1e-9)
 
@@ -317,7 +317,7 @@ class PtyLine:
         self._near = self._far = -1
 
     def _host_speed(self) -> int:
-        # A baud rate without a termios name (128000) cannot be read back and is assumed to be correct.
+        # A baud rate without a termios constant (128000) cannot be read back and is assumed to be correct.
         return _SPEEDS.get(termios.tcgetattr(self._far)[5], self.baud_rate)
 
     def _set_speed(self, baud_rate: int) -> None:

@@ -1,15 +1,14 @@
 """Solar cell currents of a body in orbit, and the ADS1115 converters that measure the currents.
 
-A solar string is a group of cells in series on one face of the body. The configuration and the faults call a
-group of cells a string. The currents follow from sunlight, sunlight reflected by the Earth, shadow, and the
-errors of the cells. The reflected light is summed over the visible ground, which is Lambertian and has a
-uniform albedo. The default albedo of 0.3 is close to the Earth's mean of 0.29 (Stephens et al. 2015, Rev.
-Geophys. 53).
+A solar string is a group of cells in series on one face of the body. The currents are computed from sunlight,
+sunlight reflected by the Earth, shadow, and the errors of the cells. The reflected light is summed over the
+visible ground, which is Lambertian and has a uniform albedo. The default albedo of 0.3 is close to the
+Earth's mean of 0.29 (Stephens et al. 2015, Rev. Geophys. 53).
 
 The emulated ADS1115 has the registers Config and Conversion and the conversion times of the data sheet (TI
-SBAS444, Table 8-3). The emulated ADS1115 converts single-ended inputs in single-shot mode, which the driver
-uses. Other settings are stored, but start no conversion. A conversion returns the voltage at the end of the
-conversion time.
+SBAS444, Table 8-3). It converts single-ended inputs in single-shot mode, which the driver uses. Other
+settings are stored, but start no conversion. A conversion returns the voltage at the end of the conversion
+time.
 """
 
 from __future__ import annotations
@@ -32,20 +31,21 @@ from sim_hal.worlds.world import OrbitingWorld, utc_date
 
 DEVICE = "solar strings"
 LAMP = 0.2
-"""Light of a halogen lamp at a short distance, relative to sunlight."""
+"""Irradiance of a halogen lamp at a short distance, relative to sunlight."""
 _RINGS, _SPOKES = 16, 32
-"""Numbers of rings and spokes of the sampling points on the visible ground."""
+"""Numbers of rings and of radial directions of the sampling points on the visible ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolarCellsModel:
-    """The properties of n solar strings.
+    """Properties of n solar strings.
 
     Attributes:
         normals: outward unit vectors (n, 3) of the strings' faces, body axes.
         peaks: nominal currents (n,) at normal incidence and one astronomical unit, A.
         gain_errors: relative errors (n,) of the peak currents.
-        grazing: angle from the surface below which more and more light is reflected, rad.
+        grazing: angle (rad) between light and surface below which the reflected fraction of the light
+            increases.
         noise: standard deviation of the current noise, A.
         albedo: reflectance (albedo) of the Earth, from 0 to 1.
     """
@@ -91,7 +91,7 @@ class SolarCellsModel:
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
-        """Return the relative current (...), 0 to 1, for light at `cosines` (...) of the incidence angle."""
+        """Return the relative currents (...), 0 to 1, for `cosines` (...) of the angle of incidence."""
         grazing = math.sin(self.grazing)
         dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
         return np.asarray(np.maximum(dimmed, 0.0))
@@ -104,10 +104,10 @@ class SolarCellsModel:
 
 
 def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return directions (m, 3) to the ground, the verticals (m, 3) of the ground, and a solid angle.
+    """Return directions (m, 3) to ground points, unit verticals (m, 3) at these points, and a solid angle.
 
     The directions sample the visible disc in rings of equal solid
-    angle. The returned solid angle (sr) is the same for each direction.
+    angle. The solid angle (sr) is that of each direction.
     """
     distance = float(np.linalg.norm(position))
     down = -position / distance
@@ -194,7 +194,7 @@ class EmulatedAds1115:
 
 
 _FRESH_NS = 20_000_000
-"""Time (ns) for which computed solar currents are reused."""
+"""Time (ns) for which computed string currents are reused."""
 
 
 class EmulatedSolarCells:
@@ -202,10 +202,10 @@ class EmulatedSolarCells:
 
     Attributes:
         parts: the converters.
-        dead: whether (n,) each string has failed and gives no current.
+        dead: mask (n,) of the failed strings, which give no current.
         frozen: whether a fault holds all currents constant.
         gain: gain of all amplifiers relative to the nominal gain.
-        lamp: outward normal (3,), body axes, of the panel in the light of a lamp on a bench; None in flight.
+        lamp: outward normal (3,), body axes, of the panel that a lamp on a bench illuminates; None in flight.
     """
 
     def __init__(

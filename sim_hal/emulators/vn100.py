@@ -4,15 +4,15 @@ The unit executes commands and sends its asynchronous outputs (one ASCII sentenc
 the 800 Hz grid of its own clock. Register values are stored as the text that the unit prints, with the
 contents and defaults of VectorNav UM001 v2.43, chapter 5. The registers that tune the attitude estimation (21
 to 26, 32 to 51, 74, 82 to 84) are stored and echoed without effect, except the heading mode in register 35.
-Of register 85, the filter windows of magnetometer, accelerometer and gyro have an effect. SYNC lines and the
-second serial port are not emulated. VectorNav specifies 500 ms for a flash write, and a start-up time of 1 s
-is assumed.
+In register 85, only the filter windows of magnetometer, accelerometer and gyro have an effect. SYNC lines and
+the second serial port are not emulated. VectorNav specifies 500 ms for a flash write, and a start-up time of
+1 s is assumed.
 
 The commands of the attitude filter are those of VectorNav UM001, chapter 8. The commands "set initial
 heading" and "set filter bias" follow VectorNav's SDK 0.99 and the answers of VectorNav units with satellite
-navigation. In the absolute heading mode the magnetometer is assumed to set the heading, so "tare" and "set
-initial heading" change nothing. Gravity is assumed to set pitch and roll in every mode, so only the yaw of a
-given attitude has an effect. The filter's estimate of the gyro bias has no error.
+navigation. In the absolute heading mode the magnetometer is assumed to set the heading, so that the commands
+"tare" and "set initial heading" have no effect. Gravity is assumed to set pitch and roll in every mode, so
+only the yaw of a given attitude has an effect. The filter's estimate of the gyro bias has no error.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from sim_hal.emulators.vn100_sensors import (
 from sim_hal.worlds.world import BodyMotion
 
 Rule = Callable[[str], str]
-"""Function that returns a field's text as the unit stores it, or raises ValueError for an invalid text."""
+"""Function that returns the text that the unit stores for a field, or raises ValueError if it is invalid."""
 
 BAUD_RATES = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600)
 ASYNC_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
@@ -56,7 +56,7 @@ SUPPORTED_FIELDS: Mapping[int, int] = {0: 0x3F3D, 1: 0x0191, 2: 0x0FFF, 4: 0x01F
 
 
 class UnitError(Exception):
-    """Error for which the unit answers `$VNERR` with an error code."""
+    """Error that the unit answers by `$VNERR` with an error code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"{code:02X}")
@@ -70,7 +70,7 @@ RECEIVE_OVERFLOW = 0x02
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """A register with a rule and a default for each field.
+    """A register of the unit, with a rule and a default value for each field.
 
     If `port_option` is set, a write may have the serial port as an additional field.
     """
@@ -190,8 +190,8 @@ REGISTERS: Mapping[int, Register] = {
 _OFF = ("0", "0", "00")
 
 FIELD_BITS = 16
-"""Width (bits) that each register field has for bit flips."""
-_BASE_10 = 2  # number of decimal fields of a binary output; later fields are hexadecimal
+"""Number of bits per register field, of which a fault can flip one."""
+_BASE_10 = 2  # number of decimal fields at the start of registers 75 to 77; later fields are hexadecimal
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,13 +203,13 @@ class BinaryOutput:
     layout: OutputLayout
 
     def pack(self, now: MessageData) -> bytes:
-        """Return the packet that contains the data of one time."""
+        """Return the binary packet with the data of one sampling time."""
         return self.layout.pack(now.values(_quantities(self.layout.fields)))
 
 
 @lru_cache(maxsize=64)
 def _quantities(fields: tuple[tuple[int, int], ...]) -> str:
-    """Return the names of the quantities in binary fields, which are given as group bit and field bit."""
+    """Return the names of the quantities in binary fields, each given by group bit and field bit."""
     return " ".join(BINARY_FIELDS[key] for key in fields)
 
 
@@ -241,7 +241,7 @@ def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
 
 
 class RegisterFile:
-    """The registers in use, and their copy in flash.
+    """Registers of the unit: contents in use, and their copy in flash memory.
 
     Attributes:
         values: fields in use of each register.
@@ -284,7 +284,7 @@ class RegisterFile:
         """Flip a bit of a register; bits after the last field are ignored.
 
         Bits are counted from the lowest bit of the first field. The register keeps the new content even if it
-        is invalid. Raises UnitError if a write of the new content would be rejected.
+        is invalid. Raises UnitError if the unit would reject this content in a write command.
         """
         place, shift = divmod(bit, FIELD_BITS)
         fields = list(self.values[number])
@@ -318,7 +318,7 @@ _VPE_CONTROL, _HEADING_MODE, _ABSOLUTE = 35, 1, 0
 
 
 class AttitudeCommands:
-    """State of the unit's attitude filter that commands change.
+    """State of the unit's attitude filter that can be changed by commands.
 
     Attributes:
         status: VPE status word, whose disturbance bits the commands KMD and KAD set.
@@ -332,7 +332,7 @@ class AttitudeCommands:
         self.status = 0
 
     def reset(self) -> None:
-        """Discard the state that commands have set."""
+        """Discard the heading and the status that commands have set."""
         self._turn = None
         self.status = 0
 
@@ -343,7 +343,7 @@ class AttitudeCommands:
         return replace(sample, quaternion=multiply(sample.quaternion, self._turn))
 
     def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Vn100Sample]) -> None:
-        """Execute one of ATTITUDE_COMMANDS; the function `sample` measures the present motion."""
+        """Execute one of ATTITUDE_COMMANDS; the function `sample` returns a sample of the present motion."""
         if command in _DISTURBANCES:
             bit = _DISTURBANCES[command]
             self.status = self.status | bit if flag(fields) else self.status & ~bit
@@ -382,7 +382,10 @@ def flag(fields: tuple[str, ...]) -> bool:
 
 
 def _yaw_of(fields: tuple[str, ...]) -> float:
-    """Return the yaw (rad) that a heading or three angles (deg) or a quaternion define. Raises UnitError."""
+    """Return the yaw (rad) from the fields: a heading (deg), three angles (deg) or a quaternion.
+
+    Raises UnitError.
+    """
     expect_count(fields, 1, 4)
     if len(fields) == 2:
         raise UnitError(TOO_FEW)
@@ -418,8 +421,8 @@ class OutputStreams:
 
     Attributes:
         muted: registers whose output is silent until the register is written again.
-        foreign: packet and rate divisor of an output that a unit with other firmware has in the flash copy of
-            register 75, or None; the output ends when the register is written.
+        foreign: packet and rate divisor of an output that only other firmware has, stored in the flash copy
+            of register 75, or None; the output ends when register 75 is written.
     """
 
     def __init__(self, registers: RegisterFile) -> None:
@@ -430,7 +433,7 @@ class OutputStreams:
         self._sends_foreign = False
 
     def reset(self) -> None:
-        """Remove all output streams, and begin the foreign output, if there is one."""
+        """Remove all output streams, and begin the output `foreign` unless it is None."""
         self._streams = {}
         self.muted.clear()
         self._sends_foreign = self.foreign is not None
@@ -456,7 +459,7 @@ class OutputStreams:
         if self.foreign is not None and self._sends_foreign:
             packet_, divisor = self.foreign
             streams[BINARY_OUTPUTS[0]] = Stream(divisor, len(packet_), lambda _: packet_, device_ns)
-        # A stream that continues unchanged keeps the time of its last message.
+        # An existing stream keeps the time of its last message.
         for number in streams.keys() & self._streams.keys():
             streams[number].sent_ns = self._streams[number].sent_ns
         load = sum(10 * stream.length * IMU_RATE_HZ / stream.divisor for stream in streams.values())
@@ -465,11 +468,11 @@ class OutputStreams:
         self._streams = streams
 
     def next_tick(self, passed: int) -> int | None:
-        """Return the first tick after `passed` on which a stream is due, or None without streams."""
+        """Return the first tick after the tick `passed` on which a stream is due, or None without streams."""
         return min(((passed // s.divisor + 1) * s.divisor for s in self._streams.values()), default=None)
 
     def due(self, tick: int) -> list[Stream]:
-        """Return the streams that are due on a tick."""
+        """Return the output streams that are due on a tick."""
         return [stream for stream in self._streams.values() if tick % stream.divisor == 0]
 
     def checksum(self) -> Checksum:
@@ -507,7 +510,8 @@ class Vn100EmulatorSettings:
         reference: quaternion (4,) from NED axes to the world's reference frame.
         gyro_bias: constant gyro bias (3,), rad/s, sensor axes.
         clock_ppm: rate error of the unit's clock, ppm; positive if the clock is fast.
-        uptime_ns: unit's time at the start of the simulation, ns, which sets the phase of the outputs.
+        uptime_ns: time of the unit's clock at the start of the simulation, ns, which determines the phase of
+            the outputs.
         boot_ns: time from reset to the first message, ns.
         flash_ns: duration of a flash write, ns.
         temperature: reported temperature, degrees C.
@@ -533,7 +537,7 @@ class Vn100Emulator:
 
     Attributes:
         registers: configuration and data registers of the unit.
-        alter: function by which a fault alters each sample before it is sent, or None.
+        alter: function with which a fault alters each sample before it is sent, or None.
     """
 
     def __init__(
@@ -578,12 +582,12 @@ class Vn100Emulator:
                 self._act(event_ns)
             else:
                 data = self._line.read(event_ns)
-                if self._then is None:  # no reception during a start or a flash write
+                if self._then is None:  # the unit does not receive during a start or a flash write
                     self._receive(data, event_ns)
             self._schedule(event_ns)
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Save a baud rate in flash, with the fastest output rate that fits. Raises UnitError."""
+        """Save a baud rate in flash, with the highest output rate that the line permits. Raises UnitError."""
         self.registers.write(5, (str(baud_rate),))
         length = OUTPUT_BY_TYPE[14].length()
         fitting = [rate for rate in ASYNC_RATES_HZ if rate <= 40 and 10 * length * rate <= baud_rate]
@@ -609,7 +613,7 @@ class Vn100Emulator:
         self._build_streams(now_ns)
 
     def save_foreign_output(self, packet: bytes, divisor: int, now_ns: int) -> None:
-        """Store an output that only other firmware has in flash, and restart the unit from flash.
+        """Store in flash an output that only other firmware has, and restart the unit from flash.
 
         The unit sends `packet` every `divisor` ticks of 1/800 s, also after later restarts.
         """
@@ -630,7 +634,7 @@ class Vn100Emulator:
             self._build_streams(now_ns)
         self._schedule(now_ns)
 
-    # Time is counted in ticks of 1/800 s of the unit's own clock.
+    # The following methods count time in ticks of 1/800 s of the unit's own clock.
 
     def _device_ns(self, now_ns: int) -> int:
         return self._uptime_ns + (now_ns - self._origin_ns) * self._clock_rate // _BILLION

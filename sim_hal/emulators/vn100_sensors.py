@@ -1,4 +1,4 @@
-"""Measurements of an emulated VN-100 (frames, units, noise), and the messages with the measurements.
+"""Measurements of an emulated VN-100 (frames, units, noise), and the contents of its messages.
 
 The main noise profiles are "thesis" and "datasheet". The profile "thesis" has uniform noise of attitude and
 rate with the bounds of Sease 2013, chapter 5. The profile "datasheet" has white noise with the densities of
@@ -33,10 +33,10 @@ ProfileName = Literal["thesis", "datasheet", "none"]
 
 @dataclass(frozen=True, slots=True)
 class NoiseProfile:
-    """Uniform noise, white noise, and errors that are constant until the next start of the unit.
+    """Sensor errors: uniform noise, white noise, and errors that are constant until the unit's next start.
 
     Attributes:
-        attitude_bound: bound of each vector component of the attitude error's quaternion, body axes.
+        attitude_bound: bound of each vector component of the error quaternion, body axes.
         rate_bound: bound of the uniform rate noise, rad/s.
         rate_density, field_density, acceleration_density: white noise densities, rad/s, T and m/s^2 per
         sqrt(Hz).
@@ -106,7 +106,7 @@ class Vn100Sample:
 
 
 class Sensors:
-    """The unit's sensors, which measure the motion of the body."""
+    """Sensors of the unit, which measure the motion of the body."""
 
     def __init__(
         self,
@@ -119,14 +119,15 @@ class Sensors:
     ) -> None:
         """Create the sensors of a unit.
 
-        `mounting` is the quaternion from sensor to body axes, `reference` that from NED to the reference
-        frame. `gyro_bias` (3,) is in rad/s. In `free_fall` the unit cannot measure the vertical, so its
-        attitude drifts at random.
+        `mounting` is the quaternion from sensor to body axes, and `reference` is the quaternion from NED to
+        the reference frame. `gyro_bias` (3,) is in rad/s. In `free_fall` the unit cannot measure the
+        vertical, so its attitude drifts at random.
         """
         self._rng = rng
         self._profile = profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
-        # The measured quaternion is linear in the true quaternion and in the error, so a table gives it fast.
+        # The measured quaternion is bilinear in the true and the error quaternion, so a matrix product is
+        # enough.
         body = multiply(np.eye(4)[None, :], np.eye(4)[:, None])
         self._table = multiply(multiply(conjugate(mounting), body), reference).reshape(4, 16)
         self._fixed_bias = gyro_bias
@@ -176,13 +177,13 @@ Values = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class MessageData:
-    """The data from which all messages of one time are made.
+    """Data for all messages of one sampling time.
 
     Attributes:
         device_ns: unit's time since its start, ns.
         sample: measured sample.
         status: VPE status word.
-        interval: time since the previous output of the same kind, over which deltas are formed, s.
+        interval: time since the previous output of the same kind, s, over which changes are integrated.
         temperature: reported temperature, degrees C.
         pressure: reported pressure, kPa.
     """
@@ -202,7 +203,7 @@ class MessageData:
         """Return the values of named quantities as text in the format of the VN-100."""
         quantities = (_QUANTITIES[name] for name in names.split())
         pairs = [(form, value) for read, form in quantities for value in read(self)]
-        # The zero padding would make a text that cannot be read as a NaN.
+        # With zero padding, the text for NaN could not be parsed.
         return [form % value if math.isfinite(value) else f"{value:+}" for form, value in pairs]
 
     def linear_acceleration(self) -> FloatArray:
@@ -236,7 +237,7 @@ _QUANTITIES: Mapping[str, tuple[Callable[[MessageData], Values], str]] = {
     "delta_angle": (_vector(lambda now: np.degrees(now.sample.rate) * now.interval), "%+08.3f"),
     "delta_velocity": (_vector(lambda now: now.sample.accel * now.interval), "%+08.3f"),
 }
-"""Function and ASCII format of each quantity; delta angles are in degrees and delta velocities in m/s."""
+"""Function and ASCII format for each quantity; delta angles are in degrees, delta velocities in m/s."""
 
 
 @lru_cache(maxsize=64)
@@ -288,7 +289,7 @@ BINARY_FIELDS: Mapping[tuple[int, int], str] = {
 
 @dataclass(frozen=True, slots=True)
 class AsciiOutput:
-    """An ASCII output: header after `$VN`, number in register 6, register with the data, and quantities."""
+    """An ASCII output: header after `$VN`, its number for register 6, register with the data, quantities."""
 
     header: str
     async_type: int
@@ -296,7 +297,7 @@ class AsciiOutput:
     quantities: str
 
     def length(self) -> int:
-        """Return the length (bytes) of one sentence with an 8-bit checksum."""
+        """Return the length (bytes) of a sentence of this output with an 8-bit checksum."""
         return len("$VN") + len(",".join([self.header, *_AT_REST.text(self.quantities)])) + len("*XX\r\n")
 
 

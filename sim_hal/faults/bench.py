@@ -1,4 +1,4 @@
-"""Simulated hardware that faults act on, and the description of a kind of fault."""
+"""Simulated hardware that faults affect, and the description of a kind of fault."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 
 from sim_hal.emulators.serial_line import SOUND, EmulatedSerialLine, HostEnd, LineFaults, PtyLine, Wire
 
-if TYPE_CHECKING:  # only for types, because parsing faults needs no hardware
+if TYPE_CHECKING:  # imported only for types, because faults can be parsed without the hardware
     from sim_hal.assembly import Hardware
 
 Removal = Callable[[], None]
-"""Function that removes a fault that has begun."""
+"""Function that ends a fault."""
 
 
 def no_removal() -> None:
-    """Do nothing; the effect of the fault lasts until the flight software repairs it."""
+    """Do nothing; the fault's effect lasts until the flight software repairs it."""
 
 
 def hold(part: object | None, attribute: str, value: object, sound: object) -> Removal:
-    """Set an attribute of a device until the fault is removed; a device that is None is ignored."""
+    """Set an attribute of a device until the fault is removed; do nothing if the device is None."""
     if part is None:
         return no_removal
     setattr(part, attribute, value)
@@ -48,7 +48,7 @@ def all_of(removals: Sequence[Removal]) -> Removal:
 
 @dataclass(slots=True)
 class Bench:
-    """The devices that faults act on from outside the flight process.
+    """Devices that faults affect from outside the flight process.
 
     Attributes:
         line: serial line of the inertial unit.
@@ -69,7 +69,7 @@ class Bench:
     _on_wires: dict[int, list[LineFaults]] = field(default_factory=dict)
 
     def disturb(self, wire: Wire, faults: LineFaults) -> Removal:
-        """Add faults to the present faults of a wire, and return their removal."""
+        """Add faults to the present faults of a wire, and return a function that removes them."""
         present = self._on_wires.setdefault(id(wire), [])
         present.append(faults)
         wire.faults = reduce(_combined, present, SOUND)
@@ -123,11 +123,11 @@ def _combined(a: LineFaults, b: LineFaults) -> LineFaults:
 
 Parameters = Mapping[str, float]
 Begin = Callable[[Bench, "FaultKind", Parameters], Removal]
-"""Function that applies a fault to the bench and returns the fault's removal."""
+"""Function that applies a fault to the bench and returns a function that removes the fault."""
 
 
 def intermittently(begin: Begin) -> Begin:
-    """Return the intermittent form of a fault, whose parameters are `period` (s) and the fraction `share`."""
+    """Return the intermittent form of a fault, with the parameters `period` (s) and `share` (fraction)."""
 
     def toggled(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
         return bench.toggle(lambda: begin(bench, fault, given), given["period"], given["share"])
@@ -180,7 +180,7 @@ class Parameter:
             else:
                 runs.append([value])
         words = []
-        for run in runs:  # writes three or more consecutive values as a range
+        for run in runs:  # three or more consecutive values are written as a range
             words += [f"{run[0]:g} to {run[-1]:g}"] if len(run) > 2 else [f"{value:g}" for value in run]
         return f"one of {', '.join(words)}{unit}"
 
@@ -190,10 +190,10 @@ class FaultKind:
     """One kind of fault.
 
     Attributes:
-        device, kind: two parts of the fault's name "device: kind".
+        device, kind: the two parts of the fault's name "device: kind".
         meaning: description of the fault's effect.
-        begin: function that applies the fault to the bench and returns its removal, or None for faults in the
-            flight process.
+        begin: function that applies the fault to the bench and returns a function that removes it, or None
+            for faults in the flight process.
         parameters: parameters of the fault by name.
         momentary: whether the fault has no duration and its effect lasts until repaired.
         where: kind of simulation in which the fault can occur.
@@ -216,5 +216,8 @@ class FaultKind:
 
     @property
     def part(self) -> str:
-        """Affected part; a coil and its bridge are one part, and so are inertial unit and magnetometer."""
+        """Name of the affected part.
+
+        A coil and its bridge are one part, as are inertial unit and magnetometer.
+        """
         return self.device.replace("bridge-", "coil-").replace("magnetometer", "imu")

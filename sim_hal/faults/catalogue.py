@@ -37,7 +37,7 @@ from sim_hal.faults.bench import (
     no_removal,
 )
 
-if TYPE_CHECKING:  # only for types, because the table of faults needs no devices
+if TYPE_CHECKING:  # imported only for types, because the table of faults does not need the devices
     from sim_hal.emulators.coil_circuit import EmulatedIna219
     from sim_hal.emulators.i2c_bus import I2cPart
     from sim_hal.emulators.pca9685 import EmulatedPca9685
@@ -59,7 +59,8 @@ def _fault(
 
 
 def _chance(default: float) -> Parameter:
-    return Parameter(default, 1e-6, 1.0)  # the minimum is above 0, because 0 would have no effect
+    # The minimum is above 0, because the probability 0 would have no effect.
+    return Parameter(default, 1e-6, 1.0)
 
 
 def _delay(default: float) -> Parameter:
@@ -84,7 +85,7 @@ def _nanoseconds(given: Parameters) -> int:
 
 
 def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
-    """Return the fault that holds an attribute of a device, or of the cameras selected by `camera`."""
+    """Return a fault that sets an attribute of a device, or of the cameras selected by `camera`."""
 
     def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
         hardware = bench.hardware
@@ -152,14 +153,15 @@ def _unplugged(bench: Bench, *_: object) -> Removal:
 
 
 def _baud(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # The baud rate changes even if the line becomes too slow, because no command checks the new rate.
+    # The baud rate changes even if the line becomes too slow, because the emulated register write is not
+    # checked.
     with suppress(UnitError):
         bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
     return no_removal
 
 
 def _stuck_samples(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
-    """Repeat the first sample of the unit, or only the magnetic field of the first sample."""
+    """Repeat the first sample after the fault's begin, or only its magnetic field."""
     first: list[Vn100Sample] = []
 
     def alter(sample: Vn100Sample) -> Vn100Sample:
@@ -206,7 +208,7 @@ def _false_field(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
 
 
 class AlteredPart:
-    """A chip whose data are altered between chip and bus; the chip acknowledges as before."""
+    """A chip whose data are altered between chip and bus, while acknowledgements are not changed."""
 
     def __init__(
         self,
@@ -214,7 +216,7 @@ class AlteredPart:
         write: Callable[[int, bytes], None] | None = None,
         read: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        """Pass writes to `write` instead of the chip, and data read from the chip through `read`."""
+        """Pass written data to `write` instead of the chip; the function `read` alters the data read."""
         self._part = part
         self._write = write or part.write
         self._read = read or (lambda data: data)
@@ -326,7 +328,7 @@ def _stuck_monitor(bench: Bench, *_: object) -> Removal:
     if monitor is None:
         return no_removal
     monitor.frozen = {number: monitor.register(number) for number in range(6)}
-    monitor.frozen[2] |= 0b10  # the conversion-ready flag stays set
+    monitor.frozen[2] |= 0b10  # this keeps the conversion-ready flag set
     return monitor.frozen.clear
 
 
@@ -364,7 +366,7 @@ def _given_or_drawn(bench: Bench, given: Parameters, name: str, values: Sequence
 
 
 def _upset_pwm(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
-    # A uniform draw over all registers would rarely select one of the three configuration registers.
+    # Configuration registers are drawn with probability 1/2; a uniform draw would rarely select one of them.
     among = _SET_UP if bench.generator.random() < 0.5 else _OUTPUTS
     register = _given_or_drawn(bench, given, "register", among)
     bench.hardware.pwm.flip(register, _given_or_drawn(bench, given, "bit", range(8)))
@@ -423,7 +425,7 @@ def _coil_faults(axis: str) -> tuple[FaultKind, ...]:
 
 
 def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[FaultKind, ...]:
-    """Return the faults of the star camera or the horizon cameras, each with `parameters`."""
+    """Return the faults of the star camera or of the horizon cameras; each fault has the `parameters`."""
     rows: tuple[tuple[str, str, Begin, dict[str, Parameter]], ...] = (
         ("off", "the camera ignores triggers and delivers no frame", _shown, {}),
         ("black", "frames without light", _shown, {}),
@@ -471,7 +473,7 @@ def _dead(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
 
 
 def _power_part(attribute: str, value: Callable[[Parameters], object], sound: object) -> Begin:
-    """Return the fault that holds an attribute of the power system, or of one of its two monitors."""
+    """Return a fault that sets an attribute of the power system or of one of its two monitors."""
 
     def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
         power = bench.hardware.power

@@ -27,7 +27,7 @@ from sim_hal.settings import Simulation
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A worker's job, with its function as MODULE:NAME, its argument, and its fault (empty for none)."""
+    """A worker's job: function as MODULE:NAME, argument, and name of the fault (empty without a fault)."""
 
     function: str
     argument: Any
@@ -66,15 +66,15 @@ def without_numbers(value: Any) -> Any:
 
 
 DEVICES = ("planner", "vision", "clock", "disk")
-"""Devices whose faults act inside the flight process."""
+"""Names of the devices whose faults occur inside the flight process."""
 
 
 class ProcessFaults:
-    """The faults inside a flight process; faults occur only after `begin`.
+    """Faults inside the flight process, which occur only after the call of `begin`.
 
     Attributes:
         realtime: whether jobs run in separate processes, which can hang and be killed.
-        now_ns: function that returns the flight's time, ns.
+        now_ns: function that returns the time of the flight's clock, ns.
     """
 
     def __init__(self, faults: Sequence[ScheduledFault], clock: Clock, realtime: bool) -> None:
@@ -89,7 +89,7 @@ class ProcessFaults:
         self._epoch_ns = epoch_ns
 
     def active(self, device: str) -> ScheduledFault | None:
-        """Return the present fault of a device, or an empty text."""
+        """Return the present fault of a device, or None."""
         if self._epoch_ns is None:
             return None
         now = (self.now_ns() - self._epoch_ns) * 1e-9
@@ -103,15 +103,15 @@ class ProcessFaults:
         return any(fault.kind.device in devices for fault in self._faults)
 
     def clock(self) -> Clock:
-        """Return the clock of the flight process with the faults of the wall clock."""
+        """Return the clock of the flight process, which includes the scheduled faults of the wall clock."""
         return cast("Clock", _SteppedClock(self._clock, self)) if self.concerns("clock") else self._clock
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
-        """Return a function that opens log files on a disk that may fail."""
+        """Return a function that opens log files on a simulated disk that may fail."""
         return (lambda path: _FailingFile(opener, path, self)) if self.concerns("disk") else opener
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return workers whose functions may fail."""
+        """Return worker specifications whose functions may fail."""
         if not self.concerns("planner", "vision"):
             return list(specs)
         return [dataclasses.replace(spec, function=perform) for spec in specs]
@@ -119,7 +119,7 @@ class ProcessFaults:
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
         """Return a job runner that passes the faults to the workers.
 
-        The function `result` makes the result of a job.
+        The function `result` creates a job result.
         """
         return _FaultyRunner(runner, specs, result, self) if self.concerns("planner", "vision") else runner
 
@@ -131,7 +131,7 @@ def host_faults(section: Simulation, clock: Clock, realtime: bool) -> ProcessFau
 
 
 def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
-    """Return the text of a configuration after the `config: corrupted` faults among `faults`."""
+    """Return the text of a configuration, corrupted by the faults `config: corrupted` among `faults`."""
     for fault in map(parse, faults):
         if fault.kind.name == "config: corrupted":
             text = corrupted(text, round(fault.parameters["bytes"]), seed or 1)
@@ -148,7 +148,7 @@ def corrupted(text: str, count: int, seed: int) -> str:
 
 
 class _SteppedClock:
-    """A clock whose UTC label may step, while its monotonic time is unchanged."""
+    """A clock whose UTC may jump, while its monotonic time is unchanged."""
 
     def __init__(self, clock: Clock, faults: ProcessFaults) -> None:
         self._clock = clock
@@ -186,7 +186,7 @@ class _FailingFile:
 
 @dataclass(slots=True)
 class _ModelledOutcome:
-    """Simulated outcome of a job without an answer, which the job runner reports at `due_ns`."""
+    """Simulated outcome of a job that does not answer; the job runner reports it at `due_ns`."""
 
     due_ns: int
     outcome: str

@@ -1,9 +1,9 @@
-"""Grammar of faults, and the check and scheduling of the faults of a flight.
+"""Syntax of faults, and functions that check and schedule the faults of a flight.
 
-A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. Both times are in seconds,
-and `@` gives the mission time. A fault without `@` begins at 0, and a fault without `for` lasts to the end.
-In the `simulation` section of a configuration the same fault is written `{fault: 'imu: silent', at: 120, for:
-5}`.
+A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. Both times are in seconds;
+the value after `@` is the mission time. A fault without `@` begins at mission time 0, and a fault without
+`for` lasts until the end of the flight. In the `simulation` section of a configuration the same fault is
+written `{fault: 'imu: silent', at: 120, for: 5}`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sim_hal.settings import FaultEntry
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
 
 LONGEST = 1e9
-"""Latest begin and longest duration (s) of a fault, thirty years, which fit into 64 bits of ns."""
+"""Latest begin and longest duration (s) of a fault: thirty years, so that times in ns fit into 64 bits."""
 
 _FAULT = re.compile(
     r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
@@ -127,7 +127,7 @@ def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
 
 
 def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
-    """Return the command line's faults as entries of a `simulation` section.
+    """Return the faults from the command line as entries of a `simulation` section.
 
     Faults that only the command line can inject are omitted, because they have already been applied to the
     configuration's text. Raises UsageError for an invalid fault.
@@ -168,7 +168,7 @@ _SECTIONS = {
     "wide": "wide_cameras",
     **dict.fromkeys(("battery", "battery-monitor", "bus-monitor", "panels"), "power"),
 }
-"""Optional configuration section of each device that can be absent."""
+"""Configuration section of each device that may be absent."""
 _EMULATED = {
     "imu": ("inertial_unit", "vn100"),
     "magnetometer": ("inertial_unit", "vn100"),
@@ -177,7 +177,7 @@ _EMULATED = {
     "strings": ("solar_strings", "ads1115"),
     **dict.fromkeys(("coil", "bridge", "pwm"), ("coils", "pca9685")),
 }
-"""Section and driver whose emulated device has the faults of a device, by the first word of its name."""
+"""Section and driver with which the faults of a device are possible, by the first word of its name."""
 
 
 def other_driver(device: str, config: Config) -> str:
@@ -200,7 +200,7 @@ def fitted(device: str, config: Config) -> bool:
 
 
 def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Parse and check the faults of a flight. Raises UsageError for a fault without effect."""
+    """Parse and check the faults of a flight. Raises UsageError for a fault that would have no effect."""
     faults = scheduled(entries, realtime)
     for fault in faults:
         if fault.at >= config.duration:

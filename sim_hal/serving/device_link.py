@@ -1,9 +1,8 @@
-"""Client of the device server `sim_hal.serving.server`, with one line of JSON per message over a Unix socket.
+"""Client of the device server `sim_hal.serving.server`, with messages as lines of JSON over a Unix socket.
 
-This module uses only the standard library and imports quickly, because the guardian opens the emulated bus
-through `open_bus` and must start at once and without numpy. `multiprocessing.connection` is not used because
-it would delay the guardian by tens of milliseconds, blocks on a partial message and unpickles the data that
-it reads.
+This module uses only the standard library and imports quickly, because the guardian opens the emulated bus by
+`open_bus` and must start at once and without numpy. `multiprocessing.connection` is not used because it would
+delay the guardian by tens of milliseconds, blocks on a partial message and unpickles the data that it reads.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from collections.abc import Sequence
 from typing import Any
 
 _ANSWER_S, _FIRST_ANSWER_S, _FIRST_S = 0.1, 5.0, 2.0
-"""Usual timeout (s) of an answer, initial timeout (s), and time (s) for which the initial timeout is used."""
+"""Usual and initial timeout (s) of an answer, and time (s) for which the initial timeout is used."""
 
 
 def pack(message: Any) -> bytes:
@@ -99,7 +98,7 @@ class RemoteI2cBus:
             self.call("select", name)
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Send a request and wait for its answer. Raises OSError as a bus does."""
+        """Send a request and wait for its answer. Raises OSError as a Linux bus does."""
         with self._lock:
             try:
                 number = self._link.send(name, *arguments)

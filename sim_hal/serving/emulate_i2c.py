@@ -1,11 +1,11 @@
 """Command `sim_hal emulate i2c`, which serves the coils' I2C bus to programs that open /dev/i2c-N.
 
-Programs reach the bus through a preload library (`i2c_preload.c`) rather than a CUSE device. A CUSE device
-needs a kernel module, its device node and the right to use both, which containers and shared machines lack.
-Each version of the library is compiled once by a C compiler. Programs that are linked statically or run
+Programs access the bus through a preload library (`i2c_preload.c`) instead of a CUSE device, because a CUSE
+device needs a kernel module, a device node and privileges, which containers and shared machines lack. Each
+version of the library is compiled once by a C compiler. Programs that are linked statically or run
 set-user-id do not load the library. The library sends requests over a Unix socket. A request consists of its
-length and one of three kinds of content. An answer consists of an errno, a length and data. All numbers are
-in native byte order, because both ends are on one machine.
+length and its content, which is of one of three kinds. An answer consists of an errno, a length and data. All
+numbers are in native byte order, because client and server are on the same computer.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ _SMBUS_HEAD = struct.Struct("=?BIH")
 _MESSAGE_HEAD = struct.Struct("=HHH")
 _READ = 0x0001
 _UNSUPPORTED = 0x0410
-"""Message flags that are not supported: ten-bit address, and a length sent by the chip."""
+"""Flags of I2C messages that are not supported: ten-bit address, and block length sent by the chip."""
 
 
 class I2cServer:
@@ -180,11 +180,11 @@ _LONGEST_WAIT_S = 0.05
 
 
 def emulate(options: argparse.Namespace) -> int:
-    """Serve the bus until the program ends, or without a program until a signal or the duration's end."""
+    """Serve the bus until the given program ends or, without a program, until a signal or a time limit."""
     config = configuration.load(options.config)
     text = options.config.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(options.config), Simulation)
-    if section is None:  # without this section, the true coils equal the configured ones
+    if section is None:  # without this section, the true coils equal the configured coils
         section = Simulation(release=Release(q2=0.0))
     now_ns = SystemClock().now_ns
     wires = EmulatedWires(now_ns, options.seed, config.coils.bus)

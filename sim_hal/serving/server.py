@@ -1,9 +1,9 @@
 """Server of simulated hardware in real time, in a process that survives the flight process.
 
 The VN-100 is served on a pseudo-terminal. The I2C bus and the cameras answer requests on a Unix socket, whose
-client is `sim_hal.rig`. Each connection is answered one request after the other. The pixels of a frame are
-passed in a file in the folder of the socket. Another process renders the frames, so that the rendering does
-not delay the devices.
+client is `sim_hal.rig`. The requests of each connection are answered one after the other. The pixels of a
+frame are transferred through a file in the folder of the socket. A separate process renders the frames, so
+that rendering does not delay the devices.
 """
 
 from __future__ import annotations
@@ -76,12 +76,13 @@ def _render(sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Seq
 
 
 class _DeviceClient:
-    """Connection of a flight process to its bus or to a camera."""
+    """Connection of a flight process to a bus or to a camera."""
 
     def __init__(self, line: socket.socket) -> None:
         self.line = line
         self.wants_frames: set[int] = set()
-        self.selected: str | None = None  # name of a bus or SPI device, None for the bus of the coils
+        # Name of the selected bus or SPI device, or None for the bus of the coils.
+        self.selected: str | None = None
         self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
@@ -124,7 +125,8 @@ class DeviceServer:
         self.lines = {name: line.name for name, line in self._lines.items()}
         self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
-        self._late = self._latest_ns = 0  # events that were late since the release, and the largest lateness
+        # Number of events that were late since the release, and the largest lateness (ns).
+        self._late = self._latest_ns = 0
         self._served_anybody = False
         self._selector = selectors.DefaultSelector()
         self._connections: dict[int, _DeviceClient] = {}
@@ -141,7 +143,7 @@ class DeviceServer:
         self._stopped = True
 
     def attend(self, descriptor: int, answer: Callable[[], None]) -> None:
-        """Call `answer` whenever `descriptor` is readable, with the devices advanced to the present."""
+        """Call `answer` whenever `descriptor` is readable, after advancing the devices to the present."""
         self._selector.register(descriptor, selectors.EVENT_READ, answer)
 
     def serve(self, patience_ns: int | None = None) -> None:
@@ -174,7 +176,7 @@ class DeviceServer:
                     key.data()
 
     def _advance(self, now_ns: int) -> None:
-        """Process the events of the devices up to the present, and count those that come late."""
+        """Process the events of the devices up to the present, and count late events."""
         late_ns = now_ns - self.hardware.simulation.next_event_ns()
         self._late += late_ns > LATE_NS
         self._latest_ns = max(self._latest_ns, late_ns)
@@ -277,7 +279,7 @@ class DeviceServer:
         put([parse(text) for text in faults], bench, epoch_ns)
 
     def _cameras(self) -> tuple[EmulatedCamera | None, ...]:
-        """Return the cameras by number, 0 for the star camera and 1 or more for the horizon cameras."""
+        """Return the cameras by number: 0 is the star camera, and 1 or more are the horizon cameras."""
         return self.hardware.camera, *self.hardware.orbit.wide
 
     def _deliver_frames(self) -> None:

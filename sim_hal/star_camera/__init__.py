@@ -1,10 +1,10 @@
-"""Image model of the star camera: a corrected version of Sease 2013, chapter 2, along the true attitude.
+"""Image model of the star camera: a corrected version of Sease 2013, chapter 2, for the true motion.
 
     model = StarCameraModel(field_of_view=np.radians(20.0))
     stars = catalogue.load()
     frame = render(model, stars.directions_at(2030.5), stars.magnitude, times, quaternions, rng)
 
-`times` and `quaternions` give the camera's attitude at the simulation's steps during the exposure. The module
+`times` and `quaternions` are the times and attitudes of the simulation steps during the exposure. The module
 `image` holds the camera's parameters, interpolates the attitude and converts charge to counts. The module
 `exposure` integrates the flux of each source along its path on the detector, for a global or a rolling
 shutter. The module `objects` adds moving objects and the effects of the camera's orbit.

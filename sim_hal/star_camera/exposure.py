@@ -1,17 +1,17 @@
-"""Charge from point sources, integrated along their paths with a global or a rolling shutter.
+"""Integrates the charge from point sources along their paths, for a global or a rolling shutter.
 
 Sease renders a still image for each of many short steps of the exposure and adds the images. This module
 divides each path into spans of a few pixels and integrates the charge of a span over time by Gauss-Legendre
 quadrature. Because the point spread function is separable, the charge of all samples on a small patch of
-pixels is one product of two thin matrices, (rows, samples) by (samples, columns), so a large number of
-samples is cheap.
+pixels is the product of two matrices, (rows, samples) and (samples, columns), so that many samples take
+little computing time.
 
 With a rolling shutter, the exposure of row r begins r line times after the exposure of row 0. Light that
 reaches row r at time t is collected if the row time u = t - start - r * line_time is within the exposure. The
 integration over a source's path uses u as its variable: the source is on row y at the time start + u + y *
-line_time. The neighbouring rows see the source a few line times earlier or later, at another point of its
-path, so the image of the source is sheared and stretched. The quadrature converges as fast as for a global
-shutter, because the integrand has no step inside the integration interval.
+line_time. Neighbouring rows are exposed to the source a few line times earlier or later, at another point of
+its path, so the image of the source is sheared and stretched. The quadrature converges as fast as for a
+global shutter, because the integrand has no discontinuity inside the integration interval.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from knightcube.vision.camera.lens import Pinhole
 DEVICE = "star camera model"
 
 STEPS = 256
-"""Entries per pixel of the point-spread table; linear interpolation errs by less than 1e-5 of the peak."""
+"""Table entries per pixel; the error of linear interpolation is less than 1e-5 of the peak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,8 @@ def integrated_gaussian(sigma: float) -> PointSpread:
         return np.asarray(ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma))
 
     def quadrature(length: float) -> int:
-        # About one Gauss-Legendre sample per sigma is needed; 0.95 per sigma errs by 1e-4 of the peak.
+        # About one Gauss-Legendre sample per sigma is needed; 0.95 per sigma gives errors of 1e-4 of the
+        # peak.
         return 1 if length < 0.02 * sigma else math.ceil(1.5 + 0.95 * length / sigma)
 
     return PointSpread(profile, math.ceil(4.0 * sigma), max(4.0, 8.0 * sigma), quadrature)
@@ -96,14 +97,14 @@ def bilinear_gaussian(sigma: float) -> PointSpread:
         return np.asarray(np.clip(1.0 - distance, 0.0, None) @ taps)
 
     def quadrature(length: float) -> int:
-        # The slope of the profile is discontinuous, so samples much closer than a pixel are needed.
+        # The slope of the profile is discontinuous, so the distance of samples must be far less than a pixel.
         return 1 if length < 1e-3 else math.ceil(2.0 + 8.0 * length)
 
     return PointSpread(profile, 2, 8.0, quadrature)
 
 
 def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
-    """Return the table index before each position, and the fraction (0 to 1) towards the next entry."""
+    """Return the table index before each position, and the fraction (0 to 1) to the next table entry."""
     scaled = positions * STEPS
     entry = scaled.astype(np.intp)
     return entry, (scaled - entry).astype(np.float32)
@@ -111,7 +112,7 @@ def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
 
 @lru_cache(maxsize=32)
 def _table(spread: PointSpread, size: int) -> tuple[Float32Array, Float32Array]:
-    """Return the table (size * STEPS + 1, size) of charge fractions, and its differences between rows.
+    """Return the table (size * STEPS + 1, size) of charge fractions, and the differences between its rows.
 
     Neighbouring table rows are for source positions that differ by 1/STEPS px.
     """
@@ -218,7 +219,7 @@ def path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> F
 
 
 def touches(low: FloatArray, high: FloatArray, columns: int, rows: int, margin: float) -> BoolArray:
-    """Return which boxes with corners `low` and `high` (..., 2) are within `margin` px of the detector.
+    """Return whether boxes with corners `low` and `high` (..., 2) are within `margin` px of the detector.
 
     A box with a NaN corner counts as outside the detector.
     """
@@ -264,9 +265,9 @@ OwnTimes = Callable[[FloatArray, IntArray], FloatArray]
 """Function from times (m, k) or (m, 1) and source indices (k,) to camera-frame directions (m, k, 3)."""
 
 FASTEST = 0.25
-"""Largest speed (px per line time) of a source; at 1 the source would move as fast as the rolling shutter."""
+"""Largest speed (px per line time) of a source; a speed of 1 is that of the rolling shutter."""
 SETTLED = 1e-4
-"""Tolerance (line times) of the iteration for the time at which a source's row is exposed."""
+"""Tolerance (line times) of the iterated time at which the row of a source is exposed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +298,7 @@ def expose_rolling(
     fastest = float(np.max(lengths / np.diff(knots))) * shutter.line_time
     if fastest > FASTEST:
         raise OutOfRange(DEVICE, "motion of a source in a line time", fastest, 0.0, FASTEST, "px")
-    # A source that moves by v rows per line time has an image stretched by the factor 1 / (1 - v).
+    # The image of a source that moves by v rows per line time is stretched by the factor 1 / (1 - v).
     reach = math.ceil(spread.reach / (1.0 - fastest))
     # A source just outside the first or last row still adds charge to that row.
     knots = knots.copy()
@@ -330,7 +331,7 @@ def _passes(
     """Return the times (n,), s, at which the row of each source has been exposed for `phase` s."""
     outside = reach + 1.0
     times = np.full(len(sources), shutter.start + phase + 0.5 * camera.rows * shutter.line_time)
-    # Each iteration reduces the error to a quarter or less for sources on the detector.
+    # For sources on the detector, each iteration reduces the error to a quarter or less.
     for _ in range(math.ceil(math.log(SETTLED / camera.rows) / math.log(FASTEST)) + 1):
         row = camera.project(vectors(times[None], sources))[0, :, 1]
         row = np.clip(np.nan_to_num(row, nan=-outside), -outside, camera.rows + outside)

@@ -213,10 +213,11 @@ class AttitudeHistory:
         return quaternion.attitude_matrix(self.at(times))
 
     def knots(self, tolerance: float, longest_turn: float) -> FloatArray:
-        """Return the knots (j,), s: times from start to end between which the rotation is small and uniform.
+        """Return the knots (j,), s: times between which the rotation is small and its rate is constant.
 
         Between two knots the attitude is within `tolerance` rad of a rotation at constant rate, and the
-        rotation is at most `longest_turn` rad. More samples of the same motion do not give more knots.
+        rotation is at most `longest_turn` rad. The number of knots depends on the motion and not on the
+        number of samples.
         """
         last = len(self.times) - 1
         kept = np.arange(last + 1)
@@ -248,9 +249,9 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""Largest charge of a faint pixel (e-), divided by the variance of the background noise (e-^2)."""
+"""Largest ratio of a faint pixel's charge (e-) to the variance of the background noise (e-^2)."""
 GREATEST_SKEWNESS = 0.05
-"""Largest skewness at which noise is drawn as Gaussian, with an error of 0.004 by the Edgeworth series."""
+"""Largest skewness of noise that is drawn as Gaussian; by the Edgeworth series, the error is 0.004."""
 
 SLICES, OUTER_SLICES = 1 << 16, 64
 """Number of equally probable slices of the normal distribution, and number of tail slices on each side."""
@@ -270,7 +271,7 @@ def counts(
     draw = _uniform if model.noise == "uniform" else _poisson
     signal = draw(model, light, exposure, rng)
     signal *= np.float32(1.0 / model.gain)
-    signal += np.float32(model.pedestal + 0.5)  # with 0.5, truncation rounds to the nearest count
+    signal += np.float32(model.pedestal + 0.5)  # adding 0.5 makes the truncation round to the nearest count
     np.clip(signal, 0.0, model.highest_count, out=signal)
     return np.asarray(signal.astype(model.count_type))
 
@@ -307,7 +308,7 @@ def _poisson(
 
 
 def _normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """Return standard normal draws four times as fast as the generator of numpy.
+    """Return standard normal random numbers four times as fast as the generator of numpy.
 
     A 16-bit number selects one of 65,536 slices of equal probability, and the draw is the centre of the
     slice. In the outermost slices, which are wide, the draw is a random point of the slice, so that the tails
@@ -341,7 +342,7 @@ def _exact(
 def _uniform(
     model: StarCameraModel, light: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Float32Array:
-    """Return the charge (e-) with the uniform noise of the thesis.
+    """Return the charge (e-) with added uniform noise as in the thesis.
 
     The noise is the sum of sqrt(signal) and sqrt(RN^2 + DC T), each multiplied by a uniform draw from 0 to 1.
     """
@@ -352,7 +353,7 @@ def _uniform(
 
 
 SMOOTHNESS = 0.01
-"""Largest error (px at the boresight) of assuming a constant rate between knots."""
+"""Largest error (px at the boresight) that the assumption of a constant rate between knots causes."""
 LONGEST_TURN = 0.05
 """Largest rotation (rad) between knots; an arc of this angle is 0.01 % longer than its chord."""
 
@@ -441,7 +442,7 @@ def _light(
     directions, magnitude = np.asarray(directions, dtype=float), np.asarray(magnitudes, dtype=float)
     if directions.ndim != 2 or directions.shape[1] != 3 or magnitude.shape != directions.shape[:1]:
         raise ValueError(f"stars {directions.shape} and magnitudes {magnitude.shape}: give (n, 3) and (n,)")
-    # A sum is finite only if every term is finite, so checking the sum avoids an array of flags.
+    # A sum is finite only if every term is finite, so checking the sum is sufficient and needs no array.
     if not (np.isfinite(directions.sum()) and np.isfinite(magnitude.sum())):
         raise ValueError("star directions and magnitudes must be finite")
     camera = model.pinhole
@@ -476,7 +477,7 @@ def _light(
 
 def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
     def vectors(times: FloatArray) -> FloatArray:
-        # One matrix product serves all times, and the stars stay the innermost axis in memory, which is fast.
+        # One matrix product for all times with the stars along the innermost memory axis is fast.
         seen = history.matrices_at(times).reshape(-1, 3) @ directions.T
         return np.swapaxes(seen.reshape(len(times), 3, -1), 1, 2)
 
@@ -484,7 +485,7 @@ def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
 
 
 def _at_own_times(history: AttitudeHistory, directions: OwnTimes) -> OwnTimes:
-    """Return a function that rotates ICRS `directions` into the camera frame, at a time per source."""
+    """Return a function that rotates ICRS `directions` into the camera frame at the time of each source."""
 
     def vectors(times: FloatArray, sources: IntArray) -> FloatArray:
         matrices = history.matrices_at(times.reshape(-1)).reshape(*times.shape, 3, 3)

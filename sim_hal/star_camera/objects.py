@@ -1,8 +1,8 @@
-"""Effects of the star camera's orbit: moving objects, aberration, blinding and the Earth in view.
+"""Effects of the star camera's orbit: moving objects, aberration, stray light, and the Earth in view.
 
 An object with a line of sight moves along a great circle among the stars. An object in orbit is lit by the
-Sun and can be hidden by the Earth. The magnitude of an object changes only when the Earth covers part of the
-Sun for that object.
+Sun and can be hidden by the Earth. The magnitude of an object in orbit changes only when the Earth covers
+part of the Sun as seen from the object.
 
     camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
     orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
@@ -12,9 +12,9 @@ Sun for that object.
 
 Stellar aberration by the camera's motion is modelled as a rotation of the whole frame by the aberration at
 the boresight (26" at most). The variation of the aberration across 20 deg, 4", is not modelled. An object in
-orbit shares the Earth's motion, so its track is shifted back by the aberration that the Earth's motion
-causes. The frame saturates if the Sun or sunlit ground is closer to the boresight than the exclusion angles
-of the camera's baffle (`SkySection`) or in the field of view. The dark Earth hides the stars behind it.
+orbit shares the Earth's motion, so the aberration that the Earth's motion causes is subtracted from its
+track. The frame saturates if the Sun or sunlit ground is closer to the boresight than the exclusion angles of
+the camera's baffle (`SkySection`) or in the field of view. The dark Earth hides the stars behind it.
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ from sim_hal.worlds.orbit import Orbit, propagate, sun_position
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld, World, orbiting, utc_date
 
 Expose = Callable[[int, FloatArray, FloatArray, Sequence[SourceTrack]], Future[Image]]
-"""Function that renders a frame from its number, times (k,), s, camera attitudes (k, 4) and object tracks."""
+"""Function that renders a frame from number, times (k,), s, camera attitudes (k, 4) and object tracks."""
 
 DEVICE = "resident space object"
 TRACK_ERROR = 1e-7
 """Largest interpolation error (rad) of a track between its samples.
 
-This is 3e-4 px of the standard camera.
+This corresponds to 3e-4 px of the default camera.
 """
 NEAREST = 1.0
 """Shortest distance (m) at which an object is modelled as a point."""
 _FIRST_DURATION = 1000.0
 """Shortest time (s) over which an object's orbit is integrated."""
 _SAMPLES = 17
-"""Number of samples of a great-circle track, whose chords err by 6e-5 rad at 20 deg/s over 1 s."""
+"""Number of samples of a great-circle track; the chord error is 6e-5 rad at 20 deg/s over 1 s."""
 _LIT_AIR = -0.1
-"""Sine of the Sun's elevation above which the air over the ground is lit, 6 deg beyond the terminator."""
+"""Sine of the Sun's elevation (-6 deg) above which the air over the ground is sunlit."""
 _RINGS, _SPOKES = 46, 120
-"""Numbers of nadir angles and azimuths at which the ground is sampled, 1.5 deg and 3 deg apart."""
+"""Numbers of nadir angles (every 1.5 deg) and azimuths (every 3 deg) at which the ground is sampled."""
 
 
 def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
@@ -72,7 +72,7 @@ def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
 
 
 class BodyTrajectory(Protocol):
-    """The trajectory of a body, such as an `Orbit`."""
+    """Protocol of the trajectory of a body, such as an `Orbit`."""
 
     def states_at(self, times: FloatArray) -> FloatArray:
         """Return the states (m, 6), position (m) and velocity (m/s), at `times` (m,), s."""
@@ -102,9 +102,9 @@ def source_tracks(
     """Return the tracks of the visible objects from `start` to `end` s.
 
     `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks count from
-    `zero` s, as those of an attitude history do. An object that is in the umbra or behind the Earth the whole
-    time is omitted. An object that is partly lit, or lit for part of the time, gets its mean brightness over
-    the track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
+    `zero` s, as in an attitude history. An object that is in the umbra or behind the Earth the whole time is
+    omitted. An object that is partly lit, or lit for part of the time, has its mean brightness over the
+    track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
     outside the orbits, and for an object within 1 m of the camera.
     """
     if not start < end:
@@ -130,9 +130,9 @@ def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _track_times(camera: BodyTrajectory, orbit: Orbit, start: float, end: float) -> FloatArray:
-    """Return times (s) between which linear interpolation of the direction errs by at most `TRACK_ERROR`.
+    """Return times (s) between which the error of linearly interpolated directions is at most `TRACK_ERROR`.
 
-    The direction of an object that passes at speed v and distance d accelerates by at most 0.65 (v/d)^2. An
+    The angular acceleration of an object that passes at speed v and distance d is at most 0.65 (v/d)^2. An
     angular acceleration a gives an interpolation error of a h^2 / 8 in a step of h s.
     """
     times = np.linspace(start, end, 9)
@@ -146,7 +146,7 @@ def _track_times(camera: BodyTrajectory, orbit: Orbit, start: float, end: float)
 
 
 class SkyObjects:
-    """The moving objects of a simulated sky; until `begin` is called, mission time counts from `start_ns`."""
+    """Moving objects of a simulated sky; mission time counts from `start_ns` until `begin` is called."""
 
     def __init__(self, entries: Sequence[SkyObject], utc: str, start_ns: int, world: World) -> None:
         """Store the objects.
@@ -202,14 +202,14 @@ class SkyObjects:
             directions = track.directions - own
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
             at = track.times.copy()
-            at[0], at[-1] = times[0], times[-1]  # makes the track cover the exposure in spite of rounding
+            at[0], at[-1] = times[0], times[-1]  # the track must cover the exposure in spite of rounding
             shifted.append(SourceTrack(at, directions, track.magnitude))
         return shifted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FreeFall:
-    """Free fall for about a second from a position (3,), m, with a velocity (3,), m/s, at time `at`."""
+    """Free fall for about a second from a position (3,), m, and a velocity (3,), m/s, at time `at`, s."""
 
     at: float
     position: FloatArray
@@ -228,7 +228,7 @@ class _FreeFall:
 
 
 class _GrowingOrbit:
-    """The orbit of an object, integrated again for a longer time when needed."""
+    """Orbit of an object, which is integrated again over a longer time when needed."""
 
     def __init__(self, start: ObjectState) -> None:
         self._start = start
@@ -259,14 +259,14 @@ def _on_circle(line: LineOfSight, magnitude: float, mission: float, times: Float
 
 
 def _dimming(tumble: Tumble, start: float, end: float) -> float:
-    """Return the dimming (mag) of a tumbling object's mean flux between two mission times."""
+    """Return the change of magnitude of a tumbling object's mean flux between two mission times (s)."""
     middles = start + (end - start) * (np.arange(64) + 0.5) / 64
     phase = 2.0 * np.pi * middles / tumble.period + math.radians(tumble.phase_deg)
     return float(-2.5 * math.log10(np.mean(10.0 ** (-0.4 * tumble.amplitude * np.sin(phase)))))
 
 
 def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera, sky: SkySection) -> Expose:
-    """Return the exposure function of a camera in orbit.
+    """Return an exposure function that adds the effects of Earth and Sun in orbit.
 
     The function `expose` renders the stars without Earth and Sun. `sky` holds the exclusion angles of the
     baffle.
@@ -303,7 +303,7 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera, sky: SkySec
 
 
 def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return attitudes (k, 4) with which the stars at the boresight appear shifted by aberration.
+    """Return rotated attitudes (k, 4), which shift the stars at the boresight by the aberration.
 
     The stars are shifted towards `velocity` (3,), m/s.
     """
@@ -317,9 +317,10 @@ def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
 def view(
     pinhole: Pinhole, to_camera: FloatArray, around: OrbitEnvironment, sky: SkySection
 ) -> tuple[bool, BoolArray | None]:
-    """Return whether stray light blinds the camera, and the pixels (rows, columns) behind the dark Earth.
+    """Return whether stray light blinds the camera, and a mask (rows, columns) of the dark Earth, or None.
 
-    `sky` holds the exclusion angles of the baffle. Sun and sunlit ground in the field always blind.
+    `sky` holds the exclusion angles of the baffle. Sun or sunlit ground in the field of view always blinds
+    the camera.
     """
     corner = float(np.arccos(pinhole.unit_vectors(np.zeros((1, 2)))[0, 2]))
     sun_excluded = max(corner, math.radians(sky.sun_exclusion_deg))
@@ -353,7 +354,7 @@ def sunlit_ground_angle(position: FloatArray, sun: FloatArray, boresight: FloatA
     """
     distance = float(np.linalg.norm(position))
     down = -position / distance
-    # The azimuths start at the boresight's own, so that the nearest point of the limb is among the samples.
+    # The azimuths start at the azimuth of the boresight, so that the nearest point of the limb is sampled.
     across = boresight - (boresight @ down) * down
     if float(np.linalg.norm(across)) < 1e-9:
         across = np.cross(down, np.eye(3)[int(np.argmin(np.abs(down)))])

@@ -1,1 +1,1 @@
-"""Simulated physical worlds, which the emulated devices measure and act on."""
+"""Simulated physical worlds, in which the emulated devices measure and apply torques."""

@@ -1,8 +1,8 @@
-"""A body that a hand holds on a laboratory bench, for `knightcube bringup` with emulated devices.
+"""A body held by hand on a laboratory bench, for `knightcube bringup` with emulated devices.
 
 The reference frame is the testbed frame, whose y axis points down. The body stands with its z axis up until
-the hand turns the body. A satellite keeps the orbit of its configuration for the devices that need one, as if
-a simulator fed the GPS receiver.
+it is rotated by hand. For devices that need an orbit, a satellite has the orbit of its configuration, as if a
+signal simulator were connected to the GPS receiver.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ _UPRIGHT = from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0
 
 
 class HeldBody:
-    """A body that rests with its z axis up, or is turned about one of its axes.
+    """A body that rests with its z axis up, or is rotated about one of its axes.
 
     Attributes:
-        held: marks a body on a bench, whose star camera sees neither the Earth nor the Sun.
+        held: true for a body on a bench; Earth and Sun are not in view of its star camera.
     """
 
     held = True
@@ -44,7 +44,7 @@ class HeldBody:
         self._angle, self._begin_ns, self._span = 0.0, 0, 1.0
 
     def turn(self, axis: FloatArray, angle: float, begin_ns: int, seconds: float) -> None:
-        """Turn the upright body about `axis` (3,), body axes, by `angle` rad, from `begin_ns` on."""
+        """Rotate the upright body about `axis` (3,), body axes, by `angle` rad, from `begin_ns` on."""
         self._axis, self._angle, self._begin_ns, self._span = axis, angle, begin_ns, seconds
 
     def release_at(self, time_ns: int) -> None:
@@ -64,12 +64,12 @@ class HeldBody:
         return BodyMotion(time_ns, attitude, self._axis * speed, to_body @ LABORATORY_FIELD, up)
 
     def truth(self) -> WorldTruth:
-        """Return no currents and no energies, which a bench does not record."""
+        """Return zero currents and energies, which are not recorded on a bench."""
         return WorldTruth(np.zeros(3), 0.0, 0.0)
 
 
 class HeldSatellite(HeldBody):
-    """A held body for which GPS receiver, solar cells and horizon cameras are in the orbit of `orbit`."""
+    """A held body whose GPS receiver, solar cells and horizon cameras behave as in the given orbit."""
 
     def __init__(self, orbit: OrbitingWorld) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class HeldSatellite(HeldBody):
         self._orbit.advance_to(time_ns)
 
     def surroundings(self) -> OrbitEnvironment:
-        """Return the environment in the orbit."""
+        """Return the environment in the orbit at the present time."""
         return self._orbit.surroundings()
 
     def utc_ns(self) -> int:
@@ -88,12 +88,12 @@ class HeldSatellite(HeldBody):
         return self._orbit.utc_ns()
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return the state in the orbit."""
+        """Return the present state in the orbit."""
         return self._orbit.orbit_truth()
 
 
 def make(inputs: WorldInputs) -> HeldBody:
-    """Return a body on the bench, with the configured orbit if the configuration has one."""
+    """Return a body on a bench, with the orbit of the configuration if it has one."""
     if isinstance(inputs.config, OrbitConfig) and inputs.section.free_body is not None:
         from sim_hal.worlds import free_body  # noqa: PLC0415 - loads the models of the orbit
 

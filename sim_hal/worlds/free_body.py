@@ -1,19 +1,20 @@
 """A free body in low Earth orbit, rotated by its coils and by the disturbance torques.
 
-The flight software assumes nominal properties of the craft. The true properties of the craft have random
-errors drawn from one seed, as a built satellite differs from its design. The torques on the body come from
-the coils, the residual dipole, the gravity gradient, air drag and sunlight. The drag on a face that meets the
-flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2. The force of sunlight on a lit face is
-given by Montenbruck & Gill 2000, eq. 3.73. The faces of a box do not shade each other.
+The flight software assumes nominal properties of the craft. The true properties of the craft differ from
+these by random errors drawn from a seed, as a built satellite differs from its design. The torques on the
+body are those of coils, residual dipole, gravity gradient, drag and solar radiation. The drag on a face that
+is exposed to the flow is given by Wertz 1978, eq. 17.61, with a drag coefficient of 2.2. The solar radiation
+force on a sunlit face is given by Montenbruck & Gill 2000, eq. 3.73. The faces of a box do not shade each
+other.
 
 Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
 the torques that depend on the attitude, namely those of the dipole in the field and of the gravity gradient
-(Wertz 1978, eq. 17.28). A step in which the body rotates by 0.01 rad errs by 1e-13 rad. The code uses
-plain floats, because for three components numpy takes ten times as long.
+(Wertz 1978, eq. 17.28). The error of a step in which the body rotates by 0.01 rad is 1e-13 rad. The code uses
+Python floats, because numpy takes ten times as long for three components.
 
-The rotation is integrated when the state is read and when the currents change. The times at which the state
-is read change the result by less than a microradian. The torques of air and sunlight and the residual dipole
-are constant in body axes for 0.1 s at a time.
+The rotation is integrated when the state is read and when the currents change. The result depends on the
+times at which the state is read by less than a microradian. Drag torque, solar radiation torque and residual
+dipole are kept constant in body axes for 0.1 s.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ TURN_PER_STEP = 0.01
 
 
 class Loads(NamedTuple):
-    """The dipole, gravity-gradient vector and torque that act on the body during a step.
+    """Dipole, gravity-gradient vector and torque that act on the body during an integration step.
 
     Attributes:
         dipole: magnetic dipole (3,) of the body, A m^2, principal axes.
-        pull: position (3,) times sqrt(3 mu / r^5), rad/s, inertial axes, for the gravity gradient.
-        torque: torque (3,) of air and sunlight, N m, principal axes.
+        pull: gravity-gradient vector (3,): position times sqrt(3 mu / r^5), rad/s, inertial axes.
+        torque: sum (3,) of drag and solar radiation torque, N m, principal axes.
     """
 
     dipole: Floats
@@ -112,7 +113,7 @@ class Rotation:
         gx, gy, gz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
         i1, i2, i3 = self._of_torques
         k1, k2, k3 = self._of_rates
-        # Gravity-gradient and gyroscopic torques have the same factors, the differences of principal moments.
+        # Gravity-gradient and gyroscopic torques have the same factors: differences of principal moments.
         return (
             0.5 * (w3 * q2 - w2 * q3 + w1 * q4),
             0.5 * (w1 * q3 - w3 * q1 + w2 * q4),
@@ -164,7 +165,7 @@ def turned(turn: Matrix, vector: Floats) -> Floats:
 
 
 def steps_within(span: float, rate: float, longest: float) -> int:
-    """Return the number of steps of at most `longest` s for `span` s at a rotation rate of `rate` rad/s."""
+    """Return the number of steps, of at most `longest` s each, for `span` s at the rate `rate` rad/s."""
     return max(1, math.ceil(span / longest - 1e-9), math.ceil(span * rate / TURN_PER_STEP))
 
 
@@ -174,14 +175,14 @@ PRESSURE_ARM = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CraftModel:
-    """A craft as it is described.
+    """Described properties of a craft.
 
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         size: edges (3,) of the box along the body axes, m.
         dipoles: dipole moment of each coil per ampere (3, n), m^2, body axes, one column per coil.
         centre_of_mass: vector (3,) from the centre of the box to the centre of mass, m, body axes.
-        offset: distance of the true from the described centre of mass, m.
+        offset: distance between the true and the described centre of mass, m.
         residual_dipole: residual dipole (3,) in shadow, A m^2, body axes.
     """
 
@@ -205,7 +206,7 @@ CRAFTS = {
 }
 
 CONSTANT_DIPOLE, SUNLIT_DIPOLE, WALKING_DIPOLE = 1e-3, 3e-4, 5e-5
-"""Largest constant and sunlit residual dipole, and standard deviation of its random walk (A m^2)."""
+"""Largest constant part, largest sunlit part, and random walk's sigma of the residual dipole (A m^2)."""
 _REFLECTED = (0.1, 0.6)
 """Lower and upper bound of the fraction of sunlight that a face reflects specularly."""
 
@@ -227,14 +228,15 @@ class Face:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueCraft:
-    """The true properties of a craft.
+    """True properties of a craft.
 
     Attributes:
         inertia: principal moments of inertia (3,), kg m^2.
         to_principal: quaternion (4,) from body axes to principal axes.
         faces: faces of the craft's box.
         coil_dipole: matrix (3, n), m^2, that maps coil currents to the dipole in body axes.
-        coil_frames: rotations (n, 3, 3) from `coil_frames`, in whose axes the errors of the coils are drawn.
+        coil_frames: rotation matrices (n, 3, 3) from the function `coil_frames`; the errors of the coils are
+            drawn in these axes.
         constant_dipole: constant part (3,) of the residual dipole, A m^2, body axes.
         sunlit_dipole: part (3,) of the residual dipole that sunlight at one astronomical unit causes, A m^2,
             body axes.
@@ -259,7 +261,8 @@ def coil_frames(dipoles: FloatArray) -> FloatArray:
         if float(start @ end) == 1.0:
             frames.append(np.eye(3))
             continue
-        # Rotations by 180 deg about `start` and then about the bisector `middle` rotate `start` to `end`.
+        # A rotation by 180 deg about `start`, followed by one about the bisector `middle`, maps `start` to
+        # `end`.
         middle = start + end
         across = np.eye(3)[(index + 1) % 3]
         if float(middle @ middle) < 1e-12:
@@ -327,7 +330,7 @@ def _direction(generator: np.random.Generator) -> FloatArray:
 
 DRAG_COEFFICIENT = 2.2
 SOLAR_PRESSURE = 4.56e-6
-"""Pressure of sunlight (N/m^2) on a black face at one astronomical unit."""
+"""Solar radiation pressure (N/m^2) on a black face at one astronomical unit."""
 
 ZERO: Floats = (0.0, 0.0, 0.0)
 
@@ -336,7 +339,7 @@ def air_torque(faces: Sequence[Face], flow: Floats, density: float) -> Floats:
     """Return the drag torque (3,), N m, at the velocity `flow` through the air, m/s, both in body axes."""
     vx, vy, vz = flow
     half = 0.5 * DRAG_COEFFICIENT * density
-    # All drag forces have the direction of the flow, so the arms are summed before one cross product.
+    # All drag forces are parallel to the flow, so the weighted arms are summed before a single cross product.
     x = y = z = 0.0
     for face in faces:
         nx, ny, nz = face.normal
@@ -351,9 +354,9 @@ def air_torque(faces: Sequence[Face], flow: Floats, density: float) -> Floats:
 
 
 def sunlight_torque(faces: Sequence[Face], sun: Floats, light: float) -> Floats:
-    """Return the torque (3,) of sunlight, N m, body axes.
+    """Return the solar radiation torque (3,), N m, body axes.
 
-    `sun` (3,) is the direction to the Sun in body axes. `light` is the sunlight relative to that at 1 au.
+    `sun` (3,) is the direction to the Sun in body axes. `light` is the irradiance relative to that at 1 au.
     """
     if light <= 0.0:
         return ZERO
@@ -376,14 +379,14 @@ def sunlight_torque(faces: Sequence[Face], sun: Floats, light: float) -> Floats:
 class LoadModel:
     """Model of the dipoles and torques of one craft.
 
-    `multiples` scale the worst-case disturbances of the craft.
+    The factors `multiples` scale the worst-case disturbances of the craft.
     """
 
     def __init__(self, craft: TrueCraft, multiples: Disturbances) -> None:
         self._faces = craft.faces
         self._drag, self._sunlight = multiples.drag, multiples.solar_pressure
         self._gradient = math.sqrt(3.0 * multiples.gravity_gradient * GRAVITATIONAL_PARAMETER)
-        # Coils in groups of three, where missing coils of the last group have no dipole.
+        # The coils are grouped by three; missing coils of the last group have zero dipole.
         missing = -craft.coil_dipole.shape[1] % 3
         self._idle = [0.0] * missing
         coils = np.pad(craft.coil_dipole, ((0, 0), (0, missing)))
@@ -420,7 +423,7 @@ class LoadModel:
         return scale * x, scale * y, scale * z
 
     def pressures(self, around: OrbitEnvironment, to_body: Matrix) -> tuple[Floats, Floats]:
-        """Return the torques (3,) of air and sunlight, N m, body axes.
+        """Return the drag torque (3,) and the solar radiation torque (3,), N m, body axes.
 
         The matrix `to_body` rotates ICRS into body axes.
         """
@@ -440,7 +443,7 @@ def generators(seed: int) -> tuple[np.random.Generator, np.random.Generator, np.
 
 
 LONGEST_STEP = 0.1
-"""Longest integration step (s), during which air, sunlight and residual dipole keep their mid-step values."""
+"""Longest integration step (s), in which drag, solar radiation and residual dipole are constant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -455,7 +458,7 @@ KNIGHTCUBE_SUPPLY = CoilSupply((23.0, 23.0, 23.0), 3.4)
 
 
 class FreeBody:
-    """The state of a free body, advanced in time under the coil currents."""
+    """World with a free body, whose state is advanced in time under the coil currents."""
 
     def __init__(
         self,
@@ -470,7 +473,8 @@ class FreeBody:
     ) -> None:
         """Create the world with a body that is held still until its release.
 
-        `utc` is the UTC at `start_ns`. The craft is by default that of `section`.
+        `utc` is the UTC at `start_ns`. The craft is `craft` or, if that is None, the craft that `section`
+        describes.
         """
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
@@ -494,14 +498,14 @@ class FreeBody:
         self._read: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
-        # The state holds at `_done_ns`; from then until `time_ns` the coil currents `_acting` flow.
+        # The state is that at `_done_ns`; the coil currents `_acting` flow from `_done_ns` to `time_ns`.
         self._done_ns = self.time_ns = start_ns
         self._pull, self._field = self._gravity_and_field(0.0)
         self.energy = 0.0
         self.supply_energy = 0.0
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body at `time_ns`, now or later."""
+        """Release the body at `time_ns`, which is not before the present time."""
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
@@ -527,7 +531,8 @@ class FreeBody:
                 field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
                 specific_force_body=np.zeros(3),
             )
-            # The motion is cached because truth recorder and inertial unit read it at the same times.
+            # The motion is cached, because truth recorder and inertial unit read the motion at the same
+            # times.
             self._read = self._state, motion
         return motion
 
@@ -567,7 +572,7 @@ class FreeBody:
     def _torques(
         self, around: OrbitEnvironment, state: State, acting: tuple[float, ...]
     ) -> dict[str, FloatArray]:
-        """Return the torque (3,), N m, body axes, of each disturbance in `CAUSES`."""
+        """Return the torque (3,), N m, body axes, by each cause in `CAUSES`."""
         turn = matrix(*state[:4])
         attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
         to_body = matrix(*attitude.tolist())
@@ -626,7 +631,7 @@ class FreeBody:
         self._pull, self._field = pull, field
 
     def _renew(self, time: float, middle: float) -> None:
-        """Evaluate the torques of air and sunlight and the residual dipole for the time `middle` (s).
+        """Evaluate drag torque, solar radiation torque and residual dipole for the time `middle` (s).
 
         The attitude is extrapolated to the time `middle`.
         """
@@ -666,10 +671,10 @@ def built_craft(
     description: DescriptionErrors,
     craft: CraftModel | None = None,
 ) -> TrueCraft:
-    """Return the true craft, which is described by `craft` or else by `section`.
+    """Return the true craft; its description is `craft` or, if that is None, in `section`.
 
     The disturbances are drawn from the generator `errors`. The argument `description` holds the differences
-    of the true craft from its description. Raises ConfigError as `craft_model`.
+    of the true craft from its description. Raises ConfigError like `craft_model`.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
     return built if description is NO_ERRORS else _differing(built, description)
@@ -715,7 +720,7 @@ def craft_model(section: FreeBodySection, config: Config | None = None) -> Craft
 
 
 def _differing(craft: TrueCraft, errors: DescriptionErrors) -> TrueCraft:
-    """Return the craft with the errors of its description."""
+    """Return the craft after applying the errors of its description."""
     x, y, z = (np.array(craft.inertia) * errors.moments).tolist()
     turn = quaternion.from_rotation_vector(errors.axes)
     columns = []

@@ -2,10 +2,10 @@
 
 The field is an expansion in spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49,
 eq. 1), whose coefficients (2024, doi 10.5281/zenodo.14012302) are interpolated linearly between epochs. After
-the last epoch, 2030, the coefficients continue with the variation and acceleration of the last epochs. The
-flight software uses another model (`knightcube.astro.earth.geomagnetism`), so that the simulation includes a
-realistic model error. `ring_current` gives the field of the ring current. Currents in the ionosphere are not
-modelled.
+the last epoch, 2030, the coefficients are extrapolated with the secular variation and acceleration of the
+last epochs. The flight software uses a different model (`knightcube.astro.earth.geomagnetism`), so that the
+simulation includes a realistic model error. `ring_current` gives the field of the ring current. Currents in
+the ionosphere are not modelled.
 
 The table `igrf.npz` holds the coefficients as integers in units of 0.01 nT. `tests/support/build_igrf.py`
 makes the table from the file that the package ppigrf ships. The package ppigrf itself is not used, because it
@@ -35,8 +35,7 @@ EXTRAPOLATION = 15.0
 """Time (years) after the last epoch for which the field is extrapolated."""
 DEVICE = "geomagnetic field"
 _NEAR_POLE = 0.5 * np.pi - 1e-8
-"""Largest latitude (rad) that is used, 7 cm from the pole, because the direction east is undefined at the
-pole."""
+"""Latitude (rad) to which larger latitudes are limited, 7 cm from the pole, where east is undefined."""
 
 
 def field(julian_date: npt.ArrayLike, position: FloatArray) -> FloatArray:
@@ -67,12 +66,12 @@ def field_on_ground(julian_date: npt.ArrayLike, position: FloatArray) -> FloatAr
 
 
 def ring_current(julian_date: npt.ArrayLike, disturbance: float) -> FloatArray:
-    """Return the uniform field (..., 3), T, ICRS axes, that a ring current adds.
+    """Return the uniform magnetic field (..., 3), T, ICRS axes, of a ring current.
 
     `disturbance` (T) is the negative Dst index, about 20 nT on a quiet day and 100 nT in a storm.
     """
     dipole = _coefficients(np.atleast_1d(julian_epoch(julian_date)).reshape(-1))[0, :3]
-    # The dipole moment (g10, g11, h11) and the field inside the ring current both point south.
+    # The dipole (g10, g11, h11) and the field inside the ring current both point south.
     axis = np.array([dipole[1], dipole[2], dipole[0]]) / np.linalg.norm(dipole)
     to_ground = celestial_to_terrestrial(julian_date)
     return np.asarray(np.einsum("...ji,j->...i", to_ground, disturbance * axis))
@@ -131,7 +130,7 @@ def _expansion(
 
 
 def _legendre(cosine: FloatArray, sine: FloatArray) -> tuple[list[list[FloatArray]], list[list[FloatArray]]]:
-    """Return the Schmidt functions P[n][m] and their derivatives by the colatitude, each of shape (points,).
+    """Return Schmidt functions P[n][m] and their derivatives by the colatitude, each an array (points,).
 
     The recursions are from Langel, "The main field", in Geomagnetism (Jacobs, 1987), eq. 27 and table 2.
     """

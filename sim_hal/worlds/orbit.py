@@ -5,20 +5,21 @@ Orbits start from Keplerian elements and follow the Earth's central gravity and 
 pole, although the two differ by 0.15 deg in 2026.
 
 The Sun's position follows the low-precision series of the Astronomical Almanac. The flight software uses
-ERFA's epv00 instead, so that simulation and flight software do not share one error. The Almanac's series
-takes 1.5 us for a date, and epv00 takes 230 us. The series errs by up to 42" until 2030, which moves the
-entry into the Earth's shadow by 0.2 s.
+ERFA's epv00 instead, so that simulation and flight software do not have the same error. The Almanac's series
+takes 1.5 us for a date, and epv00 takes 230 us. The error of the series is up to 42" until 2030, which moves
+the entry into the Earth's shadow by 0.2 s.
 
-The environment is evaluated at knots, 10 s apart, and interpolated by cubic splines. The interpolation errors
-of 2 mm and 1e-4 nT are far below the errors of the models. Sunlight changes within seconds in the penumbra,
-so sunlight has a knot every second and is interpolated linearly. The knots of a chunk of 1,000 s are computed
-together. Random numbers are drawn in the order of the knots, so they do not depend on the times that are
-requested.
+The environment is evaluated at knots 10 s apart and interpolated by cubic splines. The interpolation errors
+of 2 mm and 1e-4 nT are far below the errors of the models. In the penumbra sunlight changes within seconds,
+so sunlight has knots every second and is interpolated linearly. All knots within a chunk of 1,000 s are
+computed together. Random numbers are drawn in the order of the knots, so that they do not depend on the
+requested times.
 
 The air density is an exponential profile (Vallado, Fundamentals of Astrodynamics, 4th ed. 2013, Table 8-4)
-with a day bulge. The apex of the day bulge is 30 deg east of the Sun in right ascension, and the density
-falls off as cos^4 of half the angle from the apex (Montenbruck & Gill 2000, section 3.5.2, Harris-Priester).
-The day-side air is four times as dense as the night-side air, as near 500 km at mean solar activity.
+with a diurnal bulge. The apex of the diurnal bulge is 30 deg east of the Sun in right ascension, and the
+density falls off as cos^4 of half the angle from the apex (Montenbruck & Gill 2000, section 3.5.2,
+Harris-Priester). The density at the apex is four times that on the opposite side, as near 500 km at mean
+solar activity.
 """
 
 from __future__ import annotations
@@ -122,7 +123,7 @@ class Orbit:
 
 
 class Start(Protocol):
-    """The start of an orbit, such as Keplerian elements or a position and velocity."""
+    """Protocol of an orbit's initial state, such as Keplerian elements or a position and velocity."""
 
     def state(self) -> tuple[FloatArray, FloatArray]:
         """Return the position (3,), m, and the velocity (3,), m/s, at time zero."""
@@ -217,17 +218,18 @@ def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
 
 
 _FARTHEST_ELEMENTS, _TILT = 100e3, 0.25
-"""Largest distance (m) of fitting elements from the first revolution, and difference of inclination (deg).
+"""Limits for elements that fit an orbit: distance (m) in the first revolution, and inclination error (deg).
 
-The inclination of elements refers to the equator of date, whose pole is 0.15 deg from that of ICRS in 2026.
-J2 adds 0.03 deg in a revolution.
+The inclination of two-line elements refers to the equator of date, whose pole is 0.15 deg from the ICRS pole
+in 2026. J2 varies the inclination by 0.03 deg in a revolution.
 """
 
 
 def misfit(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> str:
-    """Return how two-line elements differ from a configured orbit that starts at `utc`; empty if they fit.
+    """Return how two-line elements differ from a configured orbit, or an empty text if they fit.
 
-    Means over the first revolution are compared, and distances. The tolerances also hold for an orbit that is
+    Mean elements over the first revolution after `utc` are compared, and the largest distance. The tolerances
+    also hold for an orbit that is
     described by mean elements instead of osculating ones: J2 varies the semi-major axis by the fraction
     k = 3/2 J2 (R/p)^2 and the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid
     elements, and OrbitError if SGP4 cannot propagate them to the first revolution.
@@ -287,14 +289,14 @@ _PROFILE = np.array(
 )
 """Heights (m) and air densities (kg/m^3) of the exponential profile [Vallado, table 8-4].
 
-Above 1,000 km, the values follow from the scale height at 1,000 km, 268 km.
+Above 1,000 km, the values are extrapolated with the scale height at 1,000 km, 268 km.
 """
 _LOWEST_PERIGEE = 150e3
-"""Lowest height (m) of the perigee of a configured orbit. A lower orbit decays within a revolution."""
+"""Lowest permitted perigee height (m) of a configured orbit. A lower orbit decays within a revolution."""
 _NIGHT, _DAY = 0.4, 1.6
-"""Factors of the air density opposite to the day bulge and at the apex of the day bulge."""
+"""Factors of the air density: opposite to the diurnal bulge, and at the apex of the diurnal bulge."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
-"""Mean of the day bulge's density factor over all directions."""
+"""Mean density factor of the diurnal bulge over all directions."""
 _LAG = math.radians(30.0)
 
 
@@ -318,7 +320,7 @@ def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -
 KNOT = 10.0
 """Time (s) between the knots of the environment's interpolation."""
 _CHUNK, _LIGHT_KNOTS = 100, 1_000
-"""Number of environment knots and of sunlight knots in a chunk."""
+"""Numbers of environment knots and of sunlight knots in a chunk of 1,000 s."""
 _SPAN = KNOT * _CHUNK
 _FIRST_ORBIT = 12_000.0
 """Duration (s) of the first integration of the orbit, which is doubled when needed."""
@@ -346,9 +348,9 @@ class Chunk:
 
 
 class Environment:
-    """The environment of the craft from time 0 s on.
+    """Environment of the craft in orbit from time 0 s on.
 
-    Times may be requested in any order within a chunk of 1,000 s, but no time before the current chunk.
+    Times within a chunk of 1,000 s may be requested in any order, but times before the present chunk may not.
     """
 
     def __init__(
@@ -358,7 +360,7 @@ class Environment:
         generator: np.random.Generator,
         multiples: Disturbances | None = None,
     ) -> None:
-        """Begin at a Julian date UTC, with `multiples` of ring current, day bulge and random walks."""
+        """Begin at a Julian date UTC; `multiples` scales ring current, diurnal bulge and random walks."""
         self._multiples = multiples = multiples or Disturbances()
         self._elements = elements
         self._julian_date = julian_date
@@ -411,7 +413,7 @@ class Environment:
         )
 
     def _cubic(self, time: float) -> tuple[float, list[list[float]]]:
-        """Return the time (s) since the knot before `time`, and the cubics that begin at this knot."""
+        """Return the time (s) since the knot before `time`, and the cubic polynomials from this knot on."""
         since = time - self._chunk.start
         while since > _SPAN:
             self._chunk = self._make(self._next)
@@ -436,7 +438,7 @@ class Environment:
         self._noise = walks[-1]
         noise = self._multiples.walks * np.array(walks)
         density = log_density(position, sun_there, self._multiples.day_bulge) + _TURBULENCE * noise[:, 0]
-        # The ring current varies over hours and never reverses.
+        # The ring current varies over hours and does not change its direction.
         waves = np.sin(times[:, None] * (2.0 * math.pi / _STORM_TIMES) + self._phases)
         ring = magnetic_field.ring_current(date, self._storm) * (1.0 + np.mean(waves, axis=1))[:, None]
         field = magnetic_field.field(date, position) + ring
@@ -449,6 +451,6 @@ class Environment:
 
 
 def air_flow(environment: OrbitEnvironment) -> Floats:
-    """Return the craft's velocity (3,), m/s, ICRS, relative to air that rotates with the Earth."""
+    """Return the craft's velocity (3,), m/s, ICRS, relative to the air, which rotates with the Earth."""
     (x, y, _), (vx, vy, vz) = environment.position, environment.velocity
     return vx + ROTATION_RATE * y, vy - ROTATION_RATE * x, vz

@@ -1,10 +1,10 @@
 """The testbed world: a rigid body on a thread in the field of a Helmholtz coil, controlled by torque coils.
 
 The model is that of Sease 2013, chapter 5. The testbed has one degree of freedom, the angle theta about the
-thread, with J theta'' = (m x B) along the thread - k theta - c theta'. The testbed frame T has y down along
-the thread and the magnetic field along -z. The body axes coincide with those of T at theta = 0. The coil on
-body x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on body z gives n A B I sin(theta), and
-the coil on body y has no effect because its axis lies along the thread.
+thread, with J theta'' = M - k theta - c theta', where M is the component of m x B along the thread. The
+testbed frame T has y down along the thread and the magnetic field along -z. The body axes coincide with those
+of T at theta = 0. The coil on body x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on body z
+gives n A B I sin(theta), and the coil on body y has no effect because its axis lies along the thread.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sim_hal.settings import CageTruth, Disturbances, Simulation
 from sim_hal.worlds.world import BodyMotion, WorldInputs, WorldTruth, about_thread
 
 VACUUM_PERMEABILITY = 4e-7 * math.pi
-"""Vacuum permeability (T m/A), with the value of the thesis."""
+"""Vacuum permeability (T m/A); the value is that of the thesis."""
 
 
 def helmholtz_field(turns: float, current: float, radius: float) -> float:
@@ -51,7 +51,7 @@ class TestbedModel:
         supply_voltage: voltage across a coil that is fully on, V.
     """
 
-    __test__ = False  # keeps pytest from collecting this class as a test
+    __test__ = False  # without this attribute, pytest would collect the class as a test
 
     inertia: float
     dipole_per_ampere: float
@@ -63,7 +63,7 @@ class TestbedModel:
 
 
 class Testbed:
-    """The state of the testbed, advanced in time under the coil currents."""
+    """World with the testbed, whose state is advanced in time under the coil currents."""
 
     __test__ = False
 
@@ -89,7 +89,7 @@ class Testbed:
         self.mean_current: FloatArray = np.zeros(3)
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body at `time_ns`, now or later."""
+        """Release the body at `time_ns`, which is not before the present time."""
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
@@ -176,12 +176,12 @@ _CAGE_STREAM = 0xCA6E
 
 
 class OrbitField:
-    """The magnetic field of a Helmholtz cage that reproduces the field along an orbit.
+    """Magnetic field of a Helmholtz cage that reproduces the field along an orbit.
 
     The reproduced field is IGRF-14 with a ring current along an orbit under J2, in the local frame whose y
-    axis is the axis of the thread. The cage produces the components normal to the thread, multiplied by the
-    cage's scale and the gain of its coils. The flight software has its own model in
-    `flight.bodies.testbed.control`.
+    axis is the axis of the thread. The cage produces the components perpendicular to the thread, multiplied
+    by the cage's scale and the gain of its coils. The flight software uses a different model
+    (`flight.bodies.testbed.control`).
     """
 
     def __init__(self, section: CageTruth, scale: float, utc: str, seed: int) -> None:
@@ -204,7 +204,7 @@ class OrbitField:
 
 
 class CagedTestbed(Testbed):
-    """The testbed in the variable field of the cage instead of the constant field."""
+    """World with the testbed in the variable field of the cage instead of a constant field."""
 
     def __init__(
         self,
@@ -221,7 +221,7 @@ class CagedTestbed(Testbed):
         self._bx, self._bz = field.at(0.0)
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance the state to `time_ns` in a field that is constant during the few ms of the advance."""
+        """Advance the state to `time_ns`; the field is kept constant during the few ms of this call."""
         if time_ns > self.time_ns:
             self._bx, self._bz = self._orbit.at((time_ns - self._start_ns) * 1e-9)
         super().advance_to(time_ns)

@@ -1,8 +1,8 @@
-"""The interface between simulated worlds and emulated devices, and the recorder of the true state.
+"""Interface between simulated worlds and emulated devices, and recorder of the true state.
 
-A configuration names its world in `simulation.world`. The name is one of `WORLDS` or a third party's factory,
-written `module:factory`, which takes `WorldInputs` and returns a `World`. A world in orbit implements
-`OrbitingWorld`.
+A configuration names its world in `simulation.world`. The name is a key of `WORLDS`, or names a factory of
+another package as `module:factory`. A factory takes `WorldInputs` and returns a `World`. A world in orbit
+implements `OrbitingWorld`.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ STANDARD_GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class BodyMotion:
-    """The measurements of an ideal inertial unit at one time.
+    """Measurements of an ideal inertial unit at one instant.
 
     Attributes:
         time_ns: simulation time.
         quaternion: attitude quaternion (4,), reference frame into body, scalar last.
         rate: rotation rate (3,), rad/s, body axes.
         field_body: magnetic field (3,), T, body axes.
-        specific_force_body: specific force (3,), m/s^2, body axes, which points up at rest.
+        specific_force_body: specific force (3,), m/s^2, body axes; at rest it points upwards.
     """
 
     time_ns: int
@@ -94,10 +94,10 @@ class WorldTruth:
 
 @runtime_checkable
 class World(Protocol):
-    """The body and its environment, advanced in time under the currents that the coils carry."""
+    """Protocol of a world: a body and its environment, advanced in time under the coil currents."""
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body, which is held still until then, at `time_ns`, now or later."""
+        """Release the body, which is held still before, at the present or a later time `time_ns`."""
 
     def advance_to(self, time_ns: int) -> None:
         """Advance the state to `time_ns` under the present coil currents."""
@@ -111,7 +111,7 @@ class World(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class WorldInputs:
-    """The inputs from which a factory makes a world.
+    """Inputs from which a factory creates a world.
 
     Attributes:
         config: flight configuration, used for values that the `simulation` section does not give.
@@ -127,7 +127,7 @@ class WorldInputs:
 
 
 def make_world(inputs: WorldInputs) -> World:
-    """Return the world that a configuration names. Raises ConfigError for any other object."""
+    """Return the world that a configuration names. Raises ConfigError if the name is not that of a world."""
     named = inputs.section.world
     factory = imported("simulation.world", named, WORLDS, os.environ)
     try:
@@ -147,7 +147,7 @@ CAUSES = ("coils", "residual dipole", "gravity gradient", "drag", "sunlight")
 
 
 class OrbitEnvironment(NamedTuple):
-    """Position, magnetic field, sunlight and air density of the craft at one time, with vectors in ICRS.
+    """Position, magnetic field, sunlight and air density of the craft at one instant; vectors are in ICRS.
 
     Attributes:
         position: geocentric position (3,), m.
@@ -185,7 +185,7 @@ class OrbitTruth(WorldTruth):
         sunlit: visible fraction of the Sun's disc.
         residual_dipole: residual dipole (3,), A m^2, body axes.
         torques: function that returns the torque (3,), N m, body axes, of each cause in `CAUSES`, or an empty
-            dict if the world does not know the torques separately.
+            dict if the world does not provide separate torques.
     """
 
     utc: float
@@ -202,7 +202,7 @@ class OrbitTruth(WorldTruth):
 
 @runtime_checkable
 class OrbitingWorld(World, Protocol):
-    """A world with an orbit, which GPS receiver, solar cells and horizon cameras need."""
+    """Protocol of a world with an orbit, which GPS receiver, solar cells and horizon cameras need."""
 
     def surroundings(self) -> OrbitEnvironment:
         """Return the environment of the craft at the present time."""
@@ -239,7 +239,7 @@ class PacketLog(Protocol):
 
 
 class RecordedPower(Protocol):
-    """A simulated power system whose state is recorded."""
+    """Protocol of a simulated power system whose state is recorded."""
 
     def truth(self) -> Mapping[str, float]:
         """Return the fields of the packet `true_power`."""

@@ -1,9 +1,9 @@
-"""The Basilisk simulation of one craft: modules, messages and their wiring.
+"""The Basilisk simulation of one spacecraft: modules, messages and their connections.
 
 Basilisk's own modules compute the dynamics, the gravity with J2, the gravity gradient, the magnetic field
 (WMM), drag, solar pressure and eclipses. This simulator provides the properties of the craft, the orbital
-elements, the Earth's orientation and the Sun's position. No table that Basilisk downloads from the network is
-used.
+elements, the Earth's orientation and the Sun's position. The simulation uses no data that Basilisk downloads
+from the network.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from sim_hal.worlds.free_body import DRAG_COEFFICIENT, TrueCraft
 from sim_hal.worlds.orbit import KeplerianElements, sun_position
 
 MASS = 1.0
-"""Mass (kg); it affects the decay of the orbit only."""
+"""Mass (kg), which affects only the decay of the orbit."""
 _DENSITY, _SCALE_HEIGHT, _HEIGHT = 0.8 * 6.967e-13, 63_822.0, 500e3
-"""Mean air density (kg/m^3), scale height (m) and height (m) from Vallado, Table 8-4."""
+"""Mean air density (kg/m^3) at the height `_HEIGHT` (m), and scale height (m), from Vallado, Table 8-4."""
 _MAX_DIPOLE = 10.0
-"""Dipole limit (A m^2) of each torque bar, above any sum of coil dipole and residual dipole."""
+"""Dipole limit (A m^2) of each torque bar, larger than every sum of coil dipole and residual dipole."""
 _TASK = "craft"
 
 
 class BasiliskScenario:
-    """A craft in Basilisk, whose time begins at zero and advances in steps of 25 ms."""
+    """A spacecraft in Basilisk; the simulation's time begins at zero and advances in steps of 25 ms."""
 
     def __init__(
         self,
@@ -198,6 +198,6 @@ def _column(vector: FloatArray) -> list[list[float]]:
 
 
 def rodrigues(attitude: FloatArray) -> FloatArray:
-    """Return the shorter modified Rodrigues parameters (3,) of a quaternion (4,)."""
+    """Return the modified Rodrigues parameters (3,) of a quaternion (4,), those of the shorter rotation."""
     q = attitude if attitude[3] >= 0.0 else -attitude
     return np.asarray(q[:3] / (1.0 + q[3]))

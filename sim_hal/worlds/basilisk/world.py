@@ -1,9 +1,10 @@
 """Basilisk as the world of a flight: `simulation.world: sim_hal.worlds.basilisk.world:make`.
 
 This world reads the section `simulation.free_body` and builds the same craft from the same seed as the world
-`free_body`, so that results can be compared. Basilisk integrates in steps of 25 ms, and between two steps the
-motion is extrapolated at its last rate. A change of the coil currents acts from the next step on. The random
-walks of air density and residual dipole, the ring current and the day bulge of the air are not modelled.
+`free_body`, so that results can be compared. Basilisk integrates in steps of 25 ms; between two steps the
+motion is extrapolated with the last rate. A change of the coil currents takes effect at the next step. The
+random walks of air density and residual dipole, the ring current and the diurnal bulge of the atmosphere are
+not modelled.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class BasiliskWorld:
     ) -> None:
         """Create the world with a body that is held still until its release.
 
-        The craft is by default that of `section`.
+        The craft is `craft` or, if that is None, the craft that `section` describes.
 
         Raises ConfigError if Basilisk is not installed.
         """
@@ -82,13 +83,13 @@ class BasiliskWorld:
         )
         self._currents, self._supply = currents, supply
         self._acting: FloatArray = np.zeros(3)
-        self._stepped_ns = 0  # Basilisk's own time, counted from the start
+        self._stepped_ns = 0  # simulation time of Basilisk, which begins at zero
         self._placed_ns = 0
         self.time_ns = start_ns
         self.energy = self.supply_energy = 0.0
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body at the first step not before `time_ns`."""
+        """Release the body at the first step at or after `time_ns`."""
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
@@ -148,7 +149,7 @@ class BasiliskWorld:
         return WorldTruth(self._acting, self.energy, self.supply_energy)
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return the present state without torques, which Basilisk does not give separately."""
+        """Return the present state without torques, which Basilisk does not provide separately."""
         motion, around = self.motion(self.time_ns), self.surroundings()
         return OrbitTruth(
             current=self._acting,
@@ -167,7 +168,7 @@ class BasiliskWorld:
         )
 
     def _step(self, until_ns: int) -> None:
-        """Run all steps up to the earliest of `until_ns`, the release and the next whole second."""
+        """Run all steps up to `until_ns`, the release or the next whole second, whichever is earliest."""
         ends = min(until_ns, (self._stepped_ns // SECOND_NS + 1) * SECOND_NS)
         if self._held and self._release_ns < NEVER:
             ends = min(ends, max(self._stepped_ns + STEP_NS, self._release_ns - self._start_ns))
