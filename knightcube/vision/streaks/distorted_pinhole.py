@@ -34,9 +34,10 @@ class DistortedPinhole(Pinhole):
 
     @classmethod
     def of(cls, lens: Lens) -> DistortedPinhole:
-        """Return the pinhole with the centre and radial distortion of `lens`.
+        """Return the pinhole camera with the image centre and the radial distortion of `lens`.
 
-        A cubic and a change of scale replace the second distortion term (least squares over the image).
+        The second distortion term is approximated by a cubic term and a change of scale (least squares over
+        the image).
         """
         middle = lens.ideal.centre
         square = (math.hypot(*middle) / lens.focal_length) ** 2
@@ -88,7 +89,7 @@ class DistortedPinhole(Pinhole):
 
 
 def streak_pinhole(camera: CameraModel, knowledge: CameraKnowledge) -> Pinhole:
-    """Return the camera model of the streak fit, which includes the distortion only of a learned lens."""
+    """Return the camera model of the streak fit; it includes the distortion only of an estimated lens."""
     if knowledge.covariance is None or not isinstance(camera, Lens):
         return camera.ideal
     return DistortedPinhole.of(camera)

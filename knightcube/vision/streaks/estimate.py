@@ -2,17 +2,17 @@
 
 The bright regions of the frame give initial guesses of the motion, and each guess is fitted to the brightest
 stars. A matched filter along each fitted motion detects faint stars. The final estimate is a joint fit of the
-motion and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that
-each modelled streak matches one complete streak in the frame. If the fitted rotation is too small, one streak
-is modelled as several segments; if it is too large, several streaks are modelled as one. All functions of
+motion and the bright stars. Its model includes the flux of the faint stars. A final check verifies that each
+modelled streak matches one complete streak in the frame. If the fitted rotation is too small, a streak is
+modelled as several segments. If it is too large, several streaks are modelled as one streak. All functions of
 this module are pure and deterministic.
 
 With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
-against it. With a rolling shutter, a motion and its time reversal produce streaks of different lengths. A
+against it. Under a rolling shutter, a motion and its time reversal produce streaks of different lengths. A
 prior rate determines the sign of the rotation before the fit. Without a prior rate, both signs of the
 rotation are fitted, and the better fit is selected. If neither sign of the rotation fits significantly
-better, the sign remains unknown, and the rate is the mean of one fit and the time reversal of the other fit.
-The covariance of the averaged rate includes the difference between the two fits.
+better, the sign remains unknown. The rate is then the mean of one fitted rate and the negative of the other
+fitted rate. The covariance of the averaged rate includes the difference between the two fits.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ _MOST_ANGLES = 2
 _STILL_ROUNDS = 12
 # Minimum number of complete streaks for a guess of the rotation angle from streak lengths alone.
 _WHOLE = 8
-# Maximum fraction of the flux in regions longer than the guessed streak length, for an accepted guess.
+# Largest accepted fraction of the flux in regions that are longer than the guessed streak length.
 _CONTRADICTED = 0.3
 # Minimum number of stars in a preliminary fit that is accepted without comparison with other fits.
 _MANY = 3
@@ -113,27 +113,28 @@ _IN_PLACE = 0.6
 _EVIDENT = 3000.0
 # Largest median chi-square per degree of freedom of a usable preliminary fit.
 _WORST_FIRST = 12.0
-# Fraction of bright pixels above which the brightest regions of a frame count as blends of stars.
+# Fraction of bright pixels above which the brightest regions of a frame are assumed to be blends of stars.
 _CROWDED = 0.05
-# Explained chi-square below which a frame of blended stars is scanned completely.
+# Chi-square explained by the best fit below which a frame of blended stars is scanned completely.
 _BEYOND_CROWD = 100_000.0
 # Largest excess chi-square of a well-fitted star, relative to the star's squared significance.
 _MOST_RESIDUAL = 0.01
 # Upper limit of a star's significance (standard deviations) in the sum of explained chi-squares.
 _ENOUGH = 200.0
-# Weight of the flux in regions longer than the guessed streak, when guesses are compared.
-# The weight of overlong regions is below 1, because a long region may be a blend of two streaks.
+# Weight of the flux in regions longer than the guessed streak length in the comparison of guesses. The weight
+# of overlong regions is below 1, because a long region may be a blend of two streaks.
 _CONTRADICTION = 0.6
 # Median chi-square per degree of freedom above which a preliminary fit is searched for a vibration.
 _SHAKEN = 2.5
-# Last step of the fit (standard deviations) below which a preliminary fit counts as converged.
+# Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
 _CALM = 2.0
-# Fraction of streak ends that even a wrong rotation matches: one of the two ends of each streak.
+# Fraction of confirmed streak ends subtracted in the comparison, because a wrong rotation matches one end of
+# a streak.
 _ENDS_BY_CHANCE = 0.4
 
 
 def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[StreakFit]:
-    """Yield preliminary fits of the motion to the brightest stars, most likely motion first.
+    """Yield preliminary fits of the motion to the brightest stars, in descending order of likelihood.
 
     The argument `near` (rad) is the rotation angle expected from a prior rate, or None.
     """
@@ -175,9 +176,9 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
 def _likelier(
     camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
 ) -> StreakFit | None:
-    """Return a fit from a scan of the whole frame that explains more of the chi-square than the fit `done`.
+    """Return a fit from a scan of the whole frame that explains more chi-square than the fit `done`.
 
-    Returns None if the scan finds no better fit, if the frame has few blended stars, or if the fit `done`
+    Returns None if the scan finds no better fit, if few pixels of the frame are bright, or if the fit `done`
     already explains enough chi-square.
     """
     if regions.lit <= _CROWDED or explained >= _BEYOND_CROWD:
@@ -239,7 +240,7 @@ def alike(one: FloatArray, other: FloatArray) -> bool:
 
 
 def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[MotionGuess]:
-    """Yield initial guesses of the motion, most likely guess first.
+    """Yield initial guesses of the motion, in descending order of likelihood.
 
     The rotation angles are derived from streak lengths if many streaks are complete, otherwise from a scan.
     """
@@ -276,7 +277,8 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # The variable `ends` is the smaller of the fractions of confirmed ends and of unbroken streaks.
+    # The variable `ends` is the fraction of confirmed streak ends or that of streaks without gaps, whichever
+    # is smaller.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
@@ -294,7 +296,7 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
 
 
 def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
-    """Return a preliminary fit with the vibration that its residuals show, or None without a vibration."""
+    """Return a preliminary fit that includes a vibration, or None if the residuals show no vibration."""
     return fit_vibration(
         camera, fit, lambda scene: iterate(camera, scene, camera.free, FIRST, camera.windows(scene))
     )
@@ -311,19 +313,19 @@ def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
     return iterate(camera, scene, free, replace(LAST, rounds=_STILL_ROUNDS))
 
 
-# Largest fraction of stars that look like segments of a longer streak.
+# Largest accepted fraction of stars that seem to be segments of a longer streak.
 _MOST_CHAINED = 0.45
 # Minimum fractions of confirmed streak ends for an accepted motion (first) and a doubtful motion (second).
 _TRUE_ENDS = (0.75, 0.6)
 # Largest fractions of streaks with gaps for an accepted motion (first) and a doubtful motion (second).
 _BROKEN = (0.12, 0.35)
-# Minimum number of streaks with two confirmed ends at which gaps in other streaks are tolerated.
+# Minimum number of streaks with two confirmed ends for which gaps in other streaks are tolerated.
 _CONFIRMING = 3
 # Minimum fraction of the flux of complete streaks that belongs to streaks consistent with the motion.
 _AGREEING_LIGHT = 0.5
 # Relative change of the rate during the exposure above which streaks are tested for flux beyond their ends.
 _UNEVEN = 0.4
-# Largest fraction of stars with flux beyond a streak end.
+# Largest accepted fraction of stars with flux beyond a streak end.
 _MOST_TRAILING = 0.5
 
 
@@ -338,10 +340,10 @@ class StreakVerdict(Enum):
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
     """Return a verdict on a motion: whether its streaks have confirmed ends and no gaps.
 
-    In a crowded frame, one apparent star may be a blend of several stars. A motion is doubtful if a few
-    streaks have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no
-    streak has both ends in the frame, or if most streaks with both ends in the frame contradict the motion. A
-    motion is rejected if too many streak ends are wrong.
+    In a frame with many stars, a streak may be a blend of several stars. A motion is doubtful if some streaks
+    have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no streak has
+    both ends in the frame, or if most streaks with both ends in the frame contradict the motion. A motion is
+    rejected if too many streak ends are wrong.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -374,22 +376,24 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
-    """Return whether most flux of bright, complete streaks is from stars that contradict the motion."""
+    """Return whether most flux of bright, complete streaks belongs to stars that contradict the motion."""
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
         inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
-    # Stars fainter than all stars in the fit of the motion were not compared with the motion and are ignored.
+    # Stars that are fainter than all stars in the fit are ignored, because they were not compared with the
+    # motion.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
 
 
-# Largest distance (px) between a star's positions in the fits with either sign of the rotation.
+# Largest distance (px) between the positions of one star in the fits with both signs of the rotation.
 _SAME_STAR = 3.0
 # Minimum chi-square difference between the two signs of the rotation for a decision on the sign.
 _LEAST_MARGIN = 50.0
-# Minimum ratio of the chi-square difference between both signs to its scatter over the stars, for a decision.
+# Minimum ratio of the chi-square difference between both signs to its scatter over the stars for a decision
+# on the sign.
 _LEAST_AGREEMENT = 3.0
 # Upper limit of a single star's chi-square difference in the decision on the sign of the rotation.
 _MOST_DIFFERENCE = 50.0
@@ -404,7 +408,7 @@ class _Candidate:
         rotation: rotation vector over the exposure (3,), rad.
         verdict: verdict of the streak check on the motion.
         middles: centres of the n bright streaks (n, 2), px. For a global shutter, `middles` is empty.
-        excess: chi-square minus the number of pixels of each bright streak (n,). For a global shutter,
+        excess: chi-square of each bright streak minus the number of its pixels (n,). For a global shutter,
             `excess` is empty.
     """
 
@@ -430,7 +434,7 @@ def _rolling_result(
     """Return the result for a camera with a rolling shutter, or None if no motion fits.
 
     Args:
-        fit_along: function that fits a motion whose rotation has a positive component along a vector (3,).
+        fit_along: function that fits a motion with a rotation in the sense of a given vector (3,).
         axis: initial guess of the rotation axis (3,), with arbitrary sign.
         prior_rate: (3,) rad/s; None if unknown.
         prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
@@ -450,7 +454,8 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # If the fit fails for one sign of the rotation, this sign may still be the true one.
+        # If the fit succeeds for only one sign, the other sign may still be correct, so that no rate is
+        # returned.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -469,20 +474,21 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y in the vector of shared parameters and one star's parameters.
+# Indices of rate, acceleration, x and y in the vector of the shared parameters followed by one star's
+# parameters.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
-# Index of the flux in the vector of shared parameters and one star's parameters.
+# Index of the flux in the vector of the shared parameters followed by one star's parameters.
 _LIGHT = 9
-# Last step of the joint fit (standard deviations) above which the fit counts as not converged.
+# Last step of a joint fit (standard deviations) above which the fit has not converged.
 _UNSETTLED = 2.0
-# Minimum decrease of chi-square at which a rotation that reverses during the exposure is preferred.
+# Minimum decrease of chi-square for which a rotation that reverses during the exposure is assumed.
 _REVERSED = 30.0
 # Largest distance (px) between two streaks that count as a double image of one star.
 # Vibration causes double images, because a star spends most time at the turning points of the vibration.
 _DOUBLE = 8.0
 # Minimum flux ratio of the fainter to the brighter component of a double image.
 _DOUBLE_RATIO = 0.3
-# Largest fraction of double images in a frame whose rate is accepted.
+# Largest fraction of double images with which the rate of a frame is accepted.
 _MOST_DOUBLE = 0.4
 # Distance (px) below which two fitted streaks count as the same star.
 _SAME = 1.5
@@ -531,7 +537,7 @@ def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> Motio
 def with_rate(
     result: MotionResult, camera: FitProblem, last: StreakFit, verdict: StreakVerdict
 ) -> MotionResult:
-    """Return `result` with the rate, or with the reason why no rate is reported."""
+    """Return `result` completed by the rate, or by the reason why no rate is reported."""
     settings = camera.settings
     if result.used_count < settings.least_stars:
         why = f"{result.used_count} streaks agree, at least {settings.least_stars} are needed"
@@ -596,11 +602,11 @@ def _rejection(
 
 # Maximum number of preliminary motions for which the joint fit is run before a frame is rejected.
 _MOST_MOTIONS = 2
-# Median region length (px) below which a frame without a common motion shows stars at rest.
+# Median region length (px) below which the stars of a frame without a common motion are at rest.
 _AT_REST = 4.0
 # Median length (px) of the brightest regions below which a frame counts as free of streaks.
 _SPOT = 2.2
-# Number of the brightest regions from whose median length a frame without streaks is recognised.
+# Number of the brightest regions whose median length shows whether a frame is free of streaks.
 _BRIGHTEST = 12
 # Reason reported if no fitted motion passes the streak check.
 _NO_CONSISTENT_MOTION = "no motion is consistent with the brightness and the ends of the streaks"
@@ -619,16 +625,16 @@ def estimate_rate(
 ) -> MotionResult:
     """Return a camera's rate estimated from the star streaks in one image.
 
-    The result holds the mean `rate` (3,), rad/s, of the camera relative to the stars in camera axes, and the
-    rate's `covariance` (3, 3). The quaternion `start_to_end` (4,) of the result is the rotation over the
-    exposure. A single image does not show the sign of the rotation. Without a prior rate, the status is
-    therefore `ambiguous` and the rate is known except for its sign. If `rate` is None, the attribute `reason`
-    says why.
+    The attributes of the result include the mean `rate` (3,), rad/s, of the camera relative to the stars, in
+    camera axes, and its `covariance` (3, 3). The quaternion `start_to_end` (4,) of the result is the rotation
+    over the exposure. A single image does not show the sign of the rotation. Without a prior rate, the status
+    is therefore `ambiguous` and the rate is known except for its sign. If `rate` is None, the attribute
+    `reason` states the cause.
 
     Args:
         image: raw counts (rows, columns), of an unsigned integer type.
-        camera: pinhole model or calibrated lens. The distortion of a lens is treated as an uncertainty of the
-            pinhole.
+        camera: pinhole model or calibrated lens. The distortion of a lens is included only as an uncertainty
+            of the pinhole.
         exposure: exposure time, s.
         prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
             the rotation.
@@ -671,8 +677,8 @@ def estimate_motion(
         prior_course: rotation as a function of time during the exposure, as estimated by the navigation
             filter; None if unknown.
 
-    Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the `status` and
-    `reason` of the result say why.
+    Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the attributes
+    `status` and `reason` of the result state the cause.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     # The actual saturation level of a frame may be lower than the configured one, but never higher.
@@ -703,7 +709,7 @@ def estimate_motion(
         if found is not None:
             return binning.in_pixels(found)
     length = float(np.median(regions.length))
-    # In a crowded frame from a camera at rest, faint regions merge, but the brightest regions do not.
+    # If a camera at rest images many stars, the faint regions merge, but the brightest regions do not.
     if length >= _AT_REST and not spots:
         seen = replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_COMMON_MOTION)
     else:
@@ -749,7 +755,7 @@ def _in_direction(
 def _best_motion(
     camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None
 ) -> _Candidate | None:
-    """Return the first motion that passes all tests, otherwise the most likely motion without a rate.
+    """Return the first motion that passes all tests, or the most likely motion with its rate removed.
 
     Returns None if no motion is found.
     """
@@ -760,9 +766,9 @@ def _best_motion(
     leading = _fitted(camera, seen, first)
     if leading.verdict is StreakVerdict.CONFIRMED:
         return leading
-    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle.
-    # A scan of the whole frame takes less time than the fit of another motion.
-    # If streaks are broken into fragments, the rotation axis is often correct but the angle wrong.
+    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle. A scan of the
+    # whole frame takes less time than the fit of another motion. If streaks are broken into fragments, the
+    # rotation axis of the fit is often correct, but the angle is wrong.
     angles = _frame_angles(camera, leading.rotation)
     if leading.possible and _has_angle(leading.rotation, angles):
         return leading
@@ -793,7 +799,7 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     """Return the motion of the joint fit that starts from the preliminary fit `first`.
 
     If the joint fit does not succeed, the motion has the verdict REJECTED. A rejected motion is fitted again
-    with the vibration that the residuals show.
+    with a vibration if its residuals show one.
     """
     last, found = _candidate(camera, seen, first)
     if found.possible or first.scene.motion.vibration.exists:
@@ -816,7 +822,7 @@ def _bright_stars(camera: FitProblem, fit: StreakFit, most: int) -> StreakFit:
 def _candidate(
     camera: FitProblem, seen: MotionResult, first: StreakFit
 ) -> tuple[StreakFit | None, _Candidate]:
-    """Return the joint fit that starts from the preliminary fit `first`, or None, and its motion."""
+    """Return the joint fit that starts from the fit `first`, or None if it fails, and its motion."""
     last, faint = final_fit(camera, first)
     if last is not None and last.scene.motion.vibration.exists:
         done = last

@@ -2,15 +2,15 @@
 
 The sums of 3 x 3 pixels of the frame are sampled on circles about the rotation axis, where all streaks are
 straight and equally long. The matched filter of a streak is a running sum over the length of the streak.
-Along a circle, the filter response of a star is a triangle that is truncated at the border of the detector.
-Across the circles, the filter response has the shape of the star's profile. Peaks of the filter response are
-stars, and the solution of a linear system gives the heights of overlapping peaks. For bright stars, the
-second difference of the response along the circle separates overlapping triangles.
+Along a circle, the filter response to a star is a triangle, truncated at the border of the detector. Across
+the circles, the filter response is proportional to the brightness profile of the star. Each peak of the
+filter response is a star. The heights of overlapping peaks are the solution of a linear system. For bright
+stars, the second difference of the response along the circle separates overlapping triangles.
 
-If the brightest regions do not determine the rotation angle, all circles are searched. All circles about the
-rotation axis must be searched if streaks are faint and fragmented, or if the border truncates all streaks.
-The mean of the pixels in a box along a circle is compared with the mean of the pixels on both sides of the
-box. The box length with the largest sum of squared significances is the length of the streaks.
+If the brightest regions do not determine the rotation angle, all circles are searched. This search of all
+circles is needed if streaks are faint and fragmented, or if the border truncates all streaks. The mean of the
+pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
+length with the largest sum of squared significances is the length of the streaks.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from knightcube.vision.streaks.polar_grid import (
 
 # Minimum fraction of a faint star's streak that must lie on the detector.
 _LEAST_SEEN = 0.35
-# Distance between two stars, in circles of the grid, at which the profiles no longer overlap.
+# Number of grid circles between two stars from which the profiles of the stars do not overlap.
 _FARTHEST = 5
 # Standard deviation (px) of a star's profile across the streak, as assumed by the filter.
 _WIDTH = 1.05
-# Step (samples) of the second difference of the filter response along a circle.
+# Step (samples) of the second difference of the filter response along a circle of the grid.
 _SHARP_STEP = 3
 # Minimum streak length (samples) for the separation of stars by the second difference.
 _SHARP_FROM = 40.0
@@ -49,11 +49,12 @@ _SHARP_FROM = 40.0
 _SHARP_SIGMAS = 6.0
 # Minimum second difference of a star's filter response, relative to the response.
 _SHARP_SHARE = 0.3
-# Minimum fraction of a peak's response that is not explained by stronger peaks.
+# Minimum fraction of a peak's response that stronger peaks do not explain, if the peak is a star.
 _OWN_SHARE = 0.45
 # Maximum number of peaks in one pass of the search.
 _MOST_PEAKS = 1000
-# Offsets in rows and columns to the neighbours with which a local maximum is compared, nearest first.
+# Offsets (rows, columns) to the neighbours with which a local maximum is compared, in ascending order of
+# distance.
 _NEIGHBOURS = sorted(
     ((down, beside) for down in (-1, 0, 1) for beside in (-2, -1, 0, 1, 2) if (down, beside) != (0, 0)),
     key=lambda step: abs(step[0]) + abs(step[1]),
@@ -67,7 +68,7 @@ _PROFILE /= _PROFILE[0]
 
 
 def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
-    """Return the fraction of the streak length by which streaks at columns `one` and `other` (...) overlap.
+    """Return the overlap of two streaks at the columns `one` and `other` (...), relative to their length.
 
     The argument `span` (..., 2) is the range of columns of a circle that lie on the detector. `length` is in
     samples.
@@ -78,7 +79,7 @@ def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: flo
 
 
 def profile(distance: FloatArray) -> FloatArray:
-    """Return a star's filter response at `distance` (px) across its circle, relative to its maximum."""
+    """Return the filter response to a star at a `distance` (px) across its circle, relative to the peak."""
     index = np.minimum(np.abs(distance) * _PER_PX + 0.5, len(_PROFILE) - 1.0).astype(np.int64)
     return np.asarray(_PROFILE[index])
 
@@ -89,8 +90,8 @@ def sharp_peaks(
     """Return grid rows and columns of bright stars, found by the second difference of the filter response.
 
     The peaks of the second difference are narrow, so that stars close to each other on one circle are
-    separated. Only p samples with high filter responses are searched, with the flat indices `place` (p,) and
-    the noise `deviation` (p,).
+    separated. Only p samples with high filter responses are searched. Their flat indices are `place` (p,),
+    and their noise is `deviation` (p,).
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -100,7 +101,8 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference of the response is scaled to that of an isolated star, as is its noise.
+    # The second difference is scaled so that it equals the response for an isolated star. Its noise is scaled
+    # by the same factor.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -113,7 +115,7 @@ def sharp_peaks(
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return fractional grid rows and columns of the peaks not explained by stronger peaks, strongest first.
+    """Return fractional grid rows and columns of the peaks that stronger peaks do not explain, descending.
 
     Only the flat indices `place` (p,) of the filter response are searched. The range `span` (r, 2) of columns
     on the detector is that of `RunningSums`.
@@ -134,17 +136,18 @@ def _unshaded_numpy(
     sigmas: float,
     across: float,
 ) -> BoolArray:
-    """Return which peaks (k,), strongest first, stronger peaks do not explain.
+    """Return which of the peaks (k,), in descending order of strength, are not explained by stronger peaks.
 
     The arguments are grid indices and heights `value` of the peaks, the ranges `spans` (k, 2) of columns on
-    the detector, the streak length in samples, the least height, and the spacing of the circles, px.
+    the detector, the streak length in samples, the minimum height, and the spacing of the circles, px.
     """
     by_row = np.argsort(row, kind="stable")
     first = np.searchsorted(row[by_row], row - _FARTHEST + 1)
     count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
-    # A crowded frame has hundreds of thousands of pairs of peaks, most of which are too far apart to overlap.
+    # A frame with many stars has hundreds of thousands of pairs of peaks, and most pairs are too far apart to
+    # overlap.
     near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
@@ -195,7 +198,7 @@ def _unshaded(
 
 
 def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return grid rows and columns of local maxima among the flat indices `place` (p,), highest first."""
+    """Return grid rows and columns of local maxima among the flat indices `place` (p,), descending."""
     columns = values.shape[1]
     place = place[_summits(values.reshape(-1), place, columns)]
     place = place[np.argsort(-values.reshape(-1)[place], kind="stable")[:_MOST_PEAKS]]
@@ -240,9 +243,9 @@ def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: 
     return np.asarray(place + np.clip(offset, -0.5, 0.5))
 
 
-# Ratio of the noise of a sample to the rounding step of the samples.
+# Ratio of the noise of a sample to the step to which samples are rounded.
 _ROUNDING = 30.0
-# Number of passes of the search for stars. The first pass uses second differences.
+# Number of passes of the search for stars, of which the first uses second differences.
 _PASSES = 3
 # Relative regularisation of the normal equations for peak heights, for stars that nearly coincide.
 _RIDGE = 0.01
@@ -252,13 +255,13 @@ _TINY = 1e-6
 _SOLVED = 1e-4
 # Maximum number of conjugate-gradient iterations for the peak heights.
 _MOST_GRADIENTS = 200
-# Number of values of the filter response computed at once, which limits the memory.
+# Number of values of the filter response that are computed in one step, which limits the memory.
 _SOME_PLACES = 1 << 16
 # Minimum streak length (px) for which the matched filter is used.
 _LEAST_LENGTH = 6.0
 # Fraction of a star's flux that lies within three pixels across the streak.
 _CAPTURED = 0.83
-# Noise of a sum of n overlapping 3 x 3 samples, relative to the noise of a pixel times sqrt(n).
+# Ratio of the noise of a sum of n overlapping 3 x 3 samples to sqrt(n) times the noise of a pixel.
 _SAMPLE_NOISE = 3.1
 
 
@@ -279,10 +282,10 @@ def find_faint(
     sigmas: float,
     most: int,
 ) -> FaintStars:
-    """Return the most significant streaks along `motion`, at most `most`, after subtracting modelled stars.
+    """Return up to `most` of the most significant streaks along `motion`, after subtracting modelled stars.
 
-    The pair `modelled` holds the flat indices of m pixels (m,) and the counts of the modelled stars there
-    (m,).
+    The pair `modelled` contains the flat indices (m,) of m pixels, and the counts (m,) of the modelled stars
+    at these pixels.
     """
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
     reach = (
@@ -311,7 +314,8 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
     """Return the 3 x 3 sums (rows * columns,) of the frame without modelled stars and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Residuals of subtracted bright stars are attenuated, because they are mostly photon noise.
+    # Pixels from which bright stars were subtracted get a smaller weight, because their residuals are mostly
+    # photon noise.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
@@ -361,11 +365,11 @@ def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Ima
 def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return rows and columns, in fractions of a grid step, and heights of the peaks in the response `held`.
+    """Return fractional grid rows and columns, and heights, of the peaks of the filter response `held`.
 
     Each pass of the search finds peaks in the residual response, solves for the heights of all stars, and
-    subtracts these stars. The array `noise` holds the noise of a running sum by the number of its samples.
-    All passes search only those samples whose initial response is significant.
+    subtracts these stars. The array `noise` contains the noise of a running sum, indexed by its number of
+    samples. All passes are restricted to the samples with a significant initial response.
     """
     flat = held.light.reshape(-1)
     place = np.flatnonzero(flat > sigmas * noise.min())
@@ -433,7 +437,7 @@ def _add_responses_numpy(
     height: FloatArray,
     across: float,
 ) -> None:
-    """Add the filter responses of stars at grid indices `row` and `column` to `out` (p,).
+    """Add the filter responses of stars at the grid indices `row` and `column` to the array `out` (p,).
 
     The other arguments are those of `_responses`, the shape of the grid, the streak length in samples, and
     the spacing of the circles, px.
@@ -452,7 +456,7 @@ def _add_responses_numpy(
     first, count = first[reached], count[reached]
     circle, weight = circle.reshape(-1)[reached], weight.reshape(-1)[reached]
     star = reached // (2 * _FARTHEST)
-    # The ranges of columns are processed in groups, which limits the memory.
+    # The ranges of columns are processed in groups to limit the memory.
     cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
     for some in np.split(np.arange(len(reached)), np.unique(cuts)):
         many = count[some]
@@ -502,9 +506,10 @@ def _add_responses(
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Return the peak heights (k,) of stars whose overlapping responses add up to the measured response."""
+    """Return peak heights (k,) of stars such that the sum of their responses is the measured response."""
     middle = np.rint(row).astype(int)
-    # The indices `one` and `other` list all pairs of stars that may overlap, including a star with itself.
+    # The arrays `one` and `other` contain the indices of all pairs of stars that may overlap, including pairs
+    # of a star with itself.
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], row - _FARTHEST, side="right")
     count = np.searchsorted(row[order], row + _FARTHEST) - first
@@ -565,7 +570,7 @@ _ENOUGH = 40.0
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
     """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
-    # The sampling is that for a rotation by one radian, which is the largest angle in this search.
+    # The grid is sampled as for a rotation by one radian.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
     held = cumulative_sums(frame.sums, pinhole, grid)
@@ -591,10 +596,10 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 
 
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the summed squared significance of the locally best windows of `width` samples on all circles.
+    """Return the sum of the squared significances of the locally best boxes of `width` samples.
 
-    The array `padded` (c, r) holds cumulative sums along the azimuth on r circles, with a margin of `room`
-    samples at both ends.
+    The array `padded` (c, r) contains the cumulative sums along the azimuth on r circles, with a margin of
+    `room` samples at both ends.
     """
     stretches = (len(padded) - 2 * room - width) // width
     outer, inner, behind, beyond = (
@@ -605,7 +610,8 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # In each interval of one box length, the best box counts if neither adjacent interval has a better box.
+    # The circles are divided into intervals of one box length. The best box of an interval is counted if no
+    # adjacent interval, on the same or a neighbouring circle, has a better box.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)

@@ -4,18 +4,18 @@ A streak at the pixel p is parallel to B(p) u, where u is the rotation vector of
 image-flow matrix, which gives the motion of stars at p. The unit normal n of the streak in the image
 therefore gives the linear equation n.B(p) u = 0, which holds for either direction of motion along the streak.
 Pairs of bright regions propose rotation axes, the other regions vote for the proposed axes, and least squares
-refines the axis with most votes. All streaks subtend the same rotation angle, and the lengths of the bright
-regions vote for this angle. A bright region that is truncated by the border of the frame gives only a lower
-limit of the angle. Fragments of one streak lie on one circle about the rotation axis, and their total length
-also votes for the rotation angle.
+refines the axis with most votes. All streaks subtend the same rotation angle, so that the length of each
+bright region is a vote for an angle. A bright region that the border of the frame truncates gives only a
+lower limit of the rotation angle. Fragments of one streak lie on one circle about the rotation axis, and
+their total length is a vote as well.
 
 If few streaks lie completely in the frame, a scan finds the rotation angle. Along a circle about the rotation
 axis, the intensity of a star's streak is a box function whose length is the rotation angle. For each trial
 length, the pixel samples around the brightest regions are summed in boxes, and each box is moved along its
-circle to the position of its largest sum. A box of the correct length contains all flux of a star and no
-background pixels. Boxes that are too long or too short by a factor of two explain only half of the
-chi-square. The scan therefore finds the rotation angle without a good initial guess, whereas a fit of the
-pixels converges only from within a few point-spread widths.
+circle to the position of its largest sum. A box of the correct length contains the whole flux of a star and
+no other pixels. Boxes that are too long or too short by a factor of two explain only half of the chi-square.
+The scan therefore finds the rotation angle without a good initial guess, whereas a fit of the pixels
+converges only from within a few point-spread widths.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_le
 SCANNED_STARS = 14
 """Number of the brightest regions that are used in the scan for the rotation angle."""
 
-# Spacing (px) of samples along that circle about the rotation axis on which stars move fastest.
+# Spacing (px) of the samples along the circle on which stars move fastest.
 _STEP = 2.0
 # Ratio of consecutive box lengths in the scan for the rotation angle.
 _FACTOR = 1.04
@@ -43,13 +43,15 @@ _FACTOR = 1.04
 _SHORTEST = 6
 # Number of the most likely rotation angles among which the prior rate chooses.
 _WEIGHED = 3
-# Upper limit of a sample relative to the median of its region, which limits the effect of crossing stars.
+# Upper limit of a sample relative to the median of its region, by which the effect of crossing stars is
+# limited.
 _CAP = 2.0
 # Upper limit of the significance (standard deviations) of a star in the scan for the rotation angle.
 _ENOUGH = 60.0
-# Minimum significance (standard deviations) of a star that the scan for the rotation angle passes to the fit.
+# Minimum significance (standard deviations) of a star from the scan for the rotation angle that is used in
+# the fit.
 _CERTAIN = 8.0
-# Minimum fraction of a streak that lies in the frame, for a star that the scan passes to the fit.
+# Minimum fraction of a streak within the frame for its star to be used in the fit.
 _LEAST_SEEN = 0.25
 
 
@@ -96,7 +98,8 @@ def scan_angles(
     # The weight of a bright star is limited, because it may be a blend of two stars.
     scale = np.minimum(_ENOUGH**2 / np.maximum(gain.max(axis=0), 1.0), 1.0)
     score = gain @ scale
-    # If the border truncates all streaks, longer rotations explain no more flux, and the shortest is chosen.
+    # If the border truncates all streaks, all rotation angles above a limit explain the same flux, and the
+    # smallest of these angles is chosen.
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")]
@@ -109,13 +112,13 @@ def scan_angles(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BestBoxes:
-    """The best box of each of w widths along the circle of each of n regions, arrays (w, n).
+    """The best boxes of w widths along the circles of n regions, as arrays (w, n).
 
     Attributes:
-        gain: chi-square that the box explains.
-        first: index of the first sample of the box.
-        light: sum of the samples.
-        seen: number of samples in the frame.
+        gain: chi-square that each box explains.
+        first: index of the first sample of each box.
+        light: sum of the samples of each box.
+        seen: number of samples of each box within the frame.
     """
 
     gain: FloatArray
@@ -126,7 +129,7 @@ class _BestBoxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Boxes:
-    """Cumulative sums (n, c + 1) along n circles of c samples: of values, and of samples inside the frame.
+    """Cumulative sums (n, c + 1), along n circles of c samples, of the values and of the mask of the frame.
 
     The azimuth of the first sample is `begin` (rad), and the spacing of the samples is `step` (rad).
     """
@@ -139,7 +142,7 @@ class _Boxes:
     step: float
 
     def best(self, widths: IntArray) -> _BestBoxes:
-        """Return the box of each of `widths` (w,) samples with the largest chi-square for each region."""
+        """Return the box that explains most chi-square, for each region and each of `widths` (w,)."""
         return _BestBoxes(*_best_boxes(self.total, self.exist, self.variance, self.middle, widths))
 
 
@@ -149,7 +152,7 @@ _Best = tuple[FloatArray, IntArray, FloatArray, FloatArray]
 def _best_boxes_numpy(
     total: FloatArray, exist: FloatArray, variance: FloatArray, middle: IntArray, widths: IntArray
 ) -> _Best:
-    """Return the values of `_BestBoxes` for boxes of `widths` (w,) samples, from the values of `_Boxes`."""
+    """Return the attributes of `_BestBoxes` for the box lengths `widths` (w,), from those of `_Boxes`."""
     last = total.shape[1] - 1
     each = np.arange(len(middle))[:, None]
     shape = len(widths), len(middle)
@@ -186,7 +189,7 @@ def _best_boxes(
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return cumulative sums along circles, of samples limited to `_CAP` times the median of the region."""
+    """Return cumulative sums, along circles, of samples limited to a multiple of their region's median."""
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
@@ -221,7 +224,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
 def _refined_angle(
     boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatArray, width: int
 ) -> AngleCandidate:
-    """Return the best rotation angle near `width` samples, with the stars found for this angle."""
+    """Return the best rotation angle near the box length `width` (samples), with the stars for this angle."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
     held = boxes.best(widths)
@@ -252,9 +255,9 @@ def _refined_angle(
 
 # Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Sine below which the linear equations of two regions are too nearly parallel to give a rotation axis.
+# Sine of the angle between the linear equations of two regions below which they give no rotation axis.
 _PARALLEL = 1e-9
-# Product (rad px) of the standard error of a region's orientation and the region's length.
+# Standard error of a region's orientation multiplied by the region's length (rad px).
 _SIDE_ERROR = 1.2
 # Minimum standard error (rad) of a region's orientation.
 _LEAST_ERROR = 0.012
@@ -262,11 +265,12 @@ _LEAST_ERROR = 0.012
 _LEAST_LENGTH = 3.5
 # Constant part (px) of the standard error of a region's length.
 _LENGTH_ERROR = 1.0
-# Part of the standard error of a region's length that is proportional to the length.
+# Relative part of the standard error of a region's length, as a fraction of the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of two rankings, with and without votes against an angle.
+# Maximum number of rotation angles from each of two rankings. Only one ranking includes the votes against an
+# angle.
 _MOST_HYPOTHESES = 3
-# Largest radial distance (px) from the centre of rotation between two fragments of one star's streak.
+# Largest distance (px) between the circles on which two fragments of one streak lie.
 _SAME_CIRCLE = 2.0
 # Largest relative difference between a region's length and the expected streak length.
 _LIKELY_LENGTH = 0.2
@@ -274,19 +278,19 @@ _LIKELY_LENGTH = 0.2
 _INSTANTS = 65
 # Minimum number of complete regions for an estimate of the angular acceleration.
 _LEAST_GROWING = 3
-# Minimum relative change of the rate at which an initial guess includes an angular acceleration.
+# Minimum relative change of the rate for which an initial guess includes an angular acceleration.
 _LEAST_GROWTH = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGuess:
-    """An initial guess of the motion and of the stars, from which a fit starts.
+    """An initial guess of the motion and of the stars for a fit.
 
     Attributes:
         motion: guessed motion of the camera.
         stars: centres of the n streaks (n, 2), px.
         light: (n,) counts.
-        contradicted: fraction of the flux that is in regions too long for the guessed rotation angle.
+        contradicted: fraction of the flux in regions that are too long for the guessed rotation angle.
     """
 
     motion: CameraMotion
@@ -306,7 +310,8 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
     flow = image_flow(pinhole, regions.centre)
     equation = np.einsum("ni,nij->nj", regions.normal, flow)
     tolerance = np.maximum(_SIDE_ERROR / np.maximum(regions.length, 1.0), _LEAST_ERROR)
-    # Long and bright regions get a large weight, because they rarely consist of several stars.
+    # Long and bright regions get a large weight, because the image of several stars is rarely so long and
+    # bright.
     worth = np.sqrt(regions.flux) * np.minimum(regions.length, 100.0)
     leaders = long[np.argsort(-worth[long], kind="stable")[:_PROPOSERS]]
     i, j = (leaders[index] for index in np.triu_indices(len(leaders), k=1))
@@ -350,8 +355,10 @@ class AxisGuess:
         last: highest azimuth about the rotation axis in each region (n,), rad.
         width: arc length of each region from the second moment of its brightness (n,), rad.
         speed: image displacement per radian of rotation at each region (n,), px/rad.
-        cut_first: whether the border of the frame truncates each region at its lowest azimuth (n,).
-        cut_last: whether the border of the frame truncates each region at its highest azimuth (n,).
+        cut_first: whether the border of the frame truncates each region at the end with the lowest azimuth
+            (n,).
+        cut_last: whether the border of the frame truncates each region at the end with the highest azimuth
+            (n,).
     """
 
     agree: BoolArray
@@ -373,7 +380,8 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         return None
     axis, agree = found
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # Azimuth zero is the direction of the image centre, and is arbitrary if the rotation axis is there.
+    # Azimuth zero is the direction from the rotation axis to the image centre. It is arbitrary if the two
+    # coincide.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]
@@ -405,7 +413,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
 def motions_by_length(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, most: int, growth: float = 0.0
 ) -> list[MotionGuess]:
-    """Return initial guesses from the lengths of regions, most likely first, each with at most `most` stars.
+    """Return initial guesses from the lengths of regions, by descending likelihood, with up to `most` stars.
 
     The argument `growth` is the relative change of the rate over the exposure, see `measured_rate_change`.
     """
@@ -439,9 +447,9 @@ def motion_by_course(
 def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
     """Return the relative change of the rate over the exposure from the asymmetry of the regions.
 
-    If the rate increases linearly from zero, the centroid of a streak lies a sixth of its length from its
-    midpoint. The relative change is positive if the rate increases in magnitude during the exposure. A change
-    of the rate that is too small to be significant counts as 0.
+    If the rate increases linearly from zero, the distance between the centroid and the midpoint of a streak
+    is a sixth of its length. The relative change is positive if the rate increases in magnitude during the
+    exposure. If the change of the rate is too small to be significant, the result is 0.
     """
     whole = guess.agree & ~regions.cut & (guess.width * guess.speed > _LEAST_LENGTH)
     if np.count_nonzero(whole) < _LEAST_GROWING:
@@ -475,11 +483,12 @@ def _arcs_numpy(
     reference: FloatArray,
     view: tuple[float, float, float],
 ) -> _Arcs:
-    """Return moments (3, n), outermost pixels (2, n) and their azimuths (2, n) of n regions about an axis.
+    """Return moments (3, n), end pixels (2, n) and azimuths of the end pixels (2, n) of n regions.
 
-    The moments are mean and variance of the azimuth, relative to the azimuths `reference` (n,), and the mean
-    cosine of the angle from the axis. The pixels of the regions are those of `BrightRegions`, the matrix
-    `frame` (3, 3) is that of `Circles`, and the camera has the focal length and centre `view`.
+    The moments are the mean and the variance of the azimuth about the axis, relative to the azimuths
+    `reference` (n,), and the mean cosine of the angle from the axis. The pixels of the regions are those of
+    `BrightRegions`, the matrix `frame` (3, 3) is that of `Circles`, and the camera has the focal length and
+    centre `view`.
     """
     n, (focal, centre_x, centre_y) = len(reference), view
     v = np.stack([(column - centre_x) / focal, (row - centre_y) / focal, np.ones(len(row))])
@@ -495,7 +504,7 @@ def _arcs_numpy(
 
 
 def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Return the pixels with the lowest and the highest azimuth of each of `n` regions, both (n,)."""
+    """Return the pixels with the lowest and with the highest azimuth in each of `n` regions, each (n,)."""
     order = np.argsort(owner.astype(np.int16), kind="stable")
     theirs, whose = azimuth[order], owner[order]
     start = np.searchsorted(whose, np.arange(n))
@@ -553,7 +562,7 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
 
 
 def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
-    """Return the most likely rotation angles (rad), each with the flux fraction in regions that exceed it."""
+    """Return the most likely rotation angles (rad), each with the fraction of the flux in longer regions."""
     whole = guess.agree & ~regions.cut & (guess.width > 0.0)
     candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
     spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates

@@ -2,8 +2,8 @@
 
 Long streaks are fitted on strips of pixels along their paths, and stars with short or slow paths (spots) on
 square patches of pixels. The model of a streak on a strip expands the flux per px to first order around each
-block of pixels. This expansion does not hold near zero speed. If the rate increases from zero or decreases to
-zero, a square patch of pixels covers the slow part of each streak.
+block of pixels. This expansion is not valid if the speed is nearly zero. If the rate increases from zero or
+decreases to zero, a square patch of pixels covers the slow part of each streak.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.path_pixels import STEEPEST, Patches, Strips, cut_patches, cut_strips
 
-# Path length, in point-spread widths, below which a star is fitted on a square patch of pixels.
+# Path length (point-spread widths) below which a star is fitted on a square patch of pixels.
 _SPOT_WIDTHS = 8.0
-# Margin below saturation, in standard deviations of the modelled counts, within which a pixel is excluded.
-# The modelled counts are used, because a selection by the measured counts would be biased by their noise.
+# Margin (standard deviations) between the modelled counts and saturation below which a pixel is excluded. The
+# modelled counts are used, because a selection by the measured counts would be biased by their noise.
 _MARGIN = 3.0
 # Number of instants at which the position of a star on its path is evaluated.
 _INSTANTS = 9
-# Residual, relative to the modelled counts, up to which a pixel is never excluded as an outlier.
+# Allowance for model errors in the exclusion of outliers, relative to the modelled counts of a pixel.
 _UNRESOLVED = 0.1
-# Largest relative speed change over one point-spread width for which a star is fitted on a pixel strip.
+# Largest relative change of a star's speed over one point-spread width on a strip of pixels.
 _STEADY = 0.05
-# Minimum length (point-spread widths) of the fast part of a path that is fitted on a pixel strip.
+# Minimum length (point-spread widths) of the fast part of a path for a fit on a strip of pixels.
 _LEAST_FAST = 4.0
-# Lower limit (px per exposure) of a star's speed in denominators.
+# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
 # Number of instants at which the rate is evaluated to find the slow part of a star's path.
 _SAMPLES = 129
@@ -49,11 +49,13 @@ _SAMPLES = 129
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPixels:
-    """The frame's values at the fitted pixels, which are grouped in b blocks along the first array axis.
+    """The values of the frame at the fitted pixels.
+
+    The first axis of the arrays is the index of a block of pixels.
 
     Attributes:
-        slot: index of each pixel in the list of all fitted pixels, in which a pixel that two stars share
-            occurs only once. For a pixel outside the frame, `slot` is the number of fitted pixels.
+        slot: index of each pixel in the list of all fitted pixels, which contains a pixel shared by several
+            stars only once. For a pixel outside the frame, `slot` is the number of fitted pixels.
         inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
@@ -114,15 +116,15 @@ class FitWindows:
     """The fitted pixels: strips of pixels along long streaks, and square patches of pixels around spots.
 
     Attributes:
-        long: indices of the stars whose long streak is fitted on a strip of pixels (a,). If part of the
-            streak is slow, the star also has a square patch of pixels for this part.
+        long: indices of the stars whose long streak is fitted on a strip of pixels (a,). If the star moves
+            slowly on part of its path, it also has a square patch of pixels for this part.
         spot: indices of the stars that are fitted on a square patch of pixels (b,).
         strips: pixels of the strips along long streaks. The star with index i in `strips` has the index
             `long[i]` in the scene.
         patches: pixels of the square patches around spots. The patch with index i belongs to the star with
             the index `spot[i]` in the scene.
         pixels: flat indices in the frame of all m fitted pixels (m,), each given once.
-        slot: for each pixel of all strips and patches, its index in the list `pixels`, as a flat array.
+        slot: index in the list `pixels` of each pixel of all strips and patches, as a flat array.
         on_strips: values of the frame on the strips of pixels along long streaks.
         on_patches: values of the frame on the square patches of pixels around spots.
         shared: number of pixels that belong to more than one star.
@@ -139,7 +141,7 @@ class FitWindows:
     shared: int
 
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
-        """Return the summed counts (m + 1,) of all stars on the m fitted pixels, from each star's own counts.
+        """Return the sum of the counts of all stars on each fitted pixel, as an array (m + 1,).
 
         The last element is the sum of the counts on pixels outside the frame.
         """
@@ -174,8 +176,8 @@ def _summed(slot: IntArray, first: Float32Array, second: FloatArray, count: int)
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
     """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
 
-    For all stars, the strip of pixels is assumed to have the width of the widest strip, whose path is the
-    most oblique to rows and columns.
+    The strips of all stars are assumed to be as wide as the strip along the path that is most oblique to rows
+    and columns.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:
@@ -225,10 +227,10 @@ def cut_windows(
 
 
 def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the m fitted pixels (m,) once each, the place of every pixel in that list, and frequencies (m,).
+    """Return the list of m distinct fitted pixels, the index of each pixel in the list, and frequencies (m,).
 
-    The flat indices `index` (p,) in a frame of `size` pixels repeat if windows overlap. The place of a pixel
-    that is not `inside` is m.
+    The pixels are given as flat indices `index` (p,) in a frame of `size` pixels, which contain repeated
+    values if windows overlap. The returned index is m for a pixel that is not `inside`.
     """
     named = index[inside]
     # If a pixel occurs in several windows, `number` keeps the index of the last occurrence.
@@ -274,7 +276,7 @@ def _frame_values_numpy(
     bad: BoolArray,
     top: float,
 ) -> tuple[BoolArray, Float32Array, Float32Array, Float32Array]:
-    """Return which pixels are usable, and their signal, floor and ceiling, see `BlockPixels`."""
+    """Return a mask of the usable pixels, and signal, floor and ceiling of all pixels, see `BlockPixels`."""
     light = signal.take(index)
     # The background is the raw counts minus the signal, and is subtracted from the saturation level.
     ceiling = np.float32(top) - counts.take(index) + light
@@ -329,10 +331,10 @@ def _strips_and_patches(
 
 
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return start and end times (n, 2) of the fast part of each star's path, and of its slow part.
+    """Return start and end times of the fast part (n, 2) and of the slow part (n, 2) of each star's path.
 
-    The slow part of a path is at the streak end at which the rate is smaller. If a path has no fast part or
-    no slow part, the start and end times of the missing part are equal.
+    The slow part of a path is at that end of the exposure at which the rate is smaller. If a path has no fast
+    part or no slow part, the start and end times of the missing part are equal.
     """
     motion = scene.motion.smooth
     if motion.constant or not motion.rotation.any():
@@ -342,7 +344,8 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    # A star counts as slow while its speed may change too much over one point-spread width.
+    # A star is slow while the relative change of its speed over one point-spread width exceeds the limit
+    # `_STEADY`.
     slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:

@@ -1,8 +1,9 @@
 """Preparation of a frame for the fit: background, noise, unusable pixels, bright regions and star width.
 
 If the point spread is several pixels wide, the frame is binned (`Binning`). If the point spread is wide, a
-binned frame determines the motion equally well in a fraction of the computing time. The responses of a colour
-camera's raw pixels are equalised, and extended sources such as the Earth's limb are excluded.
+fit to a binned frame is as accurate as a fit to the full frame, and takes a fraction of the computing time.
+The responses of a colour camera's raw pixels are equalised, and extended sources such as the Earth's limb are
+excluded.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ class ReducedFrame:
 def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> ReducedFrame:
     """Return the frame `pixels` (rows, columns) with its background subtracted and its noise estimated.
 
-    `saturation` is in counts, and `gain` in electrons per count. If `saturation` is None, the highest count
-    is used if many pixels have that count, otherwise the maximum of the integer type.
+    `saturation` is in counts, and `gain` in electrons per count. If `saturation` is None, the saturation
+    level is the highest count if several pixels have it, otherwise the maximum of the integer type.
     """
     top = saturation_count(pixels) if saturation is None else saturation
     pixels, step, offset = in_steps(pixels)
@@ -92,7 +93,7 @@ _BORDER = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightRegions:
-    """The n connected regions of bright pixels, brightest first, and the m pixels of these regions.
+    """The n connected regions of bright pixels, in descending order of brightness, and their m pixels.
 
     Attributes:
         centre: centroid of each region (n, 2), px.
@@ -123,7 +124,7 @@ class BrightRegions:
 
 
 def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> BrightRegions:
-    """Return the brightest regions, at most `most`, whose 3 x 3 sums exceed `sigmas` standard deviations."""
+    """Return up to `most` of the brightest regions with 3 x 3 sums above `sigmas` standard deviations."""
     pixel = _significant(frame.sums, frame.floor, float(frame.floor.min()), 3.0 * sigmas)
     number, count = label_pixels(pixel, frame.shape[1])
     light = np.maximum(frame.signal[pixel], 0.0).astype(np.float64)
@@ -157,7 +158,7 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
 def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
     """Return the ascending indices of `sums` that exceed `threshold` times the root of their `floor`.
 
-    The least floor of all sums is `least`.
+    The argument `least` is the minimum of `floor`.
     """
     pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(least)))
     return np.asarray(pixel[sums[pixel] > np.float32(threshold) * np.sqrt(floor[pixel])])
@@ -175,11 +176,12 @@ def _significant(sums: Float32Array, floor: Float32Array, least: float, threshol
     return found[:count].copy()
 
 
-# Minimum mean width (px) of a limb or a reflection, which is twice the width of the brightest stars.
+# Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
 _BROAD = 25.0
-# Lower limit (px) of the length by which a region's area is divided to obtain the region's mean width.
+# Lower limit (px) of the length by which the area of a region is divided to compute its mean width.
 _LEAST_LENGTH = 40.0
-# Side (px) of a square that fits into a limb or a reflection, but not into a star.
+# Side length (px) of a square that fits into the image of a limb or a reflection, but not into that of a
+# star.
 _SOLID = 31
 # Margin (px) that is excluded around a limb or a reflection.
 _ABOUT = 12
@@ -188,9 +190,9 @@ _ABOUT = 12
 def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
     """Return `frame` without the pixels of limbs and reflections, or None if it has none.
 
-    A limb or a reflection is a region that contains a square larger than any star. A net of crossing streaks
-    is not excluded, because it contains no square larger than a star. A margin around limbs and reflections
-    is also excluded, because the background map does not follow steep gradients.
+    A limb or a reflection is a region that contains a square larger than any star. A region of crossing
+    streaks is not excluded, because it contains no square larger than a star. A margin around limbs and
+    reflections is also excluded, because the background map does not follow steep gradients.
     """
     area = np.bincount(regions.owner, minlength=len(regions))
     broad = area > _BROAD * np.maximum(regions.length, _LEAST_LENGTH)
@@ -232,8 +234,8 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     """Return `frame` with the filter responses of a colour mosaic equalised, or None if they are equal.
 
     The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. Each bright region has
-    about the same flux on the four pixels of the pattern, so that the ratios of their sums are the responses
-    to starlight.
+    about the same flux on the four kinds of pixels of the pattern. The ratios of the sums of their counts are
+    therefore the responses to starlight.
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:
@@ -268,7 +270,7 @@ _LEAST_WIDTH_REGIONS = 3
 
 
 def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | None:
-    """Return the standard deviation (px) of the point spread before pixel convolution, or None if unknown.
+    """Return the standard deviation (px) of the point spread without pixel convolution, or None if unknown.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
     to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and along rows is also Gaussian,
@@ -302,7 +304,7 @@ _NARROWEST = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Binning:
-    """Binning by `size` x `size` pixels from pixel `first` (x, y), and the binned camera `pinhole`."""
+    """Binning of `size` x `size` pixels, from pixel `first` (x, y), and the binned camera `pinhole`."""
 
     size: int
     first: tuple[int, int]
@@ -310,10 +312,10 @@ class Binning:
 
     @classmethod
     def suited(cls, pinhole: Pinhole, psf_sigma: float) -> Binning:
-        """Return the binning for a point spread of `psf_sigma` px, with one pixel per bin if it is narrow.
+        """Return the binning for a point spread of `psf_sigma` px, with one pixel per bin if that is narrow.
 
-        Opposite sides of the frame lose the same number of pixels, so that the optical axis stays in the
-        centre.
+        The same number of pixels is omitted at opposite sides of the frame, so that the optical axis stays in
+        the centre.
         """
         for size in range(int(psf_sigma / _NARROWEST), 1, -1):
             columns, rows = (_centred_count(length, size) for length in (pinhole.columns, pinhole.rows))
@@ -324,13 +326,13 @@ class Binning:
         return cls(1, (0, 0), pinhole)
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
-        """Return the binned `pixels`, and the value of bins that contain a pixel of at least `top` counts."""
+        """Return the binned `pixels`, and the value of saturated bins (with a pixel of at least `top` counts)."""
         if self.size == 1:
             return pixels, top
         x, y = self.first
         shape = self.pinhole.rows, self.size, self.pinhole.columns, self.size
         cut = pixels[y : y + shape[0] * self.size, x : x + shape[2] * self.size].reshape(shape)
-        # The value of saturated bins is an integer, so that all bins remain multiples of one count.
+        # The value of saturated bins is an integer, so that all bins are multiples of one count.
         full = max(int(cut.max()), int(np.ceil(top))) * self.size**2
         sums = cut.sum(axis=(1, 3), dtype=np.uint64)
         sums[at_least(cut, top).any(axis=(1, 3))] = full
@@ -376,7 +378,7 @@ class Binning:
 
 
 def _centred_count(length: int, size: int) -> int:
-    """Return the number of bins of `size` pixels in `length` pixels that leaves equal margins if possible."""
+    """Return the number of bins of `size` px in `length` px; both margins are equal if possible."""
     count = length // size
     return count - 1 if (length - size * count) % 2 and size % 2 else count
 
@@ -391,7 +393,7 @@ _WIDER = 1.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedFrame:
-    """A frame prepared for the fit, its bright regions, and the point-spread width `sigma` in its pixels."""
+    """A frame prepared for the fit, its bright regions, and its point-spread width `sigma` (binned px)."""
 
     binning: Binning
     frame: ReducedFrame
@@ -402,7 +404,7 @@ class PreparedFrame:
 def prepare_frame(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
 ) -> PreparedFrame:
-    """Return the frame `pixels` prepared for the configured or, if much larger, the measured point spread.
+    """Return the frame `pixels` prepared for the configured point spread, or for a much larger measured one.
 
     `saturation` is the count from which a pixel is saturated.
     """

@@ -3,8 +3,8 @@
 Times are measured in exposures and are zero at mid-exposure. With the rate u at mid-exposure and the angular
 acceleration g in camera axes, the rate at time t is u + g t, and the direction v of a star obeys v' = -(u + g
 t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion). The
-Magnus expansion is exact if the acceleration g is zero, and otherwise has an error of fourth order in t.
-Terms of third and higher order in t that the navigation filter provides are added to the rotation vector. A
+Magnus expansion is exact if the acceleration g is zero, and otherwise has an error of fourth order in t. If
+the navigation filter provides terms of third and higher order in t, they are added to the rotation vector. A
 star is identified by its pixel coordinates at mid-exposure.
 """
 
@@ -29,13 +29,13 @@ _TINY = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vibration:
-    """Small rotation of a vibrating camera, as a sum of k sinusoids of time in exposures.
+    """Small rotation of a vibrating camera, a sum of k sinusoids of the time in units of the exposure.
 
-    The rotation vector at the time t is the sum over the sinusoids of `sine` sin(2 pi `frequency` t) +
-    `cosine` (cos(2 pi `frequency` t) - 1), so that it is zero at mid-exposure.
+    The contribution of a sinusoid to the rotation vector at the time t is `sine` sin(2 pi `frequency` t) +
+    `cosine` (cos(2 pi `frequency` t) - 1), which is zero at mid-exposure.
 
     Attributes:
-        frequency: cycles per exposure of each sinusoid (k,).
+        frequency: frequency of each sinusoid (k,), cycles per exposure.
         sine: amplitudes of the sines (k, 3), rad.
         cosine: amplitudes of the cosines (k, 3), rad.
     """
@@ -51,7 +51,7 @@ class Vibration:
 
     @property
     def amplitude(self) -> FloatArray:
-        """The largest rotation (k,), rad, by each sinusoid, for a vibration about one axis."""
+        """The amplitudes (k,), rad, of the sinusoids, exact for a vibration about a fixed axis."""
         return np.asarray(np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1)))
 
     def with_frequency(self, frequency: float) -> Vibration:
@@ -112,7 +112,7 @@ class CameraMotion:
 
     @property
     def accelerates(self) -> bool:
-        """Whether the angular rate changes for a reason other than a vibration."""
+        """Whether the angular rate changes over the exposure even without the vibration."""
         return bool(self.acceleration.any() or self.higher_terms.any())
 
     @property
@@ -121,7 +121,7 @@ class CameraMotion:
         return replace(self, vibration=Vibration()) if self.vibration.exists else self
 
     def directed(self, direction: FloatArray) -> CameraMotion:
-        """Return this motion or its time reversal, whichever rotates in the sense of `direction` (3,).
+        """Return this motion or its time reversal, whichever rotates in the same sense as `direction` (3,).
 
         A motion and its time reversal have the same angular acceleration.
         """
@@ -132,7 +132,7 @@ class CameraMotion:
         return CameraMotion(-self.rate, self.acceleration, higher, self.vibration.reversed())
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
-        """Return this motion with the mean rate `rotation` (3,), rad per exposure, or the opposite rate."""
+        """Return this motion with its mean rate replaced by `rotation` (3,) or its negative."""
         sign = -1.0 if self.rotation @ rotation < 0.0 else 1.0
         return replace(self, rate=self.rate + sign * rotation - self.rotation)
 
@@ -160,13 +160,13 @@ class CameraMotion:
         return np.asarray(self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY))
 
     def relative_rate(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rate about the mean axis at `time` (m,) relative to the mean rate, or its derivative."""
+        """Return the rate about the mean axis at `time` (m,) over the mean rate, or its time derivative."""
         vector = _rate(self, time) if derivative == 0 else self.acceleration[:, None] + self.higher(time, 2)
         relative = self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY)
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rotation vector (3, m) at `time` (m,) beyond rate and acceleration, or a derivative."""
+        """Return the higher-order terms and vibration (3, m) of the rotation vector, or a derivative."""
         if self.vibration.exists:
             return self.smooth.higher(time, derivative) + self.vibration.rotation(time, derivative)
         out = np.zeros((3, len(time)))
@@ -174,14 +174,15 @@ class CameraMotion:
             return out
         powers = np.arange(3.0, 3.0 + len(self.higher_terms))
         factors = (np.ones(len(powers)), powers, powers * (powers - 1.0))[derivative]
-        for coefficient in (factors[:, None] * self.higher_terms)[::-1]:  # Horner's scheme, without pow()
+        # Horner's scheme is faster than powers
+        for coefficient in (factors[:, None] * self.higher_terms)[::-1]:
             out = coefficient[:, None] + time * out
         return out * (time * time * time, time * time, time)[derivative]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarPaths:
-    """The m points on the paths of stars: position (m, 2), velocity (m, 2) and acceleration (m, 2).
+    """Position (m, 2), velocity (m, 2) and acceleration (m, 2) of m points on the paths of stars.
 
     The position is in px, the velocity in px per exposure, and the acceleration in px per exposure^2.
     """
@@ -216,7 +217,7 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
-    """Return only the positions (m, 2), px, of the points that `paths` returns, in less time."""
+    """Return the positions (m, 2), px, of the points that `paths` returns, but in less time."""
     arguments = _ideal_arguments(pinhole, motion, stars, time)
     if motion.vibration.exists:
         points = _positions_of(arguments[0], motion, *arguments[4:])
@@ -228,7 +229,8 @@ def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: F
 def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
     """Return the image-flow matrices B (n, 2, 3), px/rad, at `points` (n, 2), px.
 
-    If the camera rotates at the rate u (rad per exposure), a star moves by B u px per exposure.
+    If the camera rotates at the rate u (rad per exposure), the image of a star moves at B u (px per
+    exposure).
     """
     view = (pinhole.focal_length, *pinhole.centre)
     ideal = pinhole.undistorted(points) if isinstance(pinhole, DistortedPinhole) else points
@@ -282,9 +284,9 @@ def _ideal_arguments(
     return view, rate, acceleration, higher, np.ascontiguousarray(stars), np.ascontiguousarray(time)
 
 
-# The compiled forms have no vibration, because few frames show one.
-# The numpy forms use arrays of m vectors (..., 3, m), whose components are contiguous, and return transposed
-# views of them.
+# The compiled forms do not include a vibration, because few frames show a vibration. The numpy forms compute
+# with arrays of m vectors (..., 3, m), in which each component is contiguous, and return transposed views of
+# these arrays.
 
 
 def _positions_of(view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
@@ -371,7 +373,7 @@ def _ideal_paths(
     """See `_ideal_paths_numpy`."""
     out = np.empty((6, len(time)))
     if len(higher) == 0 and _is_small(rate, acceleration, time):
-        # Machine code for this branch uses vector instructions.
+        # The compiled form of this branch uses the processor's vector instructions.
         for m in range(len(time)):
             turn, w, change = _motion_at(rate, acceleration, time[m])
             turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, stars, m))
@@ -471,9 +473,9 @@ def _ideal_sensitivities(
 
 _Vector = tuple[float, float, float]
 
-# Squared rotation angle (rad^2) below which two terms of a series are exact.
+# Squared rotation angle (rad^2) below which two terms of a power series are exact to rounding.
 _SMALL_SQUARE = 1e-4
-# Largest squared rotation angle (rad^2) for which the series of sine and cosine are exact.
+# Largest squared rotation angle (rad^2) for which the power series of sine and cosine are exact to rounding.
 _LARGEST_SQUARE = 4.0
 
 
@@ -491,7 +493,7 @@ def _inner(a: _Vector, b: _Vector) -> float:
 
 @loop_helper
 def _direction(view: _View, stars: FloatArray, m: int) -> _Vector:
-    """Return the direction of star `m`, scaled to z = 1."""
+    """Return the direction of the star with the index `m`, scaled to z = 1."""
     return (stars[m, 0] - view[1]) * (1.0 / view[0]), (stars[m, 1] - view[2]) * (1.0 / view[0]), 1.0
 
 
@@ -513,7 +515,7 @@ def _motion_at(rate: FloatArray, acceleration: FloatArray, t: float) -> tuple[_V
 def _any_motion_at(
     rate: FloatArray, acceleration: FloatArray, higher: FloatArray, t: float
 ) -> tuple[_Vector, _Vector, _Vector]:
-    """Return `_motion_at` with the higher terms of the rotation vector."""
+    """Return the result of `_motion_at` for a motion with higher terms of the rotation vector."""
     (x, y, z), (wx, wy, wz), (gx, gy, gz) = _motion_at(rate, acceleration, t)
     power = t
     for term in range(len(higher)):
@@ -541,7 +543,7 @@ def _mean_rate(rate: FloatArray, acceleration: FloatArray, higher: FloatArray, t
 
 @loop_helper
 def _is_small(rate: FloatArray, acceleration: FloatArray, time: FloatArray) -> bool:
-    """Return whether the series of sine and cosine are exact at every `time`."""
+    """Return whether the power series of sine and cosine are exact to rounding at every `time`."""
     latest = 0.0
     for m in range(len(time)):
         latest = max(latest, abs(time[m]))
@@ -565,7 +567,7 @@ def _small_turn(q: float) -> tuple[float, float]:
 
 @loop_helper
 def _any_turn(q: float) -> tuple[float, float]:
-    """Return `_small_turn` for any squared angle q."""
+    """Return the result of `_small_turn` for any squared angle q."""
     if q < _LARGEST_SQUARE:
         return _small_turn(q)
     angle = math.sqrt(q)
@@ -697,7 +699,7 @@ class Shutter:
 
 # Number of polynomial coefficients that represent the rate over an exposure.
 _COURSE_TERMS = 7
-# Largest departure (px) of a star from uniform motion during the exposure that is neglected.
+# Departure (px) of a star from uniform motion during the exposure below which the departure is neglected.
 _UNEVEN = 0.05
 # Number of instants of the exposure at which the departure from uniform motion is evaluated.
 _INSTANTS = 65
@@ -709,7 +711,7 @@ _COURSE_SHARE = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """Rotation of the camera over the exposure as a polynomial in time, from gyro and commanded torque.
+    """Rotation over the exposure as a polynomial in time, predicted from gyro and commanded torque.
 
     The pixels of the frame determine the rate and the linear change of the rate. Higher-order terms, for
     example of a step of the rate, are better known from the navigation filter and are held fixed in the fit.
@@ -736,7 +738,7 @@ class Course:
         return cls(fitted * exposure / (powers[:, None] + 1.0), exposure * float(np.hypot(sigma, missed)))
 
     def motion(self, focal_length: float) -> CameraMotion | None:
-        """Return the motion to fit, or None if it is uncertain or nearly uniform at `focal_length`, px."""
+        """Return the initial motion of a fit, or None if this rotation is uncertain or nearly uniform."""
         motion = CameraMotion(self.terms[0], 2.0 * self.terms[1], self.terms[2:])
         time = np.linspace(-0.5, 0.5, _INSTANTS)
         uneven = (motion.progress(time) - time) * float(np.linalg.norm(motion.rotation)) * focal_length
@@ -749,7 +751,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakScene:
-    """Unknowns of the fit: motion, point spread and stars.
+    """The unknowns of the fit: the motion, the width of the point spread, and the stars.
 
     Attributes:
         motion: rotation of the camera over the exposure.
@@ -774,11 +776,11 @@ class StreakScene:
         return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
 
     def select(self, chosen: BoolArray | IntArray) -> StreakScene:
-        """Return the scene reduced to the `chosen` stars, which are given as a mask or as indices."""
+        """Return the scene with only the `chosen` stars, given as a mask or as indices."""
         return select(self, chosen, "motion", "width")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return the scene with m more stars, which do not affect the motion, at `stars` (m, 2), px."""
+        """Return the scene with m additional stars at `stars` (m, 2), px, which do not affect the motion."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),
@@ -829,7 +831,8 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
 
 # Largest distance (px) across the streak between two segments of one streak.
 _CHAIN_ASIDE = 1.3
-# Smallest and largest angle between two segments of one streak, relative to the rotation angle.
+# Smallest and largest angle between the centres of two segments of one streak, relative to the rotation
+# angle.
 _CHAIN_APART = (0.55, 1.7)
 # Largest flux ratio of two segments of one streak.
 _CHAIN_RATIO = 2.5
