@@ -41,8 +41,7 @@ class HorizonCameraJob:
         knowledge: prior knowledge, with directions and attitude in body axes.
         strings: model of the solar strings and the currents (n,), A, of the strings. Without a recent reading
             of the currents, `strings` is None.
-        response: response of the cameras' detectors to light intensity, or None for linear detectors; None:
-            linear.
+        response: response of the cameras' detectors to light intensity, or None for linear detectors.
         structure: maps of the spacecraft's own structure in the images, by the index of the camera.
         earth_only: indices of the cameras in whose images the Sun is not searched.
     """

@@ -326,7 +326,7 @@ class Binning:
         return cls(1, (0, 0), pinhole)
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
-        """Return the binned `pixels`, and the value of saturated bins (with a pixel of at least `top` counts)."""
+        """Return the binned `pixels`, and the value of each bin with a pixel of at least `top` counts."""
         if self.size == 1:
             return pixels, top
         x, y = self.first

@@ -1,13 +1,13 @@
-"""Joint fit of the motion and the brightest stars, together with all other stars on the same pixels.
+"""Joint fit of the motion and the brightest stars, together with the fainter stars on the same pixels.
 
 The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
 the ends of the streaks, so that it can converge to a wrong rotation angle. If the fitted rotation is too
 small, the model may match only one end of every streak. The function `true_ends` detects flux beyond the
 modelled streak ends. If the fitted rotation is too large, the modelled streaks extend over dark pixels. The
-function `unbroken` detects gaps, which are dark segments within a streak. If a modelled end lies more than a
-few point-spread widths beyond the true end, the pixels around it contain no starlight and do not attract the
-end. The function `stretched` therefore searches a longer distance for the true ends and corrects the streak
-length.
+function `unbroken` detects gaps, which are dark segments within a streak. If a modelled streak end lies more
+than a few point-spread widths beyond the true end, the pixels around it contain no starlight, and the fit
+does not move the modelled end to the true end. The function `stretched` therefore searches a longer distance
+for the true ends and corrects the streak length.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 # Number of processed pixels per frame after which no further motion is fitted.
 # A fit in progress is always completed, so that the work on a frame may be twice the limit.
 _MOST_WORK = 1_600_000
-# Fixed overhead of one evaluation of the model, expressed as a number of processed pixels.
+# Fixed work of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
-# Work per pixel of a pass over the frame, relative to an evaluation of the model.
+# Ratio of the work per pixel of a pass over the frame to that of an evaluation of the model.
 _PASS = 0.15
 
 
@@ -85,21 +85,22 @@ class WorkBudget:
 _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
-# First displacement (px) of a star without effect on the motion above which pixels are selected again.
-# Later iterations ignore the often poorly known displacements of stars without effect on the motion.
+# Displacement (px) in the first iteration, of a star without effect on the motion, above which pixels are
+# selected again. Later iterations ignore the often poorly known displacements of stars without effect on the
+# motion.
 _FAINT_DRIFT = 3.2
-# Change of the acceleration, relative to the rotation, after which the fit's pixels are reselected.
+# Change of the angular acceleration, relative to the rotation, above which the pixels are selected again.
 _GROWN = 0.1
-# Step of the shared parameters (standard deviations) at which the fit is converged.
-# The last step of the fit is applied, so that the remaining error is of second order in the step.
+# Step of the shared parameters (standard deviations) below which the fit has converged. The last step of the
+# fit is applied, so that the remaining error is of second order in the step.
 SETTLED = 0.4
-# Largest ratio of the lengths of consecutive steps that counts as progress of the fit.
+# Largest ratio of the lengths of a step and the preceding step that counts as progress of the fit.
 _LEAST_PROGRESS = 0.7
 # Number of iterations after which the set of pixels excluded as outliers no longer changes.
 _LOOKS = 1
 # Probability of a false alarm of the score test for a changing rate.
 _BY_CHANCE = 1e-4
-# Fraction of the score test's limit below which an approximate statistic confirms a constant rate.
+# Fraction of the score test's threshold below which an approximate statistic confirms a constant rate.
 _FAR_BELOW = 0.5
 # Number of acceleration components, which is the number of degrees of freedom of the score test.
 _GROWTHS = 3
@@ -122,7 +123,7 @@ class IterationLimits:
         settled: largest step (standard deviations) of the shared parameters at which the fit is converged.
         conjugate: maximum number of conjugate-gradient iterations by which the coupling of stars on shared
             pixels is included.
-        patience: number of iterations before the progress of the fit is first checked.
+        patience: number of iterations before the first check of the fit's progress.
     """
 
     rounds: int
@@ -167,16 +168,16 @@ class FitProblem:
 
     @property
     def free(self) -> BoolArray:
-        """Mask (SHARED,) of the fitted parameters among those that all stars share."""
+        """Mask (SHARED,) of the parameters that are fitted, among the parameters common to all stars."""
         return np.array([True] * 3 + [self.growing] * 3 + [True])
 
     @property
     def undecided(self) -> bool:
-        """Whether the fit still has to choose between a constant and a changing rate."""
+        """Whether the choice between a constant and a changing rate is left to a score test."""
         return self.settings.rate_model == "auto" and not self.growing
 
     def windows(self, scene: StreakScene) -> FitWindows:
-        """Return the fit windows, which hold the pixels near the streaks of `scene`."""
+        """Return the fit windows, which contain the pixels near the streaks of `scene`."""
         return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
 
     def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
@@ -197,7 +198,7 @@ class StreakFit:
         last_step: last step of the shared parameters, in standard deviations. The last step is 0 if the fit
             is converged.
         windows: fitted pixels.
-        free: mask (SHARED,) of the fitted parameters among those that all stars share.
+        free: mask (SHARED,) of the parameters that were fitted, among the parameters common to all stars.
         hidden: stars on the fitted pixels that were subtracted instead of fitted; None without any.
     """
 
@@ -214,7 +215,7 @@ class StreakFit:
 
         The test accounts for the scatter of the accelerations of single stars (Hotelling's T-squared test).
         """
-        # An approximation that neglects pixels shared by several stars is sufficient in most cases.
+        # In most cases, an approximation without the coupling of stars on shared pixels is sufficient.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
@@ -236,14 +237,14 @@ def iterate(
     how: IterationLimits,
     windows: FitWindows | None = None,
 ) -> StreakFit | None:
-    """Return the fit of all stars and of the shared parameters selected by `free` (SHARED,), or None."""
+    """Return the fit of all stars and the shared parameters in the mask `free`, or None if it fails."""
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
     widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
     for turn in range(how.rounds):
-        evaluation = None  # Tens of MB of old normal equations are freed before the next evaluation.
+        evaluation = None  # The old normal equations, tens of MB, are freed before the next evaluation.
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
@@ -266,7 +267,8 @@ def iterate(
             break
         previous, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene, faint_drift if turn == 0 else np.inf):
-            del windows, whole  # Tens of MB of old fit windows are freed before new ones are selected.
+            # The old fit windows, tens of MB, are freed before new fit windows are selected.
+            del windows, whole
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:
@@ -304,28 +306,28 @@ def misfit(evaluation: Evaluation, stars: IntArray | slice = slice(None)) -> flo
 _STRETCH = 0.1
 # Minimum length (px) of the segments compared at each streak end.
 _LEAST_STRETCH = 8.0
-# Distance (px) between the streak end and the segments compared on both sides of it.
+# Distance (px) between a streak end and the compared segments, which lie on both sides of the end.
 _FROM_END = 4.0
 # Number of samples along a segment of a path at a streak end.
 _SAMPLES = 24
-# Number of segments into which a streak is divided to find gaps, which are dark segments.
+# Number of segments into which a streak is divided in the search for gaps (dark segments).
 _WITHIN = 10
 # Number of samples in each segment of a streak that is searched for gaps.
 _WITHIN_SAMPLES = 10
 # Distances (px) from a star's path at which the pixels are sampled.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
-# Mean counts of the three central pixels across a streak, relative to the flux per px of streak length.
+# Mean counts of the three central pixels across a streak, relative to the flux per px along the streak.
 _MIDDLE = 0.287
 # Ratio of measured to expected intensity below which a segment of a streak counts as dark.
 _HALF = 0.5
 # Minimum fraction of usable pixels in a streak segment whose intensity is measured.
 _LEAST_VALID = 0.7
-# Minimum expected intensity (standard deviations) of a streak segment that is tested for darkness.
+# Minimum expected intensity (standard deviations) of a segment for the test whether it is dark.
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
-# Lower limit of a star's speed in the expected intensity of its streak, relative to the mean speed.
-# The point spread limits the intensity of streak segments in which the star is slow.
+# Lower limit of a star's speed, relative to the mean speed, in the computation of the expected intensity. The
+# point spread limits the intensity of streak segments in which the star is slow.
 _SLOW = 0.5
 # Minimum intensity beyond a streak end that counts as a trail, relative to the streak's mean intensity.
 _TRAIL = 0.08
@@ -336,9 +338,10 @@ _DARK = 0.15
 def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
     """Return 1 for each confirmed and 0 for each wrong end of the streaks of `scene`, as an array (n, 2).
 
-    At a confirmed streak end, there is starlight only on the inner side.
+    A streak end is confirmed if the pixels on its inner side contain starlight and the pixels on its outer
+    side do not.
 
-    Ends outside the detector and ends of very short streaks are NaN.
+    The value is NaN for an end outside the detector and for the ends of very short streaks.
     """
     out = np.full((len(scene.stars), 2), np.nan)
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
@@ -386,7 +389,7 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
 def _end_motions(
     camera: FitProblem, scene: StreakScene
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
-    """Yield, for each end of the streaks, array column, outward sign, uniform motion, positions and speeds.
+    """Yield, for the first and the second ends: column, outward sign, uniform motion, positions, speeds.
 
     The paths are extrapolated with a uniform motion, because the star may have no speed at a streak end.
     """
@@ -399,10 +402,10 @@ def _end_motions(
 
 
 def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return an array (k,) with 1 for stars whose streaks have no gaps, and 0 for all other tested stars.
+    """Return 1 for each tested star whose streak has no gaps, and 0 for each other tested star, (k,).
 
     Only the part of a star's path that is on the detector is tested for gaps. Stars with very short or very
-    faint streaks are omitted.
+    faint streaks are not tested.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     long = length > _WITHIN * _LEAST_STRETCH
@@ -435,7 +438,7 @@ def brightness(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean counts (n,) of pixels along path segments, and the standard errors (n,) of these means.
 
-    The argument `time` (n, s) holds s sampling times for each of the n path segments. The mean is NaN if a
+    The argument `time` (n, s) contains s sampling times for each of the n path segments. The mean is NaN if a
     segment has too few usable pixels.
     """
     frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
@@ -506,25 +509,27 @@ def _band_means(
     return mean, deviation
 
 
-# Half length of the search range for a streak end around the modelled end, relative to the path length.
+# Half the length of the search range around a modelled streak end, relative to the path length.
 _REACH = 0.08
-# Minimum and maximum half length (px) of the search range for a streak end.
+# Minimum and maximum of half the length (px) of the search range around a streak end.
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
 # Number of samples in the search range for a streak end.
 _STEPS = 41
-# Minimum significance (standard deviations) of the flux near a streak end that is measured.
+# Minimum significance (standard deviations) of the flux near a streak end for the end to be measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Upper limit of a sample's intensity, relative to the expectation, which limits the effect of other stars.
+# Upper limit of a sample's intensity relative to the expected value, by which the effect of other stars is
+# limited.
 _CAP = 2.0
 # Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3
 # Minimum error (px) of a streak length that counts as wrong.
 _LEAST_OFF = 4.0
-# Largest difference (px) between the length errors of streaks that agree with each other.
+# Largest difference (px) between the length errors of two streaks that are considered equal.
 _ALIKE = 3.0
-# Minimum ratio of the number of streaks with a wrong length to the number with the correct length.
+# Minimum ratio of the number of streaks with a wrong length to the number with the correct length, for a
+# correction.
 _MORE = 2
-# Largest relative change of the rate at which the rotation angle is corrected.
+# Largest relative change of the rate for which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5
 
 
@@ -564,8 +569,8 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     """Return `scene` with the rotation corrected so that modelled and measured streak ends agree.
 
     Returns None if no correction is needed, or if the rate changes so much that the intensity varies along a
-    streak. Each star is moved to the middle between its measured ends, or by half a streak length from its
-    only end in the frame.
+    streak. Each star is moved to the midpoint of its measured ends. If only one end is in the frame, the star
+    is moved to half a streak length from this end.
     """
     if abs(scene.motion.relative_acceleration) > _MOST_STRETCHED_CHANGE:
         return None
@@ -596,13 +601,15 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
 # Largest change of the rate over the exposure, relative to the rate at mid-exposure.
 # For a motion that starts or ends at rest, this relative change is 2.
 _MOST_CHANGE = 2.2
-# Deviation (standard deviations) from the majority's motion above which a star must not affect the motion.
+# Deviation (standard deviations) from the motion of the majority of stars above which a star is excluded from
+# the motion fit.
 _TRUST_SIGMAS = 3.5
 # Model error (px) of the ends of a streak, assumed when the motions of the stars are compared.
 _END_FLOOR = 0.01
 # Model error (px) of the width of a streak, assumed when the motions of the stars are compared.
 _WIDTH_FLOOR = 0.002
-# Distance between two streaks below which they are fitted together, in half widths of the fitted strips.
+# Distance between two streaks below which they are fitted together, as a multiple of half the width of a
+# strip.
 _NEAR = 1.4
 # Displacement (px) of the streak ends during the fit above which faint stars are searched again.
 _FAR = 6.0
@@ -610,15 +617,15 @@ _FAR = 6.0
 _MOST_REPEATS = 2
 # Relative error of the modelled counts of a subtracted star on a pixel.
 _SUBTRACTION_ERROR = 0.35
-# Maximum number of pixels in all fit windows together, which limits memory and time.
-# A pixel that lies in several fit windows counts once for each of these windows.
+# Maximum total number of pixels in all fit windows, which limits memory and time. A pixel that lies in
+# several fit windows counts once for each of these windows.
 _MOST_PIXELS = 60_000
-# Fraction of the pixel limit that a fit of only the brightest streaks and their neighbours may use.
+# Fraction of the maximum number of pixels for a fit of only the brightest streaks and their neighbours.
 _BRIGHTEST_SHARE = 0.5
 # Minimum number of bright streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10
-# Minimum significance (standard deviations) of faint stars on the pixels of bright streaks.
-# Undetected faint stars would shift the ends of the bright streaks.
+# Minimum significance (standard deviations) of a detected faint star in the search on the pixels of bright
+# streaks. Undetected faint stars would shift the ends of the bright streaks.
 _HIDDEN_SIGMAS = 4.5
 # Number of stars subtracted from the frame in one batch, which limits the memory.
 _AT_ONCE = 16
@@ -628,8 +635,8 @@ def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
     """Return the joint fit of the brightest stars, and the faint stars that were not fitted.
 
     Faint stars are searched a second time if the fit differs much from the motion of the fit `first`, or if
-    modelled and measured streak ends disagree. A fit is rejected if its streaks still have wrong ends after
-    the second search.
+    modelled and measured streak ends disagree. A fit is rejected if its streaks have wrong ends after the
+    second search.
     """
     other = None
     for _ in range(_MOST_REPEATS):
@@ -660,7 +667,7 @@ def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
 
 
 def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
-    """Return the joint fit of stars detected along the motion of the fit `first`, and the other faint stars.
+    """Return the joint fit of stars found along the motion of the fit `first`, and the other faint stars.
 
     A constant rate is fitted unless the settings or the pixels require a changing rate.
     """
@@ -707,11 +714,11 @@ def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
 
 
 def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> StreakFit | None:
-    """Return the fit of `scene` with the motion on which the stars agree; None if the fit fails.
+    """Return the fit of `scene` with the motion of the majority of stars; None if the fit fails.
 
-    A score test on the pixels decides between a constant and a changing rate. The brightest stars without
-    effect on the motion are also fitted, as long as at most `room` times the usual number of pixels is
-    needed. Stars that are not fitted are subtracted from the frame.
+    A score test on the pixels decides between a constant and a changing rate. Stars without effect on the
+    motion are fitted as well, in descending order of brightness, until the number of pixels reaches `room`
+    times its usual limit. Stars that are not fitted are subtracted from the frame.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
@@ -723,7 +730,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # Deleting the old fit and popping its windows frees tens of MB during the next fit.
+    del done  # The old fit is deleted and its windows are popped, which frees tens of MB during the next fit.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
@@ -733,7 +740,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
 def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     """Return the joint fit repeated from `last` with another `camera`, or None if it does not succeed.
 
-    At the start of the repeated fit, all bright stars affect the motion.
+    The repeated fit starts with all bright stars included in the fit of the motion.
     """
     scene = last.scene
     leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
@@ -779,7 +786,7 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return which stars in the motion fit agree with the majority's motion, or all if too few agree."""
+    """Return which stars in the motion fit agree with most others in the motion, or all if few agree."""
     estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
     if estimates is None:
@@ -800,7 +807,7 @@ def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
 
 
 def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
-    """Return a mask (n,) of the stars in the motion fit and the brightest others within the pixel limit."""
+    """Return a mask (n,) of the stars in the motion fit and of other bright stars within the pixel limit."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))
@@ -809,7 +816,7 @@ def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArra
 
 
 def _subtracted(camera: FitProblem, others: StreakScene) -> FitProblem:
-    """Return `camera` without the stars `others`, whose model errors are added to the noise of the frame."""
+    """Return `camera` with the stars `others` subtracted and their model errors added to the noise."""
     if not len(others.light):
         return camera
     signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()

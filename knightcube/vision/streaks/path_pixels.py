@@ -1,7 +1,7 @@
 """Selection of the pixels near the paths of stars: strips along long streaks, and patches around spots.
 
-A strip consists of parallel lines of pixels across the path of a star. A line of pixels across the path is
-part of a column if the path runs mainly along rows, and part of a row otherwise. Ten neighbouring lines of
+A strip consists of parallel lines of pixels across the path of a star. A line of pixels across the path lies
+in a column of the frame if the path runs mainly along rows, otherwise in a row. Ten neighbouring lines of
 pixels form a block. The path of a star is divided into parts if it is long, and where its direction changes
 from mainly along rows to mainly along columns. Each pixel is assigned to the nearest part of a path.
 """
@@ -24,20 +24,23 @@ LINES = 10
 STEEPEST = 0.68
 """Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
 
-# Largest camera rotation (rad) in a part of a path, for a monotonic change of the star's column or row.
+# Largest camera rotation (rad) within a part of a path. It ensures that the star's column or row changes
+# monotonically.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
 _SAMPLES = 17
-# Ratio of a star's speeds along rows and columns at which the path is divided into parts.
-# With a ratio of 1, the border between two parts could follow a diagonal of pixels and lose all of them.
+# Ratio of a star's speeds along rows and along columns at which its path is divided into parts. If the ratio
+# were 1, the border between two parts could follow a diagonal of pixels, and all pixels of the diagonal would
+# be omitted.
 _DIAGONAL = 1.03
 # Number of instants at which the direction of part of a path is evaluated.
 _INSTANTS = 7
-# Lower limit (px per exposure) of a star's speed in denominators.
+# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
-# Lower limit of the cosine between a path and a line's normal, for lines of pixels beyond the path's end.
+# Lower limit of the cosine of the angle between a path and the normal of a line of pixels beyond the end of
+# the path.
 _MOST_BENT = 0.5
-# Width (px) of the gap between adjoining parts of a straight path, whose pixels belong to neither part.
+# Width (px) of the gap between adjoining parts of a straight path. Pixels in the gap belong to neither part.
 _SEAM = 0.003
 # Increase of the gap width (px) between parts of a curved path, per cubed strip width and squared curvature.
 _ARC = 0.3
@@ -55,8 +58,8 @@ class Strips:
         step: step in column and row from one pixel of a line to the next, (b, 2) for b blocks of lines.
         index: flat index in the frame of each of k pixels per line, (b, LINES, k), or 0 for a pixel that is
             not `inside`.
-        inside: mask (b, LINES, k) of the pixels that are in the frame and whose nearest part of the path is
-            that of their block.
+        inside: mask (b, LINES, k) of the pixels in the frame that are nearer to their block's part of the
+            path than to other parts.
     """
 
     star: IntArray
@@ -83,8 +86,8 @@ def cut_strips(
     """Return the pixels within `width` px of the paths of `stars` (n, 2), px, between start and end `times`.
 
     The start and end times (n, 2) are in exposures from mid-exposure. The mask `ending` (n, 2) states which
-    start and end times are ends of a streak. At the end of a streak, pixels beyond the end are included. If
-    `ending` is None, all times are ends of a streak.
+    start and end times are ends of a streak. At an end of a streak, pixels beyond the end are included. If
+    `ending` is None, all these times are ends of a streak.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
@@ -134,13 +137,14 @@ class _Lines:
 def _parts(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return star, start and end time of each path part, and a mask (.., 2) of times that are streak ends."""
+    """Return star, start time and end time of each path part, and a mask (.., 2) of the streak ends."""
     turned = float(np.linalg.norm(motion.rotation)) + float(np.linalg.norm(motion.acceleration))
     pieces = max(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # Without rounding errors, streak ends can be found by equality.
+    # These times have no rounding errors, so that streak ends are recognised by equality.
+    edges[:, -1] = times[:, 1]
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -181,7 +185,7 @@ def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: In
     major = np.where(falling[:, None], major[:, ::-1], major)
     sampled = np.where(falling[:, None], sampled[:, ::-1], sampled)
     within = np.clip(line, major[owner, :1], major[owner, -1:])
-    # All parts are interpolated at once, in intervals of their own.
+    # All parts are interpolated in one call, because each part has its own interval.
     begin = np.arange(len(major)) * (float(np.ptp(major)) + 1.0 if major.size else 1.0)
     at = (within + begin[owner, None]).reshape(-1)
     times = np.interp(at, (major + begin[:, None]).reshape(-1), sampled.reshape(-1)) if len(at) else at
@@ -244,10 +248,10 @@ def _select_pixels_numpy(
     size: tuple[int, int],
     width: float,
 ) -> None:
-    """Compute the mask `within` (b, LINES, k) of pixels near paths whose nearest part is that of their block.
+    """Compute the mask `within` (b, LINES, k) of pixels that are nearest to the path part of their block.
 
     The `bounds` of all parts are start time, end time, and a mask (.., 2) of times that are streak ends. The
-    other arguments are those of `_Lines`, and `size` holds the columns and rows of the frame.
+    other arguments are those of `_Lines`, and `size` contains the numbers of columns and rows of the frame.
     """
     along, (low, high, outer) = along_rows[:, None], bounds
     position, velocity, bent = points
@@ -265,7 +269,7 @@ def _select_pixels_numpy(
     aside -= np.float32(0.5) * curved * ahead * ahead
     foot = np.divide(ahead, pace, out=ahead)
     foot += time.astype(np.float32)
-    # A pixel between two parts of a path may be lost, but no pixel is counted twice.
+    # A pixel between two parts of a path may be omitted, but no pixel is counted twice.
     seam, room = (_SEAM + _ARC * width**3 * np.square(bend)) / speed, width / speed
     start = low[part, None] + np.where(outer[part, :1], -room, seam)
     stop = high[part, None] - np.where(outer[part, 1:], -room, seam)

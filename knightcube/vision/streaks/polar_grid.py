@@ -24,7 +24,7 @@ ACROSS = 1.8
 
 # Spacing (px) of the samples along a circle of the polar grid.
 _ALONG = 4.0
-# Number of circles processed at once, small enough for the samples to fit into the processor's cache.
+# Number of circles processed in one step, small enough for their samples to fit into the processor's cache.
 _CHUNK = 64
 # Smallest angle (rad) between a circle of the polar grid and the rotation axis.
 _NEAREST = 0.003
@@ -60,7 +60,7 @@ class PolarGrid:
 
     @property
     def off_centre(self) -> float:
-        """Offset (samples) of a running sum's centre from a sample: 0.5 for an even number of samples."""
+        """Offset (samples) of the centre of a running sum from a sample: 0, or 0.5 for an even sum length."""
         return 0.0 if round(self.length) % 2 else 0.5
 
     def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
@@ -72,7 +72,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return a polar grid of the circles that cross the detector, thinned to one in `every` circles."""
+    """Return a polar grid with one in `every` of the circles that cross the detector."""
     angle = float(np.linalg.norm(motion.rotation))
     axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
@@ -104,8 +104,8 @@ def sampled(
 
     The samples are values of the 3 x 3 pixel sums `sums`, which must be zero along the border of the frame.
     The samples are rounded to integer multiples of `unit`, so that sums of them are fast and exact. The mask
-    excludes samples beside the detector. If the circles are complete, a margin of `room` samples is included
-    on both sides of the detector.
+    excludes samples that are not on the detector. If the circles are complete, a margin of `room` samples is
+    included on both sides of the detector.
     """
     turning, rising = _direction_terms(grid)
     view, shape = (pinhole.focal_length, *pinhole.centre), (pinhole.columns, pinhole.rows)
@@ -117,7 +117,7 @@ def sampled(
 def _direction_terms(grid: PolarGrid) -> tuple[Float32Array, Float32Array]:
     """Return terms (3, c) of azimuths and (3, r) of circles, whose sum is the direction of a sample.
 
-    The direction is divided by the sine of its polar angle.
+    The direction is not a unit vector, but is divided by the sine of its polar angle.
     """
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
@@ -141,7 +141,7 @@ def _samples(
     for axis, limit in ((0, last[0]), (1, last[1])):
         place = turning[axis] + rising[axis, :, None]
         place *= depth
-        # With the added 0.5, truncation to an integer rounds to the nearest integer.
+        # After the addition of 0.5, truncation to an integer rounds to the nearest integer.
         place += np.float32(view[1 + axis] + 0.5)
         np.maximum(place, np.float32(0.0), out=place)
         np.minimum(place, np.float32(limit), out=place)
@@ -168,7 +168,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
     for start in range(0, len(grid.polar), _CHUNK):
         part = slice(start, min(start + _CHUNK, len(grid.polar)))
         near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
-        # The direction of azimuth pi points from the rotation axis away from the image centre.
+        # The azimuth pi is the direction from the rotation axis away from the image centre.
         behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
         if grid.full and pinhole.contains(behind, margin=2.0)[0]:
             yield part, slice(0, count)
@@ -184,7 +184,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
 _BOX = 3.0
 # Largest cumulative sum of samples that can be represented, in units of the rounding step.
 _HIGHEST = 2.0**30
-# Number whose addition and subtraction rounds a sample to an integer.
+# Number that rounds a sample to an integer if it is added and then subtracted (float32).
 _ROUND = 1.5 * 2.0**52
 
 
@@ -195,9 +195,8 @@ class RunningSums:
     Attributes:
         light: (r, c) counts.
         count: number of samples on the detector in each running sum (r, c).
-        span: indices of the first and last column of each circle that lie on the detector (r, 2). The range
-            `span` is unlimited, from -inf to inf, if the samples of a circle on the detector are not
-            contiguous.
+        span: indices of the first and last column of each circle that lie on the detector (r, 2). If the
+            samples of a circle on the detector are not contiguous, the range `span` is from -inf to inf.
         excess: noise of the running sums on each circle, relative to the noise for independent samples (r,).
     """
 
@@ -210,12 +209,12 @@ class RunningSums:
 def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
     """Return the running sums over one streak length, centred on each sample of the polar grid.
 
-    The pixel sums `sums` must be zero along the border of the frame, because samples outside the frame take
-    the border's value. The samples are rounded to multiples of `unit` counts.
+    The pixel sums `sums` must be zero along the border of the frame, because samples outside the frame are
+    read from the border. The samples are rounded to multiples of `unit` counts.
     """
     width = max(round(grid.length), 1)
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # Elements off the detector are never written, so that no memory is allocated for them.
+    # Elements outside the detector are never written, so that the system allocates no memory for them.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
@@ -225,7 +224,8 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
     limits = width, grid.full, float(np.float32(1.0 / unit)), float(np.float32(unit))
     _sum_along(response, count, span, sums.reshape(-1), turning, rising, parts.reshape(-1, 4), *view, limits)
     span[np.isfinite(span)] += grid.off_centre
-    # On circles near the rotation axis, neighbouring samples share pixels, so that their noise is correlated.
+    # On circles near the rotation axis, neighbouring samples have common pixels, so that their noise is
+    # correlated.
     spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
     slow = np.flatnonzero(spacing < _BOX)
     steps = np.arange(1, width)
@@ -240,7 +240,7 @@ def _ends(part: slice) -> tuple[int, int]:
 
 
 _Limits = tuple[int, bool, float, float]
-"""Samples in a streak, whether circles are complete, samples per count, and counts per rounded sample."""
+"""Streak length (samples), whether circles are complete, rounding steps per count, and counts per step."""
 
 
 def _sum_along_numpy(
@@ -258,9 +258,9 @@ def _sum_along_numpy(
     """Compute the running sums `response` and their numbers of samples `count` (r, c), and `span` (r, 2).
 
     The direction of a sample is the sum of a term `turning` (3, c) of its azimuth and a term `rising` (3, r)
-    of its circle. Each of the groups `parts` (g, 4) holds the first circle, the circle after the last, the
-    first azimuth and the azimuth after the last. The camera has the focal length and centre `view`, and the
-    `shape` columns and rows.
+    of its circle. Each row of the array `parts` (g, 4) describes a group of samples by the indices of the
+    first circle, the circle after the last, the first azimuth and the azimuth after the last. The camera has
+    the focal length and centre `view`, and the `shape` columns and rows.
     """
     width, full, per_count, unit = limits
     before, after, columns = width // 2, width - width // 2, response.shape[1]
@@ -285,7 +285,8 @@ def _sum_along_numpy(
         count[part, low:high] = held[1]
         start, stop = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
         whole = inside.sum(axis=1) == stop - start + 1
-        # The centre of a running sum of an even number n of samples lies half a sample before the sample n/2.
+        # The centre of a running sum of an even number n of samples lies half a sample before the sample with
+        # the index n/2.
         edges = np.stack([start - 0.5, stop + 0.5], axis=1) + left
         span[part] = np.where(whole[:, None], edges, span[part])
 
@@ -360,7 +361,7 @@ def _pixel_indices(
     view: tuple[float, float, float],
     shape: tuple[int, int],
 ) -> None:
-    """Compute the flat pixel index of each sample of a circle, negative off the detector, see `_samples`.
+    """Compute the flat pixel index of each sample of a circle, which is negative outside the detector.
 
     The first sample has the azimuth with the index `left`.
     """

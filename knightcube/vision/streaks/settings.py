@@ -39,13 +39,13 @@ class LikelihoodSettings:
         least_stars: minimum number of stars from which a rate is reported. Two stars determine a rate, but do
             not allow a check of their agreement.
         least_length: minimum median length of streaks from which a rate is reported, px.
-        least_significance: minimum ratio of a rate to its standard deviation, for the rate to be reported.
+        least_significance: minimum ratio of a rate to its standard deviation for the rate to be reported.
         worst_misfit: chi-square per degree of freedom above which a motion is rejected, provided that the
             residuals also exceed `worst_displacement`.
-        worst_displacement: largest accepted rms displacement across the streaks for a motion with a large
-            misfit, px.
-        worst_shaking: largest accepted vibration common to all streaks, as displacement across them (px) or
-            as relative change of brightness.
+        worst_displacement: largest rms displacement across the streaks, px, with which a motion is accepted
+            in spite of a large misfit.
+        worst_shaking: largest accepted vibration common to all streaks, as displacement across the streaks
+            (px) or as relative change of brightness along them.
         worst_uncertainty: largest accepted relative uncertainty (one standard deviation) of the rate from
             model errors.
         sign_sigmas: minimum significance (standard deviations) of the prior rate along the rotation axis, for
@@ -97,8 +97,8 @@ class LikelihoodSettings:
 def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
     """Return the accuracy of the pinhole camera that replaces a calibrated `lens` in the fit of streaks.
 
-    The fit does not model the lens distortion. The difference between lens and pinhole therefore counts as an
-    uncertainty of the pinhole.
+    The fit does not model the lens distortion. The difference between lens and pinhole is therefore included
+    in the uncertainty of the pinhole.
     """
     middle = 0.5 * (lens.columns - 1), 0.5 * (lens.rows - 1)
     square = math.hypot(*middle) ** 2 / lens.focal_length**2

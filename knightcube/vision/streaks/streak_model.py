@@ -22,8 +22,8 @@ following equation gives the change dm of the counts if a parameter displaces th
 
 In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
 per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with
-coefficients for each block of pixels. One basis image, the first moment of m along the path, accounts for
-derivatives that change along a block of pixels.
+coefficients for each block of pixels. One basis image is the first moment of m along the path. It describes
+derivatives that vary along a block of pixels.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
 instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
@@ -53,7 +53,7 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.path_pixels import LINES, Patches, Strips, path_distances, pixel_rows
 
-# Lower limit (px per exposure) of a star's speed in denominators.
+# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
 
 # Gauss-Legendre nodes and weights for one short segment of a star's path.
@@ -61,7 +61,7 @@ _SLOWEST = 1e-3
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
 # Length of a path segment for the quadrature, in point-spread widths.
 _PIECE_WIDTHS = 8.0
-# Distance from a patch, in point-spread widths, up to which starlight reaches the pixels of the patch.
+# Distance from a patch (point-spread widths) beyond which starlight does not reach the pixels of the patch.
 _BEYOND = 5.5
 # Number of instants at which a path with a changing rate is evaluated to divide it into segments.
 _SPOT_SAMPLES = 33
@@ -117,7 +117,7 @@ def _pieces(
     sigma: float,
     patches: Patches,
 ) -> FloatArray:
-    """Return times (n, p + 1) that divide the paths near the patches into p segments of equal length."""
+    """Return the times (n, p + 1) that divide each path near its patch into p segments of equal length."""
     n = len(stars)
     sampled = times[:, :1] + np.diff(times) * np.linspace(0.0, 1.0, _SPOT_SAMPLES)
     there = positions(pinhole, motion, np.repeat(stars, _SPOT_SAMPLES, axis=0), sampled.reshape(-1))
@@ -126,8 +126,8 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # The part of the path near the patch is extended by one sample at both ends.
-    # A path that is never near its patch of pixels is divided over the complete exposure.
+    # The part of the path near the patch is extended by one sample at both ends. If a path is never near its
+    # patch of pixels, the path over the complete exposure is divided.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -138,14 +138,14 @@ def _pieces(
     out = np.empty((n, count + 1))
     for star in range(n):
         part = slice(first[star], last[star] + 1)
-        # The small linear term keeps the path length strictly increasing for a star at rest.
+        # The small linear term makes the path length strictly increasing even for a star at rest.
         run = way[star, part] + 1e-6 * np.arange(last[star] + 1 - first[star])
         out[star] = np.interp(run[0] + share * (run[-1] - run[0]), run, sampled[star, part])
     return out
 
 
 def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the fractions (n, m, p) of a star's flux on p columns or rows of pixels, and two derivatives.
+    """Return the fractions (n, m, p) of the flux on p columns or rows of pixels, and two derivatives.
 
     Each of m Gaussians of standard deviation `sigma` (px) is centred on its `place` (n, m), in px along one
     axis. The fractions are differentiated with respect to the centre of the Gaussian (`place`) and its width
@@ -162,11 +162,12 @@ def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatAr
 IMAGES = 7
 """Number of images that are combined into the counts and derivatives of a block of pixels."""
 
-# Number of blocks computed at once, small enough for their pixels to fit into the processor's cache.
+# Number of blocks computed in one step, small enough for their pixels to fit into the processor's cache.
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths) along a path between a pixel and the crossing of its line.
+# Largest distance (point-spread widths), along a path, of a pixel from the point where the path crosses its
+# line.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in exposures.
 _STEP = 1e-4
@@ -185,8 +186,8 @@ def images(
 ) -> Float32Array:
     """Return images (b, IMAGES + more, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The argument `width` is the width w of the point spread, px. The last `more` images are left uninitialised
-    for the caller.
+    The argument `width` is the width w of the point spread, px. The last `more` images are not initialised;
+    the calling function sets them.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
@@ -207,8 +208,8 @@ def _draw_numpy(
 ) -> None:
     """Compute the basis images `out` (b, .., LINES, k) from the points at which paths cross lines of pixels.
 
-    The arrays `points` are those of `StarPaths.at_lines`. The two values `delay` are the exposure
-    delay from row to row and the row without delay.
+    The arrays `points` are those of `StarPaths.at_lines`. The argument `delay` contains two values: the
+    exposure delay from row to row, and the row without delay.
     """
     position, velocity, acceleration = points
     speed = np.maximum(np.hypot(velocity[0], velocity[1]), _SLOWEST)
@@ -237,9 +238,9 @@ def _draw_numpy(
 class _Crossings:
     """Points at which paths cross the lines of b blocks of pixels (b, LINES).
 
-    First pixels and steps are those of `Strips`. Position and unit tangent are arrays (b, LINES, 2). Time,
-    speed, acceleration along the path (`gained`) and curvature (`bend`) are arrays (b, LINES), and the time
-    at the centre of each block an array (b, 1).
+    The first pixels and the steps are defined in `Strips`. Position and unit tangent are arrays (b, LINES,
+    2). Time, speed, acceleration along the path (`gained`) and curvature (`bend`) are arrays (b, LINES), and
+    the time at the centre of each block an array (b, 1).
     """
 
     corner: IntArray
@@ -277,7 +278,7 @@ def _draw_part(out: Float32Array, lines: _Crossings, width: float, shutter: Shut
 
 
 def _endless(lines: _Crossings, count: int, width: float) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Return counts on the pixels of an endless streak, and the pixels' distances (px) across and along it.
+    """Return the counts of an infinitely long streak, and each pixel's distance (px) across and along it.
 
     All returned arrays have the shape (count, b, LINES) for b blocks with `count` pixels per line.
     """
@@ -308,7 +309,7 @@ def _endless(lines: _Crossings, count: int, width: float) -> tuple[Float32Array,
 
 
 def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Shutter, width: float) -> None:
-    """Limit the counts `out[:, 0]` of an endless streak to its exposure, and compute the images of its ends.
+    """Limit the counts `out[:, 0]` of an infinitely long streak to the exposure, and compute its end images.
 
     The array `along` (b, LINES, k) is the distance (px) of each pixel along the path from the centre of its
     block of pixels.
@@ -402,7 +403,7 @@ def _exponential(exponents: FloatArray, bits: IntArray, out: FloatArray) -> None
     """Compute the exponential `out` (k,) of non-positive exponents (k,), which are overwritten.
 
     The power of two is written as the exponent `bits` of `out`, which shares its memory with `bits`. The
-    relative error is below 1e-9. Exponents below -80 count as -80.
+    relative error is below 1e-9. Exponents below -80 are replaced by -80.
     """
     for k in range(len(bits)):
         exponent = max(exponents[k], -80.0)
@@ -429,7 +430,7 @@ def _endless_line(
     path: _Three,
     profile: _Three,
 ) -> None:
-    """Compute four values for each of `count` pixels on a line across an endless streak, from index `begin`.
+    """Compute four values for each of `count` pixels on a line across an infinite streak, from `begin`.
 
     The values are distance across the path, distance along the path from the centre of the block, exponent
     of the profile, and factor of the profile. Distances (px) across and along the path from the point at
@@ -454,7 +455,7 @@ def _endless_line(
 
 @loop_helper
 def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> None:
-    """Set the images of a block of pixels to those of an endless streak."""
+    """Set the images of a block of pixels to the images of an infinitely long streak."""
     for k in range(len(exponential)):
         out[0, k] = exponential[k] * pixels[3, k]
         out[3, k], out[4, k], out[5, k], out[6, k] = 0.0, 0.0, 0.0, 1.0
@@ -462,11 +463,11 @@ def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> Non
 
 @loop_helper
 def _from_end(pixels: FloatArray, pace: FloatArray, width: float, sign: float, later: float) -> None:
-    """Compute the distances `pixels[3]`, in widths, of a line of pixels from one end of the streak.
+    """Compute the distances `pixels[3]` (point-spread widths) of a line of pixels from one streak end.
 
-    The variable `sign` is 1 for the start and -1 for the stop of the exposure. The values `pace` are speed,
-    acceleration along the path, time, time from the centre of the block, and delay of the first pixel. The
-    delay increases by `later` from pixel to pixel.
+    The variable `sign` is 1 for the start and -1 for the stop of the exposure. The argument `pace` contains
+    the speed, the acceleration along the path, the time, the time from the centre of the block, and the delay
+    of the first pixel. The delay increases by `later` from pixel to pixel.
     """
     speed, gained, time, end = pace[0], pace[1], pace[2], -0.5 * sign
     shift = (time - pace[3] - end - pace[4]) * speed - 0.5 * gained * (time - end) ** 2

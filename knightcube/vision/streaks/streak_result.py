@@ -49,7 +49,7 @@ REASONS = {
     StreakStatus.SATURATED: "the frame is overexposed",
     StreakStatus.FROZEN: "the frame is the same as the previous one",
 }
-"""One-line reasons for a missing rate, for results without a more detailed reason."""
+"""One-line reasons for a missing rate, which are used if a result has no more detailed reason."""
 
 
 def no_rows(*shape: int) -> Callable[[], FloatArray]:
@@ -64,14 +64,14 @@ class FrameMotion:
     Attributes:
         status: outcome of the frame. With the status `rate`, the rate is known; with `ambiguous`, the rate is
             known except for its sign; otherwise no rate was found.
-        checksum: checksum of the pixels, which differs between any two exposures of a working sensor.
+        checksum: checksum of the pixels. Any two exposures of a working sensor have different checksums.
         exposure: exposure time, s.
         length: median length of the used streaks, otherwise of all streaks or regions found, px; NaN if none
             is found.
         endpoints: both ends (x, y) of each of the streaks found (found, 2, 2), px. If a rate was found, the
-            first ends of all streaks belong to the same instant. With the status `rate`, the first end of
+            first ends of all streaks correspond to the same instant. With the status `rate`, the first end of
             each streak is earlier than its second end.
-        used: whether each of the streaks found contributes to the rate (found,).
+        used: mask of the streaks that contribute to the rate (found,).
         rate: angular rate of the camera relative to the stars (3,), in camera axes, rad/s; None if unknown.
         covariance: covariance of `rate` (3, 3), rad^2/s^2; None if unknown.
         residual: rms error of the ends of the streaks, rad; NaN if unknown.
@@ -100,7 +100,7 @@ class FrameMotion:
         return int(np.count_nonzero(self.used))
 
     def reversed(self) -> Self:
-        """Return the time-reversed motion, with the opposite rate and exchanged streak ends."""
+        """Return the time-reversed motion, with the negative rate and swapped streak ends."""
         assert self.rate is not None
         return replace(self, rate=-self.rate, endpoints=self.endpoints[:, ::-1])
 
@@ -169,7 +169,7 @@ class MotionResult(FrameMotion):
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 
     def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
-        """Return the displacements (m, 2), px, of the stars `chosen` (m,) for a line time error of one sigma.
+        """Return the displacements (m, 2), px, of the stars `chosen` by a line time error of one sigma.
 
         The delay of a star is proportional to the distance of its row from `middle_row`. If the line time is
         exactly known, an empty array (0, 2) is returned.
@@ -181,7 +181,7 @@ class MotionResult(FrameMotion):
         return np.asarray((end - start) * delay)
 
     def reversed(self) -> Self:
-        """Return the time-reversed motion, with the opposite rate and the same acceleration."""
+        """Return the time-reversed motion, with the negative rate and the same acceleration."""
         return replace(
             FrameMotion.reversed(self),
             endpoint_covariance=self.endpoint_covariance[:, ::-1],

@@ -1,10 +1,10 @@
 """Covariance of the fitted rotation, including errors that the model does not describe.
 
-Photon noise gives a lower limit of the covariance. The covariance is increased by the scatter of the stars
+The covariance due to photon noise is a lower limit. The covariance is increased by the scatter of the stars
 beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
-all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves the ends
-of all streaks, and vibration of the body. The residuals at the streak ends and along the streaks limit the
-errors from point spread and vibration.
+all stars equally and therefore cause no scatter. The first is a point spread with an unexpected width or
+profile, which moves the ends of all streaks. The second is vibration of the body. The residuals at the streak
+ends and along the streaks limit the errors from point spread and vibration.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ _LEAST_SENSITIVITY = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """RMS displacement (px) of streaks that would explain the residuals of the fit.
+    """RMS displacement (px) of streaks, or of their ends, that would cause the residuals of the fit.
 
     Attributes:
-        shown: significant part of the displacement, after subtraction of two standard deviations of the
-            noise, px.
-        chance: upper limit of the displacement, one standard deviation above the measured value, px.
+        shown: significant part of the displacement, px, computed after two standard deviations of chi-square
+            are subtracted.
+        chance: upper limit of the displacement, px, computed from chi-square plus one standard deviation.
     """
 
     shown: float
@@ -82,7 +82,7 @@ def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement
 
 
 def _sensitive(left: StreakResiduals, change: Float32Array) -> BoolArray:
-    """Return which fitted pixels are sensitive to a `change` of the modelled counts."""
+    """Return which fitted pixels are sensitive to a displacement, given the `change` of their counts."""
     most = change.max(axis=(1, 2), keepdims=True, initial=0.0)
     return np.asarray((left.weight > 0.0) & (change > _LEAST_SENSITIVITY * most))
 
@@ -107,13 +107,13 @@ def _displacement(
     )
 
 
-# Instants, in exposure times from mid-exposure, at which paths with and without lens error are compared.
+# Instants (in exposures from mid-exposure) at which paths with and without lens error are compared.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
-# Lower limit (px per exposure) of a star's speed in denominators.
+# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
 # Indices of rate and star position among the parameters of `geometry.sensitivities`.
 _RATE_AND_POSITION = np.array([0, 1, 2, 6, 7])
-# Probability of correcting a calibration error although the camera has none.
+# Probability that a calibration error is corrected although the camera has none.
 _BY_CHANCE = 1e-5
 
 
@@ -125,7 +125,8 @@ class CalibrationCorrection:
         step: correction of the k fitted shared parameters (k,). The correction is 0 if the calibration errors
             are not significant.
         added: covariance (k, k) that calibration errors add to the covariance for an exactly known camera.
-        described: part of `added` (k, k) from calibration errors whose standard deviation is specified.
+        described: part of `added` (k, k) that is due to calibration errors with a specified standard
+            deviation.
         score: gradient of the log-likelihood of each star after the correction (n, k).
         error: most likely values of the m calibration errors, in standard deviations (m,).
     """
@@ -157,7 +158,7 @@ def correct(
         spread: variance of the scatter of the stars, relative to their noise.
         described: number of calibration errors whose standard deviation is specified.
         counted: calibration errors that the fit has already corrected, in standard deviations (m,). The
-            solved calibration errors are in addition to `counted`.
+            estimated calibration errors are in addition to the errors `counted`.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -187,8 +188,8 @@ def correct(
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
     """Return the covariance (k, k) due to calibration errors that have the information matrix `left` (m, m).
 
-    Each correction is assumed to have a standard deviation of its own size, because large displacements of
-    streaks are underestimated.
+    The standard deviation of each correction is assumed to equal the correction, because large displacements
+    of streaks are underestimated.
     """
     change = leading @ error
     return np.asarray(leading @ np.linalg.inv(left) @ leading.T + np.outer(change, change))
@@ -197,9 +198,9 @@ def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArr
 def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> FloatArray:
     """Return apparent rate changes (n, 3, m) of each star by calibration errors of one standard deviation.
 
-    The apparent rate changes are in rad per exposure. Exactly known calibration parameters are omitted, and
-    the line time of the shutter is last. A streak determines the position of its path perpendicular to the
-    path, and its ends determine the length.
+    The apparent rate changes are in rad per exposure. Exactly known calibration parameters are omitted. The
+    last of the m errors is that of the line time. A streak determines the position of its path perpendicular
+    to the path, and its ends determine the length.
     """
     errors = _error_root(camera)
     n = len(scene.stars)
@@ -278,7 +279,7 @@ _MOST_STARS = 10
 _STEP = 0.5
 # Margin (px) by which the examined path extends beyond the point at which the star is at rest.
 _BEFORE = 5.0
-# Length of the path examined for a reversal, relative to the length of the fitted path.
+# Ratio of the length of the path that is examined for a reversal to the length of the fitted path.
 _BEYOND = 1.9
 # Half width (px) of the band of pixels around a path that is examined for a reversal.
 _ASIDE = 3
@@ -294,7 +295,7 @@ _MOST_IMPROVEMENT = 100.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PathLight:
-    """Sums over the pixels of a streak from which chi-square follows for any intensity along its path.
+    """Sums over the pixels of a streak that determine chi-square for any intensity along its path.
 
     In these sums, d is the counts of a pixel, w the weight of the pixel, and g the point-spread profile
     across the path.
@@ -399,27 +400,31 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient iterations in the computation of the covariance.
 _CONJUGATE = 12
-# Largest number of stars that cannot be tested for agreement, and the resulting factor on the variance.
+# Largest number of stars for which a test of their agreement is impossible, and the factor by which the
+# variance is then increased.
 _UNCHECKED = (2, 4.0)
-# Relative difference between fitted and configured point-spread variance that is neglected.
+# Relative difference between fitted and configured point-spread variance below which it is neglected.
 _SAME_SPREAD = 0.02
-# Ratio of the streak ends' error to the root of fitted minus configured point-spread variance.
+# Ratio of the error of a streak end to the square root of the difference between the fitted and the
+# configured point-spread variance.
 _END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
-# Uncertainty of the streak ends, relative to the displacement that explains their residuals.
+# Ratio of the uncertainty of the streak ends to the significant displacement that explains their residuals.
 _END_SHOWN = 1.5
-# Uncertainty of streak ends, relative to the upper limit of the displacement from their residuals.
+# Ratio of the uncertainty of the streak ends to the upper limit of the displacement from their residuals.
 _END_CHANCE = 0.5
-# Ratio of the streak ends' error (px) to vibration common to all streaks (px across, or brightness).
+# Ratio of the error of the streak ends (px) to the vibration common to all streaks, given in px across the
+# streaks or as relative change of brightness.
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
-# Largest calibration error (standard deviations) at which the lens correction is converged.
+# Largest remaining calibration error (standard deviations) for which the lens correction has converged.
 _SMALL_ERROR = 0.2
-# Relative uncertainty of the rotation due to lens errors above which a lens correction is always tried.
+# Relative uncertainty of the rotation due to lens errors above which the lens is always corrected.
 _WORTHWHILE = 0.002
-# Ratio of covariance to noise covariance above which model errors must be the cause (three sigma).
+# Ratio of the covariance to the covariance from noise above which model errors must be the cause (three
+# sigma).
 _BEYOND_NOISE = 9.0
 
 
@@ -446,8 +451,8 @@ class RotationUncertainty:
 def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: StreakFit) -> RotationUncertainty:
     """Return the rotation over the exposure of the fit `whole`, with its uncertainty.
 
-    The argument `result` holds the stars of the fit. If faint stars are hidden in the streaks, the rotation
-    is taken from a fit of the brightest streaks with all their hidden stars.
+    The argument `result` contains the stars of the fit. If faint stars are hidden in the streaks, the
+    rotation is taken from a fit of the brightest streaks with all their hidden stars.
     """
     camera, whole, lens = _corrected_lens(camera, whole, result.exposure)
     brightest = brightest_fit(camera, whole)
@@ -458,7 +463,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if brightest is not None:
         lens = _lens_effect(camera, brightest, result.exposure, lens.counted)
     rotation = scene.motion.rotation + lens.step
-    # The error that led to the rejection of stars may also affect the accepted stars to a smaller degree.
+    # The cause of the rejection of some stars may also affect the accepted stars to a smaller degree.
     agreed = int(np.count_nonzero(scene.trusted))
     judged = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
     spread = max(result.misfit, lens.spread, 1.0) * max(judged / max(agreed, 1), 1.0)
@@ -471,7 +476,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
         _END_COMMON * max(common_motion.across, common_motion.along),
     )
     ends = float(np.sqrt(2.0) * end / result.length)
-    # The uncertainty of a fit that did not converge includes its last step.
+    # If the fit did not converge, the uncertainty includes its last step.
     covariance = noise * spread * (1.0 + last.last_step**2)
     # An error common to all streak ends changes the rotation angle.
     # The uncertainty of the rotation axis is assumed to equal that of the angle.
@@ -519,11 +524,11 @@ class _LensEffect:
 def _corrected_lens(
     camera: FitProblem, whole: StreakFit, exposure: float
 ) -> tuple[FitProblem, StreakFit, _LensEffect]:
-    """Return camera and fit after correction of the most likely lens errors, and the effect of other errors.
+    """Return camera and fit after a correction of the lens, and the effect of the remaining errors.
 
-    Lens errors that displace streaks far are underestimated. The fit is repeated with the corrected lens
-    until the correction is small. The lens is corrected if the stars show a lens error, or if the lens
-    contributes most of the uncertainty.
+    The estimates of lens errors that cause large displacements of streaks are too small. The fit is repeated
+    with the corrected lens until the correction is small. The lens is corrected if the stars show a
+    significant lens error, or if the lens errors cause most of the uncertainty.
     """
     first = lens = _lens_effect(camera, whole, exposure, None)
     if not lens.seen and np.trace(lens.described) < _WORTHWHILE**2 * np.sum(whole.scene.motion.rotation**2):
@@ -545,7 +550,7 @@ def _corrected_lens(
 def _lens_effect(
     camera: FitProblem, last: StreakFit, exposure: float, counted: FloatArray | None
 ) -> _LensEffect:
-    """Return how calibration errors of the camera change the rotation, beyond the errors already corrected.
+    """Return the effect on the rotation of calibration errors that have not yet been corrected.
 
     The fit has already corrected the calibration errors `counted` (m,), in standard deviations.
     """
@@ -587,11 +592,11 @@ def _scatter(equations: StarEquations, scene: StreakScene) -> float:
 
 
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
-    """Return the uncertainty (px) of streak ends if the true point-spread width differs from `sigma` (px).
+    """Return the uncertainty (px) of streak ends due to a point spread that may differ from the model.
 
-    If the residuals at the streak ends are not significant, the point spread has the modelled shape and the
-    same width along and across the streaks. Significant residuals at the streak ends indicate another shape
-    of the point spread, or a vibration too fast to be resolved, which shifts the apparent ends.
+    If the residuals at the streak ends are not significant, the point spread has the modelled profile, with
+    the same width along and across the streaks. Significant residuals at the streak ends indicate a different
+    profile of the point spread, or an unresolved fast vibration. Both shift the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described

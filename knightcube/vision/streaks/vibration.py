@@ -1,10 +1,10 @@
-"""Vibration of the camera, which displaces all streaks of a frame in common.
+"""Fit of a vibration of the camera, which displaces all streaks of a frame in common.
 
 A vibration displaces the stars across their paths and changes their speed, and thereby the intensity, along
-their paths. The residuals of a fit without vibration show both as functions of time. The vibration is
-modelled as a sum of few sinusoids of the camera's rotation vector. The first value of each frequency
-decreases chi-square most. Gauss-Newton steps improve frequencies and amplitudes, and between these steps the
-motion and the stars are fitted again.
+their paths. The residuals of a fit without vibration show both effects as functions of time. The vibration is
+modelled as a sum of few sinusoids of the camera's rotation vector. The initial value of each frequency is the
+trial frequency that decreases chi-square most. Gauss-Newton steps improve frequencies and amplitudes, and
+between these steps the motion and the stars are fitted again.
 
 In one time bin, the residuals depend linearly on 12 numbers: the rotation vector, its time derivative, and
 the rotation vectors at the start and the end of the exposure, which move the ends of the streaks.
@@ -25,7 +25,8 @@ from knightcube.vision.streaks.path_pixels import LINES
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Addition to the limit for another star's flux, relative to the brightest modelled pixel of the same line.
+# Addition to this threshold for another star's flux, relative to the brightest modelled pixel of the same
+# line.
 _FOREIGN_SHARE = 0.6
 
 
@@ -77,7 +78,7 @@ _SIGNIFICANT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class CommonMotion:
-    """RMS vibration common to all streaks, as deviation from the smooth model, or 0 if not significant.
+    """RMS vibration common to all streaks (deviation from the smooth motion), or 0 if not significant.
 
     Attributes:
         across: displacement of the streaks across their paths, px.
@@ -93,8 +94,8 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
 
     At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
     changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
-    bins of time. Only products of the residuals of different stars are summed, so that a neighbour of one
-    star has no effect.
+    bins of time. Only products of the residuals of different stars are summed, so that an unmodelled
+    neighbour of a single star has no effect.
     """
     if not len(left.star):
         return CommonMotion()
@@ -128,7 +129,7 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
     own = np.stack([np.bincount(cell, score[:, axis], size) for axis in (0, 1)], axis=-1)
     own = own.reshape(-1, _BINS, 2)
     known = np.bincount(cell, information, size).reshape(-1, _BINS)
-    # The weight of a star is limited by the star's own scatter, which includes model errors.
+    # The weight of a star is limited by the scatter of its residuals, which includes model errors.
     scatter = np.sum(own**2, axis=(1, 2)) / np.maximum(known.sum(axis=1), 1e-30)
     trust = 1.0 / np.maximum(scatter, 1.0)
     own, known = own * trust[:, None, None], known * trust[:, None]
@@ -141,9 +142,10 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
     return float(np.sqrt(common / weight))
 
 
-# Number of time bins, and their range in exposures from mid-exposure, for the fit of a vibration.
+# Number of time bins for the fit of a vibration, and half the time that they cover, in exposures.
 _FINE_BINS, _RANGE = 512, 0.56
-# Expected amplitude (px) of a vibration, and of the errors of position, rate and acceleration beside it.
+# Prior standard deviation (px) of the amplitude of a vibration, and of the errors of position, rate and
+# acceleration.
 _USUAL, _LOOSE = 1.0, 10.0
 # Lowest frequency of a vibration, and step between trial frequencies, in cycles per exposure.
 _LOWEST, _GRID = 0.75, 0.2
@@ -151,15 +153,16 @@ _LOWEST, _GRID = 0.75, 0.2
 _SHORTEST_WAVE = 6.0
 # Minimum decrease of chi-square by a sinusoid.
 _LEAST_GAIN = 60.0
-# Maximum number of sinusoids, and minimum difference of their frequencies, in cycles per exposure.
+# Maximum number of sinusoids, and minimum difference (cycles per exposure) between their frequencies.
 _MOST_SINUSOIDS, _LEAST_APART = 2, 1.0
-# Maximum number of Gauss-Newton steps, and the displacement (px) by a step below which the fit is converged.
+# Maximum number of Gauss-Newton steps, and displacement (px) by one step below which the fit has converged.
 _MOST_STEPS, _CONVERGED = 4, 0.02
 # Largest change of a frequency in one step, in cycles per exposure.
 _MOST_DETUNED = 0.3
 # Largest accepted amplitude of a vibration, px.
 _LARGEST = 2.5
-# Error of the rotation over the exposure, relative to the amplitude that the point spread averages out.
+# Ratio of the error of the rotation over the exposure to the amplitude that is lost by averaging over the
+# point spread.
 _LOST_SHARE = 2.0
 # Start and end of the exposure, in exposures from mid-exposure.
 _ENDS = np.array([-0.5, 0.5])
@@ -171,7 +174,8 @@ def fit_vibration(
     """Return `fit` with the vibration that its residuals show, or None if they show no vibration.
 
     The function `again` repeats the fit from a scene with a vibration, and returns None if it does not
-    succeed. An existing vibration of `fit` is improved. Returns None also for a vibration that is too large.
+    succeed. If `fit` already includes a vibration, this vibration is improved. Returns None also for a
+    vibration that is too large.
     """
     while True:
         vibration = fit.scene.motion.vibration
@@ -201,8 +205,8 @@ def fit_vibration(
 def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
     """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
 
-    The model of the streaks neglects that the point spread averages a vibration of short wavelength, which
-    also reduces the fitted amplitudes. The corresponding error of the streak ends is included.
+    The point spread averages a vibration of short wavelength. The model of the streaks neglects this effect,
+    which also reduces the fitted amplitudes. The corresponding error of the streak ends is included.
     """
     vibration = scene.motion.vibration
     if not vibration.exists or not len(left.star):
@@ -225,7 +229,7 @@ def _highest_frequency(camera: FitProblem, scene: StreakScene) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RotationSums:
-    """Normal equations of the rotation in b time bins; the first of two index pairs selects four rotations.
+    """Normal equations of four rotation vectors in each of b time bins.
 
     Attributes:
         time: middle of each bin (b,), in exposures from mid-exposure.
@@ -251,7 +255,7 @@ class _RotationSums:
 def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> _RotationSums:
     """Return the normal equations of a common rotation of the stars as a function of time.
 
-    The weight of a star is limited by the star's own scatter, which includes model errors.
+    The weight of a star is limited by the scatter of its residuals, which includes model errors.
     """
     time, star = left.time.reshape(-1), np.repeat(left.star, LINES)
     path = paths(camera.pinhole, scene.motion, scene.stars[star], time)
@@ -283,7 +287,7 @@ def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals
     )
 
 
-# Lower limit (px per exposure) of a star's speed in denominators.
+# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
 
 
@@ -365,7 +369,8 @@ def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, Flo
     ]
     information, score = sums.normal_equations(np.concatenate(functions))
     n = 9 + 6 * k
-    # The last k parameters are the frequencies; their functions have the known amplitudes.
+    # The last k parameters are the changes of the frequencies. Their functions are scaled by the previous
+    # amplitudes.
     chosen = np.zeros((len(score), n + k))
     chosen[:n, :n] = np.eye(n)
     amplitudes = np.stack([vibration.sine, vibration.cosine])
@@ -378,7 +383,7 @@ def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, Flo
     step = np.linalg.solve(matrix, chosen.T @ score - prior * mean)
     sine, cosine = amplitudes + step[9:n].reshape(2, k, 3)
     detuned = np.clip(step[n:], -_MOST_DETUNED, _MOST_DETUNED)
-    # The change of the rotation over the exposure by each parameter.
+    # The derivative of the rotation over the exposure with respect to each parameter.
     over = np.concatenate(functions)[:, 0, 2:] @ np.array([-1.0, 1.0])
     rotation = np.kron(over, np.eye(3)) @ chosen
     total = rotation @ np.linalg.solve(matrix, rotation.T)
