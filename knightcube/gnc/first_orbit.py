@@ -1,4 +1,4 @@
-"""The orbit of an object from directions alone, fitted to all sightings from a satellite in a known orbit.
+"""Orbit determination of an object from directions alone, sighted from a satellite in a known orbit.
 
 The six unknowns at the middle of the arc are two angles of the direction, the relative velocity divided by
 the distance, and the logarithm of the distance. The sightings of one pass determine the distance poorly and
@@ -9,9 +9,9 @@ by the Gauss-Newton method, and all six unknowns of the best fit are then refine
 an orbit if the 95 % confidence interval of the distance, which follows from chi-square, is short. Gauss's
 method finds the same distance, but uses only three sightings and is therefore noisier.
 
-The forces are the gravity of a spherical Earth and J2. The directions of an object are compared with
-catalogue directions of stars, so light time and aberration shift the apparent direction according to the
-object's velocity relative to the Sun.
+The forces are the gravity of a spherical Earth and J2. The directions of an object are measured relative to
+catalogue directions of stars. Light time and aberration therefore shift the apparent direction according to
+the object's velocity relative to the Sun.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _STATE_STEPS = np.repeat([1.0, 1e-3], 3)
 def smoothed(
     times: FloatArray, states: FloatArray, sigma: FloatArray, middle: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the states (n, 6) of the orbit that fits measured positions best.
+    """Return the states (n, 6) of the orbit that best fits measured positions.
 
     The covariance (6, 6) of the state at the instant `middle` is returned too. The standard deviation of each
     position is `sigma` (n,), m, along each axis. The velocities of `states` are only the initial guess.
@@ -102,8 +102,8 @@ _NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
 _DEGREES_95 = 3.841
 """95 % quantile of chi-square with one degree of freedom."""
 _STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
-"""Steps of the six unknowns in central differences: direction (rad), velocity per distance (1/s), log
-distance."""
+"""Steps of the six unknowns in central differences: direction (rad), velocity divided by distance (1/s), and
+logarithm of the distance."""
 _LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
 """Longest Gauss-Newton steps of the five unknowns other than the distance, which keep poor hypotheses from
 diverging."""
@@ -114,7 +114,7 @@ not in free fall or that the sightings have larger errors than stated."""
 
 
 class ArcError(FlightError):
-    """Error raised if the sightings do not determine an orbit; the message gives the reason with values."""
+    """Error raised if the sightings do not determine an orbit; the message states the reason with values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,7 +244,7 @@ def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -
 
 
 class _ArcFit:
-    """The least-squares fit of an orbit to the sightings, for several hypotheses at once."""
+    """The least-squares fit of an orbit to the sightings, computed simultaneously for several hypotheses."""
 
     def __init__(self, seen: Bearings) -> None:
         self._seen = seen

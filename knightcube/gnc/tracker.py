@@ -23,9 +23,9 @@ for an object that moves along a great circle at a constant angular rate. The ad
 Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. The
 assignment in order of chi-square is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and
 Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A track is
-confirmed after m sightings in n frames if its angular rate differs from the rate of a star. Two unconfirmed
-tracks may share a sighting. A confirmed track is propagated without measurements while the object is not
-detected.
+confirmed after m sightings in n frames if its angular rate differs from the rate of the stars. Two
+unconfirmed tracks may use the same sighting. A confirmed track is propagated without measurements while the
+object is not detected.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class MotionModel:
     """The prior and the process noise of the objects' motion.
 
     Attributes:
-        rate: standard deviation of each component of the angular rate before the second sighting, rad/s.
-        closing: standard deviation of the ratio (range rate) / range before the second sighting, 1/s.
+        rate: initial standard deviation of each component of the angular rate, rad/s.
+        closing: initial standard deviation of the ratio (range rate) / range, 1/s.
         wander: noise density of the tidal acceleration divided by the range, 1/s^3. In a low orbit with the
             orbital rate n, the tidal acceleration divided by the range reaches 1.5 n^2 = 1.8e-6 1/s^2. With
             the default density, the errors of direction and rate agree with the covariance in passes with
@@ -97,8 +97,8 @@ class LineOfSightState:
         time_ns: time of the state.
         direction: unit vector (3,) to the object, ICRS.
         velocity: relative velocity (3,) divided by the range (z of the module's docstring), ICRS, 1/s.
-        covariance: covariance (6, 6) of direction and velocity; the variance of the direction along itself is
-            zero.
+        covariance: covariance (6, 6) of direction and velocity; the variance of the direction vector along
+            itself is zero.
     """
 
     time_ns: int
@@ -142,8 +142,8 @@ def begin(
 def tides(observer: FloatArray) -> FloatArray:
     """Return the gravity gradient (3, 3) 1/s^2 at a position (3,) m from the Earth's centre, ICRS.
 
-    To first order, the relative acceleration of two objects in free fall is this matrix times their relative
-    position.
+    To first order, the relative acceleration of two objects in free fall is the gravity gradient times their
+    relative position.
     """
     distance = float(np.linalg.norm(observer))
     up = observer / distance
@@ -155,7 +155,7 @@ def predict(
 ) -> LineOfSightState:
     """Return the line of sight propagated to `time_ns`. Raises ValueError for an earlier time.
 
-    The gravity gradient is `tide` (3, 3), 1/s^2, or None if unknown.
+    The argument `tide` (3, 3), 1/s^2, is the gravity gradient, or None if unknown.
     """
     step = (time_ns - state.time_ns) * 1e-9
     if step == 0.0:
@@ -173,7 +173,7 @@ def predict(
 
 
 def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> DirectionInnovation:
-    """Return the residual of a direction (3,) with covariance (3, 3) rad^2 from the predicted direction."""
+    """Return the residual of a direction (3,), with covariance (3, 3), rad^2, relative to the prediction."""
     basis = tangent_basis(state.direction)
     residual = basis @ direction / max(float(direction @ state.direction), 1e-3)
     observation = np.hstack([basis, np.zeros((2, 3))])
@@ -244,7 +244,7 @@ class TrackSettings:
             rad/s.
         coast: time after which a confirmed track without a sighting ends, s.
         maximum_tracks: largest number of tracks, including tentative tracks.
-        brightness: standard deviation of the brightness between sightings of one object, magnitudes.
+        brightness: standard deviation of the brightness of an object from sighting to sighting, magnitudes.
     """
 
     motion: MotionModel = field(default_factory=MotionModel)
@@ -417,7 +417,8 @@ class ObjectTracker:
     def _is_object(self, track: Track) -> bool:
         if track.history.bit_count() < self._settings.needed:
             return False
-        # The first two sightings determine position and rate, and later sightings test position and rate.
+        # The first two sightings of a track determine direction and rate, and later sightings test direction
+        # and rate.
         tested = 2 * (track.sightings - 1)
         if track.chi_square > bound(self._settings.missed, tested):
             return False

@@ -1,12 +1,12 @@
 """Allocation of a torque to the available coils, with the direction of the torque preserved.
 
 A dipole moment m causes the torque m x B, which has no component along the field B (Wertz 1978, section
-18.1). With three equal coils, the smallest dipole moment for a torque T normal to B is B x T / B^2. For any
-scalar lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed, lambda is
-chosen so that the failed coil needs no current, which is possible unless the axis of the failed coil is
-normal to the field. A requested torque that the coils cannot produce is projected onto the space of torques
-that the coils can produce. If a current exceeds its limit, all currents are scaled by one factor, which
-preserves the direction of the torque (the idea of CMU's Argus flight software).
+18.1). For three equal coils, the smallest dipole moment that produces a torque T normal to B is B x T / B^2.
+For any scalar lambda, the dipole moment m + lambda B causes the same torque as m. If one coil has failed,
+lambda is chosen so that the failed coil needs no current, which is possible unless the axis of the failed
+coil is normal to the field. If the coils cannot produce a requested torque, the torque is projected onto the
+space of torques that they can produce. If a current exceeds its limit, all currents are scaled by one factor,
+which preserves the direction of the torque (the idea of CMU's Argus flight software).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
 
 WEAKEST = 0.15
-"""Torque per unit current, relative to the strongest direction, below which a torque direction is discarded.
-A torque in such a direction would need the full current, and scaling would then reduce the torque in the
-other directions."""
+"""Torque per unit current below which a torque direction is discarded, relative to the direction with the
+largest torque per unit current. A torque in a discarded direction would need the full current, and scaling
+would then reduce the torque in the other directions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +49,14 @@ def allocate(
     free: FloatArray | None = None,
     resistance: FloatArray | None = None,
 ) -> Allocation:
-    """Return currents for a torque (3,) N m in a magnetic field (3,) T, body axes.
+    """Return the coil currents for a torque (3,), N m, in a magnetic field (3,), T, body axes.
 
     Column k of `dipoles` (3, n) is the dipole moment of coil k per ampere, m^2. The current limits of the
     coils are `limits` (n,), A, and the mask `available` (n,) marks the coils that may be used. The mask
-    `free` (3,) marks the axes about which the body can rotate; a suspension thread carries the torque about
-    the other axes. Of all currents that produce the torque, the currents with the least heat in the coil
-    resistances `resistance` (n,), ohm, are chosen. Without the argument `resistance`, the resistances are
-    assumed to be equal. Raises FlightError for an input that is not finite.
+    `free` (3,) marks the axes about which the body can rotate, because a suspension thread may prevent
+    rotation about the other axes. Of all currents that produce the torque, the currents with the least heat
+    in the coil resistances `resistance` (n,), ohm, are chosen. Without the argument `resistance`, the
+    resistances are assumed to be equal. Raises FlightError for an input that is not finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):

@@ -33,14 +33,15 @@ _NEWTON_STEPS, _EXACT = 60, 1e-9
 """Largest number of Newton steps for limited currents, and relative accuracy of the resulting dipole
 moment."""
 _SATURATED = 1e-4
-"""Weight of a coil at its limit in the Newton matrix, relative to a coil below its limit."""
+"""Weight in the Newton matrix of a coil at its current limit, relative to a coil below its limit."""
 
 
 def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None) -> FloatArray:
     """Return the magnetic field (3,), T, of a coil with the dipole moment `moment` (3,), A m^2.
 
-    The field is that at the vector `offset` (3,), m, from the coil's centre. A coil with an `area` (m^2) is a
-    circular loop (Biot-Savart law, summed over segments); without an area it is a point dipole.
+    The field is computed at the point with the vector `offset` (3,), m, from the coil's centre. If `area`
+    (m^2) is given, the coil is modelled as a circular loop (Biot-Savart law, summed over segments), and
+    otherwise as a point dipole.
     """
     size = float(np.linalg.norm(moment))
     axis = moment / size
@@ -145,7 +146,8 @@ class CoilMap:
     def currents(self, dipole: FloatArray) -> FloatArray:
         """Return the currents (n,), A, of least heat that produce a dipole moment (3,), A m^2.
 
-        More than three coils stay within their limits if the dipole moment is within `limits`.
+        The currents of more than three coils satisfy the current limits if the dipole moment is within
+        `limits`.
         """
         if self._strength is not None:
             return np.asarray(dipole / self._strength)
@@ -158,8 +160,9 @@ class CoilMap:
         """Return the currents (n,), A, of least heat within the limits that produce a dipole moment (3,).
 
         By duality, the currents are R^-1 D' y, clipped to the limits, for a vector y (3,) of Lagrange
-        multipliers. The multipliers maximise a concave function, whose gradient is the missing dipole moment.
-        The multipliers are found by Newton's method with a line search.
+        multipliers. The multipliers maximise a concave function, whose gradient is the difference between the
+        wanted and the produced dipole moment. The multipliers are found by Newton's method with a line
+        search.
         """
         limits, resistance = self.current_limits, self.resistance
 
@@ -212,11 +215,11 @@ class CoilMap:
         return self._strength is not None
 
     def error_covariance(self, gain: float | FloatArray, axes: float) -> FloatArray:
-        """Return the covariance (9, 9) of the matrix (row by row) from the commanded to the actual dipole.
+        """Return the covariance (9, 9) of the matrix, row by row, from commanded to actual dipole moment.
 
         The errors of the coils are independent and uniformly distributed. The largest relative error of a
-        coil's dipole is `gain`, equal for all coils or (n,). The largest misalignment of a coil's axis is
-        `axes` (rad) in each of two directions.
+        coil's dipole moment is `gain`, a single number for all coils or an array (n,). The largest
+        misalignment of a coil axis is `axes` (rad) in each of the two directions normal to the axis.
         """
         found: FloatArray = np.zeros((3, 3, 3, 3))
         gains = np.broadcast_to(gain, len(self.current_limits))

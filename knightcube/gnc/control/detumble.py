@@ -33,7 +33,7 @@ _NO_CURRENT: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True)
 class WindowSchedule:
-    """Durations (ns) of the phases of a window: settle and measure with coils off, then act."""
+    """Durations (ns) of the phases of a window: settle and measure (coils off), and act (coils driven)."""
 
     settle_ns: int
     measure_ns: int
@@ -94,10 +94,10 @@ class DetumblerSettings:
 
 
 def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> float:
-    """Return the best `share` for a body free in three axes in a field that rotates at `field_rate` rad/s.
+    """Return the best `share` for a free body in a field that rotates at `field_rate` rad/s.
 
-    The rate along the field can be removed only as the field rotates. With a gain above k = 2 Omega J, where
-    Omega is the rotation rate of the field, the spin aligns with the field and remains (Avanzini and
+    The rate along the field can be removed only while the field rotates. With a gain above k = 2 Omega J,
+    where Omega is the rotation rate of the field, the spin aligns with the field and remains (Avanzini and
     Giulietti 2012). Along an orbit the field rotates about twice per revolution of the satellite.
     """
     return min(2.0 * field_rate * schedule.period_ns * _SECOND, MAXIMUM_SHARE)
@@ -141,7 +141,7 @@ class Detumbler:
         self._before = self._field = self._rate = None
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether at `time_ns` the coils were off and their field had decayed."""
+        """Return whether the coils were off and their field had decayed at `time_ns`."""
         schedule = self._schedule
         phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
         inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
@@ -188,7 +188,7 @@ class Detumbler:
         return self._rate
 
     def _close_window(self) -> None:
-        """Average the samples of a window, and compute the rate from this and the previous mean field."""
+        """Average the samples of a window, and compute the rate from the last two mean fields."""
         if not self._samples:
             return
         time_ns = round(sum(time for time, _ in self._samples) / len(self._samples))

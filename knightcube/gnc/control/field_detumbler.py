@@ -2,18 +2,18 @@
 
 The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first
 until the field of the coils has decayed, then to measure the field. The driven phase between two pauses is
-short while the estimated rate is uncertain, as with the magnetometer alone. The filter
+short while the estimated rate is uncertain, for example with the magnetometer alone. The filter
 `knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
 rate and the rotation of the field in inertial axes. A gyro sample shows the rate along the field immediately.
 The momentum plan uses a predicted field. If the orbit is known, the field is predicted along the orbit.
 Without a known attitude, the predicted field is rotated so that its direction and its change agree with the
 measured field. Without a known orbit, the measured field is assumed to continue to rotate at the present
 rate. In an orbit near the equator, however, the field's direction only oscillates by some 20 deg. In contrast
-to B-dot control, a spin along the field is also removed, as soon as the field has rotated. The coils stay off
-until `TRUSTED` consecutive samples agree with the prediction of the filter and the standard deviation of the
-rate across the field is below `BOUNDED`. Until the coils are driven, samples outside the pauses are used as
-well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a
-restarted sensor may give only unusable fields.
+to B-dot control, this detumbler also removes a spin along the field as soon as the field has rotated. The
+coils stay off until `TRUSTED` consecutive samples agree with the prediction of the filter and the standard
+deviation of the rate across the field is below `BOUNDED`. While the coils stay off, samples outside the
+pauses are used as well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS`
+periods, because a restarted sensor may give only unusable fields.
 
 The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
 momentum h obeys h' = m x B, where m is the dipole moment and B the field. The equation h' = m x B contains
@@ -26,10 +26,11 @@ to at most r within the time T if and only if every vector y satisfies
 The minimum time is the smallest T for which every vector y satisfies this inequality, and the planned costate
 is the vector y for which both sides are equal. For the planned costate y, A(y) y is parallel to h, where A is
 the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The planned costate is found by iteratively
-reweighted least squares: the matrix A is computed with the last costate, and then the next costate from A.
-Momentum along the field can be removed only after the field has rotated. The minimum-time plan may first add
-momentum across the field, which is removed later. The plan leaves a residual momentum r, because the removal
-of the last momentum along a slowly rotating field would take most of the time.
+reweighted least squares: in each iteration, the matrix A is computed with the last costate, and the next
+costate is computed from A. Momentum along the field can be removed only after the field has rotated. The
+minimum-time plan may first add momentum across the field, which is removed later. The plan leaves a residual
+momentum r, because the removal of the last momentum along a slowly rotating field would take most of the
+time.
 
 If a body spins along the field, the minimum-time plan first accelerates the body about an axis across the
 field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy.
@@ -65,7 +66,7 @@ the mean limit of the body axes."""
 STEEP = 12.0
 """Gain of the dipole moment: a coil reaches the dipole limit where |B x y| (field B, costate y) exceeds its
 mean divided by this gain. The minimum-time plan would always saturate all coils, but noise of B would then
-reverse the coils wherever B x y is small."""
+reverse the coil currents wherever B x y is small."""
 FLAT = 0.02
 """Lower bound of |B x y| (field B, costate y), relative to its largest value, which keeps the weights of the
 iteration finite."""
@@ -78,8 +79,8 @@ class MomentumPlan:
     """A plan that removes the momentum in minimum time.
 
     Attributes:
-        costate: scaled costate y (3,), inertial axes, A m^2/T; zero for a body at rest. The commanded dipole
-            moment is -B x costate, clipped at the limit of each coil.
+        costate: scaled costate y (3,), inertial axes, A m^2/T, which is zero for a body at rest. The
+            commanded dipole moment is -B x costate, clipped at the limit of each coil.
         horizon: time until the body is at rest, s.
     """
 
@@ -90,7 +91,7 @@ class MomentumPlan:
 def momentum_plan(
     momentum: FloatArray, field: FloatArray, times: FloatArray, limit: float, rest: float
 ) -> MomentumPlan:
-    """Return the plan that reduces `momentum` (3,) N m s to `rest` N m s in minimum time.
+    """Return the plan that reduces the momentum (3,), N m s, to the magnitude `rest`, N m s, in minimum time.
 
     The predicted field after `times` (n,), s, is `field` (n, 3), T, in the inertial axes of the momentum. The
     mean dipole limit of the body axes is `limit`, A m^2. If the field prediction ends too early, the plan
@@ -179,7 +180,7 @@ def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     wanted = field / math.sqrt(float(field @ field))
     middle = first + wanted
     square = float(middle @ middle)
-    if square < 1.0:  # a prediction that is wrong by more than 120 deg is not corrected
+    if square < 1.0:  # a predicted direction with an error of more than 120 deg is not corrected
         return fields
     # The rotation is the product of two rotations by 180 deg, about the bisector and the final direction.
     halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
@@ -192,8 +193,9 @@ def aligned_to_change(
 ) -> FloatArray:
     """Return `fields` (n, 3) in the axes in which the present field and its change are known.
 
-    The fields are predicted after `times` (n,), s, in any inertial axes. The result begins with the direction
-    of `field` (3,), and rotates from there in the direction of the time derivative `change` (3,).
+    The fields are predicted after `times` (n,), s, in any inertial axes. The first field of the result has
+    the direction of `field` (3,), and the following fields rotate in the direction of the time derivative
+    `change` (3,).
     """
     soon = min(int(np.searchsorted(times, CHANGED)), len(times) - 1)
     predicted = _axes(fields[0], fields[soon] - fields[0])
@@ -299,8 +301,9 @@ class FieldDetumblerSettings:
         limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
         horizon: duration of the field prediction, about a quarter of an orbit, s.
         replan: time between momentum plans, s.
-        gentle: initial rate below which the upper bound of the rate is the initial rate, rad/s.
-        spin_up: ratio of the upper bound of the rate to the initial rate, for initial rates above `gentle`.
+        gentle: initial rate up to which the upper bound of the rate equals the initial rate, rad/s.
+        spin_up: ratio of the upper bound of the rate to the initial rate if the initial rate is above
+            `gentle`.
         slow: rate below which a body counts as detumbled, rad/s.
     """
 
@@ -374,7 +377,7 @@ class FieldDetumbler:
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether at `time_ns` the coils were off and their field had decayed."""
+        """Return whether the coils were off and their field had decayed at `time_ns`."""
         schedule = self._schedule
         if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
             return True
@@ -382,7 +385,7 @@ class FieldDetumbler:
         return time_ns >= self._begun_ns and schedule.settle_ns <= phase_ns < self._pause_ns
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
-        """Accept a field (3,) T measured at `time_ns`, or ignore it if the field of the coils disturbed it.
+        """Accept a field (3,), T, measured at `time_ns`, or ignore it if the coils disturbed the measurement.
 
         The rate (3,), rad/s, is measured by a gyro at the same time as the field. The sample may be older
         than the last command.
@@ -435,7 +438,7 @@ class FieldDetumbler:
 
     @property
     def next_pause_ns(self) -> int:
-        """Time (ns) of the next coil pause for a measurement of the field, as planned at the last command."""
+        """Time (ns) of the next coil pause for a field measurement, as planned at the last command."""
         return self._begun_ns + self._pause_ns + self._act_ns
 
     @property

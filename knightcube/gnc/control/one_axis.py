@@ -73,7 +73,7 @@ class CurrentCommand:
 
     @classmethod
     def without_authority(cls, error: float) -> CurrentCommand:
-        """Return the command of zero current for an angle at which the coil has no useful torque."""
+        """Return the command of zero current, for an angle at which the coil has no useful torque."""
         return cls(0.0, 0.0, False, False, error)
 
 
@@ -113,10 +113,10 @@ _MINIMUM_BRAKING = 0.05
 
 
 class LqTracker:
-    """The linear-quadratic tracker, which has no internal state.
+    """The linear-quadratic tracker of an angle, which has no internal state.
 
     Attributes:
-        error_gain, rate_gain: elements of the gain K for e (1/s^2) and for e' (1/s).
+        error_gain, rate_gain: elements of the gain K for the error e (1/s^2) and for its derivative e' (1/s).
     """
 
     def __init__(
@@ -208,7 +208,7 @@ _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
 _TIMEOUT = 60.0
-_REACH = 0.45  # modelled amplitude, relative to the angle bound; the true amplitude may be 1.4 times as large
+_REACH = 0.45  # modelled amplitude relative to the angle bound; the true amplitude may be 1.4 times as large
 _WEAK = 0.7  # fraction of the modelled torque that is assumed to be available for braking
 _SHORT_PULSE = 1.0
 
@@ -250,7 +250,7 @@ class ExcitationController:
     """A controller that repeats the excitation manoeuvres for as long as commands are requested."""
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: ExcitationSettings) -> None:
-        """Create the manoeuvres for a plant model that is commanded every `period` seconds.
+        """Create the manoeuvres for a plant model and a control period of `period` seconds.
 
         Raises UsageError if a value is outside its range.
         """
@@ -335,7 +335,7 @@ class ExcitationController:
 def manoeuvres(strength: float, reach: float, swing: float) -> tuple[Manoeuvre, ...]:
     """Return manoeuvres whose pulses of `strength` rad/s^2 rotate the body by up to `reach` rad.
 
-    A pulse of T seconds followed by an opposite pulse rotates a resting body by strength * T^2.
+    A pulse of T seconds followed by an opposite pulse rotates a body from rest to rest by strength * T^2.
     """
     out = math.sqrt(reach / strength)
     made = []

@@ -1,4 +1,4 @@
-"""The planning job that computes a table of the pointing law for a pointing target.
+"""The planning job that computes a pointing table (feedforward and feedback gains) for a pointing target.
 
 Field and torques are predicted along the orbit for a revolution and a quarter, because the gains at the end
 of the table depend on the following revolution. The pointing table covers a third of a revolution of the
@@ -9,9 +9,9 @@ From a distant attitude, the body can approach the commanded attitude by a slew 
 `slew_plan`, or `slew_vmc` on request, plans the slew with the disturbance torques that the attitude filter
 estimates. The planned dipole moments of the slew are used as feedforward. During the slew, the remaining slew
 is replanned from the newest estimates of motion, body and torques, with the present path as the initial guess
-(`rest_table`). The gains come from linear-quadratic tracking along the slew and the following attitude law,
-and errors at the end of the slew have the highest cost. The pointing table also contains the change of the
-dipole moment per change of the estimated torques.
+(`rest_table`). The feedback gains are computed by linear-quadratic tracking along the slew and the following
+attitude law, and errors at the end of the slew have the highest cost. The pointing table also contains the
+derivatives of the dipole moment with respect to the estimated torques.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ slew."""
 FINE = 5
 """Number of steps of a slew table per step of a pointing table, because a slewing body rotates faster."""
 TAIL = 300.0
-"""Duration (s) after the end of a slew that the computation of the feedback gains of the slew also covers."""
+"""Duration (s) after the end of a slew that is included in the computation of the feedback gains."""
 END = 2_000.0
-"""Weight (s) of errors at the end of a slew: an error at the end costs as much as the same error that lasts
-for this time. The weight is high because disturbance torques are poorly known before the slew, and the errors
-that they cause should be corrected by the end of the slew."""
+"""Weight (s) of errors at the end of a slew: an error at the end has the same cost as an equal error that
+lasts for this time. The weight is high because disturbance torques are poorly known before the slew, and the
+errors that they cause should be corrected by the end of the slew."""
 HOTTER = 1.1
 """Largest ratio of the coil heat of a new plan to that of the present plan, for the remaining slew. A plan
 with more heat would correct a deviation for which the remaining time is too short."""
@@ -101,7 +101,7 @@ at most by the second factor. The third value is the largest number of trials.""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewRequest:
-    """The parameters of slews into a pointing target.
+    """The parameters of slews to a pointing target.
 
     Attributes:
         seconds: requested duration of the slew, s; the slew takes longer if this duration is too short.
@@ -175,7 +175,7 @@ def slew(
     ahead: Ephemeris,
     fastest: float,
 ) -> SlewPath | None:
-    """Return a slew, slower than `fastest` rad/s, into the attitude law of a target, or None.
+    """Return a slew, slower than `fastest` rad/s, to the attitude law of a target, or None if none is found.
 
     The slew avoids the exclusion cones that do not contain the camera at the start, unless no such slew is
     found.
@@ -210,7 +210,7 @@ def _task(
     seconds: float,
     avoided: tuple[Cone, ...],
 ) -> SlewTask:
-    """Return the task of a slew of `seconds` s into the attitude law of a target."""
+    """Return the planning task of a slew of `seconds` s to the attitude law of a target."""
     limit = begin.limit if wish.limit is None else wish.limit
     craft = SlewCraft(begin.inertia, np.full(3, RESERVE * limit), wish.heat, wish.residual)
     law = end_law(target, axes, ahead, float(begin.times[0]))
@@ -276,7 +276,8 @@ def slew_table(
     times = np.asarray(first + step * np.arange(FINE * begin.kept + 1), dtype=float)
     wanted = references(law, ahead, times)
     flown = path.references(times[:count] - first)
-    # The residual dipole moment is added here because the pointing law subtracts the estimate in flight.
+    # The residual dipole moment is added to the table, because the pointing law subtracts the estimate in
+    # flight.
     dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual
     stop = count + round(TAIL / step)
     tracked = _joined(flown, wanted.until(stop + 1))
@@ -306,7 +307,7 @@ def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeR
 
 
 def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeReferences:
-    """Return the motion `then` with the first instants replaced by the instants of `first`."""
+    """Return the motion `then`, with its first instants replaced by those of the motion `first`."""
     count = len(first.times)
     return AttitudeReferences(
         then.times,
@@ -325,7 +326,7 @@ def _tracking(
 ) -> tuple[FloatArray, FloatArray]:
     """Return tracking gains (n, 3, 6), and dipole moments (n, 3, 9) per unit of each disturbance component.
 
-    The motion `tracked` (n + 1,) contains the slew, for which `dipole` is planned, and the time after it.
+    The motion `tracked` contains the slew, for which `dipole` is planned, and the motion after the slew.
     """
     count, steps = len(dipole), len(tracked.times) - 1
     times, step = tracked.times[:steps], float(tracked.times[1] - tracked.times[0])
@@ -378,7 +379,8 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
     wanted = references(
         law_of(job.target, job.axes, path.quaternion[-1], ahead, LEAD + path.horizon), ahead, times
     )
-    # The residual dipole moment is added here because the pointing law subtracts the estimate in flight.
+    # The residual dipole moment is added to the table, because the pointing law subtracts the estimate in
+    # flight.
     dipole = path.dipoles(times[:count] + 0.5 * step - LEAD) + wish.residual
     tracked = _joined(path.references(times[:count] - LEAD), wanted)
     gain, torque_part = _tracking(tracked, ahead, dipole, begin, job.weights)
@@ -427,7 +429,8 @@ _LONGEST = 10_000.0
 LEAD = 2.0
 """Time (s) between the estimated state and the start of the table, during which the table is computed."""
 FAR = math.radians(15.0)
-"""Angle (rad) from the attitude law above which the body slews to the law, if slews are configured."""
+"""Angle (rad) between attitude and attitude law above which the body slews to the law, if slews are
+configured."""
 WAY = 4.0
 """Duration of the initial guess of the approach, in time constants of the pointing law. The optimised path
 does not depend on the duration of the initial guess."""
@@ -437,8 +440,8 @@ does not depend on the duration of the initial guess."""
 class ObjectDirection:
     """The direction (3,) of an object, ICRS, at the time `since` (s after a job's origin).
 
-    The relative velocity of the object divided by the distance is `velocity` (3,), 1/s, and zero for a fixed
-    direction.
+    The vector `velocity` (3,), 1/s, is the relative velocity of the object divided by its distance, and zero
+    for a fixed direction.
     """
 
     direction: FloatArray
@@ -460,7 +463,7 @@ class PointingJob:
         sizes: estimated components (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
         areas: relative areas (3,) of the faces on which air and sunlight act.
-        slew: parameters of slews, or None if the body always approaches the attitude law without a slew.
+        slew: parameters of slews, or None if the body approaches every attitude law without a slew.
         running: the slew in progress whose remaining part is replanned, or None if a new path is planned.
         sight: the sighted object at which the body points instead of `target`, or None if it points at
             `target`.
@@ -489,7 +492,7 @@ class PointingJob:
 
 
 def prepare() -> None:
-    """Import the modules that plan slews, as the worker does before its first job."""
+    """Import the modules that plan slews, which the worker process does before its first job."""
     from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
 
 

@@ -35,7 +35,7 @@ LARGEST_RATE = math.radians(1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingCommand:
-    """Dipole moment that the pointing law commands, with the attitude and rate errors.
+    """Dipole moment that the pointing law commands, and the attitude and rate errors.
 
     Attributes:
         dipole: dipole moment (3,) within the coils' limit, A m^2.
@@ -110,14 +110,14 @@ def _cut(vector: FloatArray, longest: float) -> FloatArray:
 
 
 FAR = math.radians(15.0)
-"""Deviation (rad) from the path above which the body is damped."""
+"""Deviation (rad) from the planned path above which the body is damped."""
 LEAVING = math.radians(5.0)
-"""Deviation (rad) from the path above which a new path is planned."""
+"""Deviation (rad) from the planned path above which a new path is planned."""
 SLOW = math.radians(0.1)
 """Rate (rad/s) below which the damping ends; the orbital rate is 0.06 deg/s."""
 DAMPING_TIMEOUT = 180.0
-"""Time (s) after which the damping ends although the rate is not low. Removing momentum along the field would
-take a quarter of an orbit."""
+"""Time (s) after which the damping ends although the rate is not low. The removal of momentum along the field
+would take a quarter of an orbit."""
 DAMPING = 0.01
 """Bandwidth w of the damping torque, rad/s."""
 
@@ -144,7 +144,7 @@ class PathRecovery:
         self.ready = self.since is not None and (speed < SLOW or now - self.since > DAMPING_TIMEOUT)
 
     def planned(self) -> None:
-        """Return to path following, because a new path was planned."""
+        """End the damping and return to path following, because a new path was planned."""
         self.since, self.ready, self.leaving = None, False, False
 
 

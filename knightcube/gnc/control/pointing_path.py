@@ -18,7 +18,7 @@ The path minimises the squared rotation error relative to the attitude law plus 
 the predicted field and torques. The path obeys the full equations of motion and the limit of the coils. The
 path is found by iterative linear-quadratic sweeps (Li & Todorov 2004, ICINCO, and Tassa, Erez & Todorov 2012,
 IROS). Each sweep linearises the equations of motion about the last motion and simulates the corrected motion.
-Because coils cause no torque along the field, the first iterations from a large error would give tumbling
+Because coils cause no torque along the field, the first iterations from a large error would lead to tumbling
 motions. The first sweeps therefore allow a torque along the field, at a cost that is increased until this
 torque vanishes.
 """
@@ -58,7 +58,7 @@ class LinearErrorModel:
         by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2 for a
             dipole.
         by_torque: change of the errors (n, 6, 3) per N m of torque in each axis.
-        missing: torque f (n, 3) that the reference motion requires in addition to the modelled torques, N m.
+        missing: torque f (n, 3) that the reference motion needs in addition to the modelled torques, N m.
         field: magnetic field (n, 3) in the axes of the reference motion, T.
     """
 
@@ -216,19 +216,20 @@ RISES = (4.0, 2.0, 10.0)
 """Factors by which the cost of a torque along the field is increased from stage to stage. The factors are
 tried in turn until a path settles, because different factors lead to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
-"""Costs of a torque along the field, relative to the cost of the same torque across the field. The cost is
-increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
+"""Costs of a torque along the field, relative to the cost of the same torque across the field. The cost of a
+torque along the field is increased up to DEAR, and the last sweeps use the cost PROHIBITIVE."""
 SETTLED = math.radians(20.0)
-"""Largest angle (rad) from the attitude law, in the second half of a path, for a path that has settled."""
+"""Largest angle (rad) from the attitude law in the second half of a path that counts as settled."""
 SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
-this number of sweeps, the best motion is used even without convergence."""
+this number of sweeps, the best motion is used even if the sweeps have not converged."""
 SAVED = (0.05, 2e-3)
 """Relative improvements of the cost by a sweep below which a stage ends. If a sweep improves the cost by less
 than the first value, the cost of a torque along the field is increased. If a sweep improves the cost by less
 than the second value, the sweeps at the largest cost end."""
 NEAR = math.radians(10.0)
-"""Angle (rad) from the attitude law up to which the first sweeps do not need a torque along the field."""
+"""Largest angle (rad) between the first motion and the attitude law at which the sweeps do not need a torque
+along the field."""
 EXCESS = 3e-5
 """Amount (rad/s) by which the body rate exceeds the rate limit at a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
@@ -381,9 +382,9 @@ def best_path(
 ) -> tuple[PlannedMotion, MotionGains]:
     """Return the best path from the first state of `initial` to the attitude law, with feedback gains.
 
-    The motion `initial` (n + 1,) is an initial guess that ends on the attitude law and need not be feasible
-    with coils. The computation takes 0.3 ms per instant and sweep. Raises PlanningError if the body rotates
-    too fast to be propagated.
+    The motion `initial` (n + 1,) is an initial guess that ends on the attitude law; the coils need not be
+    able to produce it. The computation takes 0.3 ms per instant and sweep. Raises PlanningError if the body
+    rotates too fast to be propagated.
     """
     rest = PlannedMotion(initial.quaternion, initial.rate, np.zeros((len(initial.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
@@ -471,7 +472,7 @@ def _swept(
 ) -> MotionGains:
     """Return the feedback gains about a motion.
 
-    If `given` is true, the attitudes and rates need not result from the controls of the motion.
+    If `given` is true, the attitudes and rates of the motion need not be consistent with its controls.
     """
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
@@ -541,7 +542,7 @@ def errors(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
 
 
 def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathCriterion) -> FloatArray:
-    """Return the weighted rotation errors (n + 1,), rad, relative to the attitude law."""
+    """Return the magnitudes (n + 1,), rad, of the weighted rotation errors relative to the attitude law."""
     turn, weights = errors(wanted, motion)[:, :3], criterion.state[:3, :3]
     squares = np.einsum("ni,ij,nj->n", turn, weights, turn)
     return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(weights)[-1]))

@@ -2,14 +2,15 @@
 
 The motion is found by multiple shooting with linear-quadratic steps. Each step is shortened until the step
 improves a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization,
-algorithm 18.3). In contrast to the sweeps of `pointing_path`, intermediate motions need not be feasible. The
-defect of a time step is the difference between the propagated state at the end of the step and the state at
-the next instant. The defects of all steps converge to zero during the iterations (Bock & Plitt 1984, IFAC 9th
-World Congress). Multiple shooting prevents errors from growing along a revolution. Without multiple shooting,
-errors could grow, because coils cause no torque about the field and the body may rotate by a large angle
-about the pointing axis. An iteration of multiple shooting takes 0.07 ms per instant. The motion is propagated
-by the midpoint rule, and the derivatives are those of this discrete rule. With derivatives of the continuous
-motion, the iteration would stall for bodies that rotate by degrees per time step.
+algorithm 18.3). In contrast to the sweeps of `pointing_path`, the intermediate motions of multiple shooting
+need not obey the equations of motion. The defect of a time step is the difference between the propagated
+state at the end of the step and the state at the next instant. The defects of all steps converge to zero
+during the iterations (Bock & Plitt 1984, IFAC 9th World Congress). Multiple shooting prevents the growth of
+errors along a revolution. Without multiple shooting, errors could grow, because coils cause no torque about
+the field and the body may rotate by a large angle about the pointing axis. An iteration of multiple shooting
+takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and the derivatives are those of
+this discrete rule. With derivatives of the continuous motion, the iteration would stall for bodies that
+rotate by degrees per time step.
 
 If multiple shooting fails or the motion exceeds the limit of the coils, the table contains the best path of
 the module `pointing_path` instead. The cost of an error at the end of the path is computed by a backward
@@ -140,7 +141,7 @@ DONE = math.radians(0.05)
 shooting also ends if an iteration improves the merit by less than the fraction SAVED."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Largest accepted sum of the weighted defects of a motion, divided by 1 + cost of the motion."""
+"""Largest accepted ratio of the sum of the weighted defects of a motion to 1 + cost of the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,7 +288,7 @@ def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> Pl
 
 LEAST_PART = 1.0 / 3.0
 """Minimum fraction of a table that is used if the remainder of the table is unusable. If the usable part of a
-new table is shorter, the previous table is kept."""
+new table is shorter than this fraction, the previous table is kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -300,8 +301,8 @@ class PointingWeights:
         dipole: dipole moment along one axis that has a cost of one, A m^2.
         fastest: rate above which the cost increases steeply while the body approaches the attitude law (see
             `pointing_path.EXCESS`), rad/s.
-        roll: rotation error with unit cost about the unit vector `axis` (3,), rad, if rotations about this
-            axis weigh less than other rotations.
+        roll: rotation error about the unit vector `axis` (3,) that has a cost of one, rad, if rotations about
+            this axis have a smaller weight than other rotations.
     """
 
     turn: float
@@ -342,11 +343,11 @@ class PointingTable:
         return float(np.linalg.norm(self.path.rate, axis=1).max())
 
     def below(self, fastest: float) -> PointingTable | None:
-        """Return the part of the table before the body rate reaches `fastest`, rad/s.
+        """Return the part of the table that ends before the body rate reaches `fastest`, rad/s.
 
         Returns None if this part is shorter than the fraction `LEAST_PART` of the table.
 
-        A table with a slew is never shortened, so the result is the whole table or None.
+        A table with a slew is never shortened, so the result is the complete table or None.
         """
         over = np.flatnonzero(np.linalg.norm(self.path.rate, axis=1) >= fastest)
         if not len(over):

@@ -4,14 +4,14 @@ The direction s of the Sun and the field B are measured in body axes, and propag
 the gyro rate. The control law demands the torque J (w^2 e - 2 z w rate), with bandwidth w, damping ratio z,
 and the rotation e from the body axis to the Sun. The coils can produce only the component of the demanded
 torque across the field (Lovera & Astolfi 2004, Automatica 40(8)). A torque about the direction of the Sun is
-therefore added, such that the sum has no component along the field. A torque about the Sun disturbs the
-pointing of the body axis least. Unless the field is normal to the direction of the Sun, both axes across this
-direction are controlled simultaneously, while the body may roll about the direction. The added torque about
-the direction of the Sun is reduced if the body rolls fast. The direction of the Sun is propagated through an
-eclipse (`PropagatedSun`). If the direction of the Sun is unknown, the rate of the body is only damped. The
-residual dipole moment, which causes the largest torque on a light body, is estimated and cancelled
-(`ResidualDipole`). The coils are off while the field is measured. The coils are driven only after the fields
-measured in two consecutive pauses agree.
+therefore added so that the total torque has no component along the field. A torque about the Sun direction
+disturbs the pointing of the body axis least. Unless the field is normal to the Sun direction, both axes
+normal to this direction are controlled simultaneously, while the body may roll about the Sun direction. The
+added torque about the direction of the Sun is reduced if the body rolls fast. The direction of the Sun is
+propagated through an eclipse (`PropagatedSun`). If the direction of the Sun is unknown, the rate of the body
+is only damped. The residual dipole moment, which causes the largest torque on a light body, is estimated and
+cancelled (`ResidualDipole`). The coils are off while the field is measured. The coils are driven only after
+the fields measured in two consecutive pauses agree.
 """
 
 from __future__ import annotations
@@ -89,16 +89,18 @@ class PropagatedSun:
 RATE_GAIN, DIPOLE_GAIN = 0.1, 8e-4
 """Gains (1/s and 1/s^2) of the residual dipole observer, for time constants of 10 s and 2 min."""
 LONGEST_INTERVAL = 1.0
-"""Longest gap (s) between readings; after a longer gap the observer restarts from the measured rate."""
+"""Longest gap (s) between rate measurements; after a longer gap the observer restarts from the measured
+rate."""
 
 
 class ResidualDipole:
-    """An estimate of the residual dipole moment from the body rate, the measured field and the coils' dipole.
+    """An estimate of the residual dipole moment from the body rate, the field and the dipole of the coils.
 
-    A Luenberger observer predicts the rate from the dipole moments of coils and body and follows the measured
-    rate. The difference is attributed to a residual dipole moment across the field. The component along the
-    field becomes observable when the field rotates in body axes. Gravity-gradient and aerodynamic torques
-    across the field are also attributed to the residual dipole moment, and are therefore cancelled as well.
+    A Luenberger observer predicts the rate from the dipole moments of coils and body, and corrects the
+    prediction by the measured rate. The difference between measured and predicted rate is attributed to a
+    residual dipole moment across the field. The component along the field becomes observable when the field
+    rotates in body axes. Gravity-gradient and aerodynamic torques across the field are also attributed to the
+    residual dipole moment, and are therefore cancelled as well.
     """
 
     def __init__(self, inertia: FloatArray, bound: float | FloatArray) -> None:
@@ -258,7 +260,8 @@ class SunAcquisition:
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
         torque = torque + (speed**2 * seeking.inertia) @ _rotation_to_sun(seeking.axis, sun)
-        # A torque about the Sun, which disturbs the pointing least, cancels the torque along the field.
+        # A torque about the Sun direction, which disturbs the pointing least, cancels the torque along the
+        # field.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun
         return torque - spread * (float(field @ torque) / float(field @ spread))
@@ -277,7 +280,7 @@ class SunAcquisition:
 
 
 def _rotation_to_sun(axis: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the rotation vector (3,) from an axis to the Sun, shortened to at most one radian."""
+    """Return the rotation vector (3,) from an axis to the Sun direction, limited to one radian."""
     across = cross_product(axis, sun)
     sine = math.sqrt(float(across @ across))
     cosine = float(axis @ sun)

@@ -7,21 +7,21 @@ late measurement (module `replay`). The rate from a streaked image is the mean r
 filter therefore stores the attitude at the start of an exposure until the exposure ends. The filter can also
 estimate the age of the inertial unit's samples (module `mekf`). For a body that hangs on the testbed's
 thread, the filter uses only the component of each measurement about the thread. The torsion and the damping
-of the thread are known or estimated. The filter can distinguish the thread's torques from the estimated
-disturbance, because these torques depend on the angle and the rate.
+of the thread are either known or estimated by the filter. The filter can distinguish the thread's torques
+from the estimated disturbance, because these torques depend on the angle and the rate.
 
-The class `CommandCheck` checks with the gyro whether the coils carry the commanded currents. While a coil is
-broken, the model predicts an acceleration that does not occur. With a broken coil, the innovations of the
-gyro exceed their covariance within a few samples. While the coils work, the innovations of the gyro stay
-within their covariance. If the innovations exceed their covariance, the filter treats the coil currents as
-unknown and follows the gyro. The coil currents of the last half second before the detection are also treated
-as unknown. A change of the rate that no coil current can cause is not evidence of wrong coil currents,
-because the gyro may be faulty. The commands are trusted again when the rate follows the commands. The model z
-= b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate that the
-commands should cause. The commands are confirmed if the response g is well determined and is 1 within its
-uncertainty, and if the residuals are white. While the coils are not driven, the response is not determined,
-so the commands cannot become trusted again. If the gyro is noisier than assumed, the check widens its limits
-and does not raise an alarm.
+The class `CommandCheck` compares the gyro samples with the commands to check whether the coils carry the
+commanded currents. While a coil is broken, the model predicts an acceleration that does not occur. With a
+broken coil, the innovations of the gyro exceed their covariance within a few samples. While the coils work,
+the innovations of the gyro stay within their covariance. If the innovations exceed their covariance, the
+filter treats the coil currents as unknown and follows the gyro. The coil currents of the last half second
+before the detection are also treated as unknown. A change of the rate that no coil current can cause is not
+evidence of wrong coil currents, because the gyro may be faulty. The commands are trusted again when the rate
+follows the commands. The model z = b + g c is fitted to the gyro samples z of the last second, where c is the
+change of the rate that the commands should cause. The commands are confirmed if the response g is well
+determined and is 1 within its uncertainty, and if the residuals are white. While the coils are not driven,
+the response is not determined, so the commands cannot become trusted again. If the gyro is noisier than
+assumed, the check increases its limits and does not raise an alarm.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ _MAXIMUM_CHANGE = 3.0
 coils. A reversed coil causes twice the change of the rate, and the uncertain age of a sample adds to this."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
 """Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. If wrong
-currents were assumed to act for longer, they would explain any innovation after a long gap."""
+currents were assumed to act for a longer time, they could explain any innovation after a long gap."""
 _PROOF = 1.0
 """Time span (s) of the gyro samples that must confirm the commands before the commands are trusted again."""
 _SHARE_SIGMA = 0.2
@@ -85,9 +85,9 @@ _WHITE = 0.5
 which they count as white. The expected ratio is one for white noise (von Neumann 1941) and near zero for a
 drift."""
 _SCALE_OVER = 64.0
-"""Number of gyro samples over which the scale of the gyro noise is averaged."""
+"""Number of gyro samples over which the scale factor of the gyro noise is averaged."""
 _SHARE_ERROR = 0.15
-"""Deviation of the fitted response g from 1 that the error of the modelled coil gain can explain."""
+"""Largest deviation of the fitted response g from 1 that an error of the modelled coil gain can explain."""
 
 
 class CommandCheck:
@@ -201,7 +201,7 @@ class CommandCheck:
         return commanded[self._axes], natural[self._axes]
 
     def _variance(self, state: FilterState, rate: RateMeasurement) -> FloatArray:
-        """Return the variance of a gyro sample plus that of the rate due to the noise of the coils."""
+        """Return the variance of a gyro sample plus the variance of the rate due to coil noise."""
         model = self._model
         idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
         by_coils = 0.5 * _PROOF * model.noise.current * (idle.by_current**2).sum(axis=1)
@@ -213,8 +213,8 @@ class FilterSettings:
     """Noise and limits of the attitude filter.
 
     Attributes:
-        current_noise: standard deviation of the current of a driven coil, A; independent in each control
-            cycle.
+        current_noise: standard deviation of the current of a driven coil, A, which is independent from
+            control cycle to control cycle.
         control_period: duration of a control cycle, s.
         disturbance_walk: random walk of the unmodelled angular acceleration, rad/s^2 per sqrt(s).
         disturbance_start: initial standard deviation of the unmodelled angular acceleration, rad/s^2.
@@ -229,13 +229,13 @@ class FilterSettings:
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
         field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
-        rate_walk: random walk of the rate due to white torques other than those of the coils, rad/s per
+        rate_walk: random walk of the rate due to white torque noise other than that of the coils, rad/s per
             sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
         gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
             component by this many standard deviations.
         history_ns: largest delay of a measurement that is still used, ns.
-        longest_step: longest step of propagation, s; a slowly rotating body permits longer steps.
+        longest_step: longest propagation step, s; longer steps are suitable for a slowly rotating body.
     """
 
     current_noise: float
@@ -259,7 +259,7 @@ class FilterSettings:
 
 
 def free_axes(body: RigidBody) -> FloatArray:
-    """Return an array (3,) with 1 for the axes about which the body can rotate, and 0 for the others."""
+    """Return an array (3,): 1 for an axis about which the body can rotate, 0 for another axis."""
     return np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
 
 
@@ -309,7 +309,7 @@ def first_checkpoint(
     attitude: AttitudeMeasurement,
     rate: RateMeasurement,
 ) -> Checkpoint:
-    """Return the filter's first checkpoint, at the time of the later of the two measurements.
+    """Return the filter's first checkpoint, whose time is that of the later of the two measurements.
 
     For a suspended body, only the angle about the thread is used of the measured attitude.
     """
@@ -509,7 +509,7 @@ class AttitudeFilter:
 
     @property
     def doubts_commands(self) -> bool:
-        """Whether the coil currents are unknown because the motion contradicted the commands."""
+        """Whether the coil currents are treated as unknown because the motion contradicted the commands."""
         return self._check.active
 
     @property

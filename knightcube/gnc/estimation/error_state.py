@@ -1,12 +1,12 @@
-"""The error state of a Kalman filter as a declared list of blocks, with propagation and update.
+"""The error state of a Kalman filter as a list of blocks, with covariance propagation and update.
 
-The filters of the testbed (`attitude_filter`) and of the satellite (`free_filter`) are two lists of blocks.
-Both filters use the covariance propagation and the Kalman update of this module.
+The filters of the testbed (`attitude_filter`) and of the satellite (`free_filter`) declare two different
+lists of blocks. Both filters use the covariance propagation and the Kalman update of this module.
 
 Each block is a vector with a name, a prior covariance, a random walk and a role. An estimated block is
 corrected by measurements. A considered block (Schmidt 1966) is not corrected, but its uncertainty and its
 correlations enter the gains and the covariance of all other blocks. A fixed block is known exactly. The role
-of a block can therefore be changed without a change of the filter's equations.
+of a block can be changed without a change of the filter's equations.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class StateBlock:
 
     Attributes:
         name: name of the block, unique within the list.
-        prior: standard deviations (n,) or covariance (n, n) at the start.
+        prior: initial standard deviations (n,) or initial covariance (n, n).
         walk: standard deviations (n,) of the random walk per sqrt(s); a single number applies to all
             elements.
         role: treatment of the block.
@@ -65,7 +65,7 @@ class ErrorState:
         size: number of elements of the error state.
         prior: initial covariance (size, size), with zeros for fixed blocks.
         walks: variances (size,) of the random walks per second, with zeros for fixed blocks.
-        considered: flags (size,) of the elements of considered blocks, or None without such a block.
+        considered: flags (size,) of the elements of considered blocks, or None if no block is considered.
     """
 
     def __init__(self, blocks: Sequence[StateBlock]) -> None:
@@ -133,7 +133,7 @@ def updated(covariance: FloatArray, gain: FloatArray, cross: FloatArray, spread:
 def propagated(
     covariance: FloatArray, flow: FloatArray, seconds: float, density: FloatArray, walks: FloatArray
 ) -> FloatArray:
-    """Return the covariance (n, n) after a step of `seconds`, for dynamics of attitude and rate.
+    """Return the covariance (n, n) after a step of `seconds`, in which only attitude and rate have dynamics.
 
     The first six states are attitude and rate. The argument `flow` (6, k) contains the rows of the error
     dynamics F for attitude and rate, and the columns for the first k states. The spectral density of the

@@ -69,8 +69,8 @@ class FieldRateSettings:
         inertia_walk: random walk of the inertia, relative to its trace, per sqrt(s).
         gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
             component by this many standard deviations.
-        refusals: number of consecutively rejected measurements after which the filter restarts, or the gyro
-            is excluded.
+        refusals: number of consecutively rejected measurements after which the filter restarts (field
+            measurements) or the gyro is excluded (gyro measurements).
         gyro_sigma: assumed bound of the gyro bias per axis, rad/s.
         longest_gap: longest time between the samples that start the filter, s; longer gaps can hide a fast
             spin.
@@ -93,8 +93,8 @@ class FieldRateSettings:
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
     """Return the body rate (3,) rad/s that rotated the field `before` into `after`, both (3,) T in body axes.
 
-    The component of the rate along the field is not observable. The rate across the field is exact for a
-    steady rotation of less than half a revolution, and zero without a field.
+    The component of the rate along the field is not observable. The returned rate across the field is exact
+    for a steady rotation of less than half a revolution, and zero if a field is zero.
     """
     rotated = np.cross(after, before)  # in body axes, the field rotates opposite to the body
     length = float(np.linalg.norm(rotated))
@@ -159,7 +159,7 @@ class FieldRate:
 
     @property
     def rotation(self) -> FloatArray:
-        """Quaternion (4,) of the rotation from the body axes at the start into the present body axes."""
+        """Quaternion (4,) of the rotation from the initial body axes into the present body axes."""
         return np.array(self._rotation)
 
     @property
@@ -225,12 +225,12 @@ class FieldRate:
         return True
 
     def measure_rate(self, rate: FloatArray) -> None:
-        """Apply the present gyro rate (3,) rad/s if the gyro is more accurate than the filter.
+        """Apply the present gyro rate (3,), rad/s, if the gyro is more accurate than the filter.
 
-        The error of the gyro is mostly a bias, and frequent use of the gyro would reduce the covariance below
-        that bias. A gyro that contradicts the filter several times in a row is excluded until `restart`. The
-        gyro is also excluded if the field predictions fail after its rate was used. If the gyro contradicts
-        an estimate that used the gyro, the filter restarts.
+        The error of the gyro is mostly a bias, and frequent use of the gyro would reduce the standard
+        deviation of the rate below that bias. A gyro that contradicts the filter several times in a row is
+        excluded until `restart`. The gyro is also excluded if the field predictions fail after its rate was
+        used. If the gyro contradicts an estimate that used the gyro, the filter restarts.
         """
         settings = self._settings
         self._is_reset = False
@@ -323,7 +323,7 @@ class FieldRate:
         self._update_unexplained()
 
     def _set_inertia(self, error: FloatArray) -> None:
-        """Set the errors (6,) of the elements of the assumed inertia, relative to its trace."""
+        """Set the errors (6,) of the elements of the assumed inertia tensor, relative to its trace."""
         self._error = error
         self._inertia = self._assumed + self._trace * tensor(error)
         self._inverse: FloatArray = np.asarray(np.linalg.inv(self._inertia), dtype=float)
@@ -346,7 +346,7 @@ class FieldRate:
         self._rotation = compose(rotated, self._rotation)
 
     def _propagate_covariance(self) -> None:
-        """Propagate the covariance to the time of the state, linearised halfway between both times."""
+        """Propagate the covariance to the time of the state, linearised at the middle of the interval."""
         dt = self._pending
         if not dt or self._rate is None:
             return
@@ -360,7 +360,8 @@ class FieldRate:
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings
-        # The error of the gyroscopic torque is correlated while the body rotates by less than about a radian.
+        # The error of the gyroscopic torque remains correlated until the body has rotated by about one
+        # radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
         # The filter is linearised, so products of the errors of rate, inertia and field change act as noise.

@@ -1,23 +1,24 @@
-"""The navigation filter of a free satellite whose body and sensors are not exactly known.
+"""The navigation filter of a free satellite whose mass properties and sensor errors are not exactly known.
 
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
 gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
-module `attitude_filter` replays each late sample at its own time. This filter instead propagates a late
-attitude to the present with the present rate, and the innovation includes the error of that rate. The
-propagation with a constant rate is accurate for some seconds if the body rotates slowly enough for star
-images.
+filter of the module `attitude_filter` replays each late sample at the time of the measurement. This filter
+instead propagates a late attitude to the present with the present rate, and the innovation includes the error
+of that rate. This propagation with a constant rate is accurate for some seconds if the body rotates slowly
+enough for star images.
 
 Besides attitude and rate, the error state (see `error_state`) contains blocks for the errors of the
 satellite's description.
 
-The block `inertia` holds the errors of the inertia tensor, relative to the trace. Euler's equation is linear
-in the errors of the inertia tensor. A tumble about more than one axis shows the ratios of the moments and the
-principal axes (Psiaki 2005, JGCD 28(4)). The common scale of the inertia is observable only relative to the
-dipole moment of the coils.
+The block `inertia` contains the errors of the inertia tensor, relative to the trace. Euler's equation is
+linear in the errors of the inertia tensor. In a tumble about more than one axis, the ratios of the moments of
+inertia and the principal axes are observable (Psiaki 2005, JGCD 28(4)). The common scale of the inertia is
+observable only relative to the dipole moment of the coils.
 
-The block `coils` is the matrix of gains and misalignments of the coils. The estimated dipole is the commanded
-dipole plus the product of the matrix in block `coils` and the commanded dipole. The blocks `gyro_matrix` and
-`field_matrix` hold scale factors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
+The block `coils` is the matrix of gain errors and misalignments of the coils. The estimated dipole is the
+commanded dipole plus the product of the matrix in block `coils` and the commanded dipole. The blocks
+`gyro_matrix` and `field_matrix` contain the scale factor errors and misalignments of gyro and magnetometer
+(Pittelkau 2001, JGCD 24(6)).
 
 The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
 accurately than the attitude of the body, because the misalignment of the star camera adds to the uncertainty
@@ -28,7 +29,7 @@ Gauss-Markov process with a long correlation time.
 Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
 sunlight, and the components of the disturbance torques of `knightcube.astro.earth.disturbance`.
 
-The block `field_error` is the error of the field model. The error of the field model keeps its sign for
+The block `field_error` is the error of the field model. The error of the field model is correlated over
 minutes, and is modelled as a Gauss-Markov process of first order in body axes. While the attitude is known
 accurately, the standard deviation of the field model's error is estimated by expectation maximisation
 (Dempster, Laird & Rubin 1977), from the square and the variance of the estimated error.
@@ -151,7 +152,7 @@ class FreeMotion:
     def correct(self, error: FloatArray) -> None:
         """Set the inertia to the assumed inertia plus an error.
 
-        The error (6,) holds the elements xx, yy, zz, yz, zx and xy of a tensor, relative to the trace.
+        The error (6,) contains the elements xx, yy, zz, yz, zx and xy of a tensor, relative to the trace.
         """
         if np.array_equal(error, self._error):
             return
@@ -245,7 +246,7 @@ class FreeFilterSettings:
         torque: expected magnitude and random walk of the aerodynamic torque, N m. The expected magnitudes of
             the solar radiation torque and of the constant torque are fixed fractions of `torque`.
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
-        coil_error: relative error of the coils' dipole, which varies over tens of seconds and adds to the
+        coil_error: relative error of the coils' dipole that varies over tens of seconds, in addition to the
             error of the constant coil matrix.
         coil_noise: density of the white noise of each coil's dipole while the coils are driven, A m^2
             sqrt(s).
@@ -253,13 +254,12 @@ class FreeFilterSettings:
             temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
             rate in rad/s. The random walk represents flexible parts, which Euler's equation of a rigid body
-            omits and which are loaded only while the body rotates. The random walk of the inertia keeps its
-            uncertainty from becoming too small.
+            omits and which are loaded only while the body rotates. The random walk of the inertia error
+            prevents its uncertainty from becoming too small.
         errors: largest errors of the description of body and sensors.
         coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; None for
             coils along the body axes, because their covariance follows from `errors`.
-        roles: roles of the blocks of the error state whose role differs from the default, by name of the
-            block.
+        roles: roles, by block name, of those blocks of the error state whose role differs from the default.
         rate_start: initial standard deviation of the rate, rad/s.
         fine, coarse: largest standard deviation about the least certain axis for the accuracy classes FINE
             and COARSE, rad.
@@ -378,8 +378,8 @@ class FreeFilter:
         driven: commanded dipole (3,) of the coils in body axes during the last step, A m^2.
         covariance: covariance (STATES, STATES) of the error state.
         field_error: standard deviation of the field model's error, T per axis.
-        changes: number of changes of the estimate so far. refused: number of measurements that did not pass
-            the gate. newest_square: normalised square of the newest innovation.
+        changes: number of changes of the estimate until now. refused: number of measurements that did not
+            pass the gate. newest_square: normalised square of the newest innovation.
     """
 
     def __init__(
@@ -437,7 +437,7 @@ class FreeFilter:
             self.widen(np.arange(SLOW.start, SLOW.stop))
             self.field_error = max(self.field_error, self._settings.field)
             self._reset_field()
-        # The first attitude and rate depend on misalignments, gyro bias and gyro matrix.
+        # The errors of the first attitude and rate depend on misalignments, gyro bias and gyro matrix.
         first = np.zeros((6, STATES))
         misaligned = CAMERA if by_stars else HORIZON
         self.quaternion = multiply(from_rotation_vector(-self._constants[misaligned]), quaternion)
@@ -529,7 +529,7 @@ class FreeFilter:
             covariance[COILS, COILS] += fresh
 
     def renew(self, at: slice, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
-        """Reset the block `at` of slow states (n,) to zero with a covariance (n, n).
+        """Reset the block `at` of slowly varying states (n,) to zero, with a given covariance (n, n).
 
         The estimate and its copies `memories` are changed. The reset is necessary when the block describes a
         different device, such as another magnetometer, or a different allocation of the currents to the
@@ -590,16 +590,16 @@ class FreeFilter:
         return _EYE + self._matrix(COILS)
 
     def description(self) -> dict[str, FloatArray]:
-        """Return the estimated parameters of body and sensors with standard deviations, by name.
+        """Return the estimated parameters of body and sensors, with their standard deviations, by name.
 
-        The inertia `inertia` (6,), kg m^2, holds the elements xx, yy, zz, yz, zx and xy of the tensor. The
-        entries `coils`, `gyro` and `field` (9,) are the matrices of coils, gyro and magnetometer, row by row.
-        The entry `camera` (3,), rad, is the rotation vector of the star camera's misalignment. The entries
-        `dipole` and `sunlit_dipole` (3,), A m^2, are the residual dipole in shadow and its increase in
-        sunlight. The name of each standard deviation ends with `_sigma`. The standard deviation of the
-        attitude of the star camera is `camera_attitude_sigma` (3,), rad; it is smaller than that of the
-        attitude of the body. The standard deviations of inertia and coils relative to the trace (`per_trace`)
-        are `inertia_ratio_sigma` and `coils_ratio_sigma`.
+        The entry `inertia` (6,), kg m^2, contains the elements xx, yy, zz, yz, zx and xy of the inertia
+        tensor. The entries `coils`, `gyro` and `field` (9,) are the matrices of coils, gyro and magnetometer,
+        row by row. The entry `camera` (3,), rad, is the rotation vector of the star camera's misalignment.
+        The entries `dipole` and `sunlit_dipole` (3,), A m^2, are the residual dipole in shadow and its
+        increase in sunlight. The name of each standard deviation ends with `_sigma`. The entry
+        `camera_attitude_sigma` (3,), rad, is the standard deviation of the attitude of the star camera, which
+        is smaller than that of the attitude of the body. The standard deviations of inertia and coils
+        relative to the trace (`per_trace`) are `inertia_ratio_sigma` and `coils_ratio_sigma`.
         """
         self.motion.correct(self._constants[INERTIA])
         sigma = np.sqrt(self.covariance.diagonal())
@@ -654,7 +654,8 @@ class FreeFilter:
             field = attitude_matrix(self.quaternion) @ around.field
             slope = cross_product(rate, field)
             rotation = self.motion.inverse @ cross_product(changed, field + 0.5 * seconds * slope)
-            # The field and the gyroscopic torque change during the step, so the time of each dipole matters.
+            # The field and the gyroscopic torque change during the step, so the effect of a dipole depends on
+            # its time within the step.
             change = self.motion.inverse @ cross_product(changed, slope)
             self.rate = self.rate + change + self.motion.stiffness(rate) @ rotation
             self.quaternion = multiply(from_rotation_vector(rotation), self.quaternion)

@@ -26,7 +26,7 @@ class _AtOneTime:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeMeasurement(_AtOneTime):
-    """A measured attitude (4,) from reference into body axes, with covariance (3, 3) rad^2 in body axes.
+    """A measured attitude (4,), reference to body axes, with covariance (3, 3), rad^2, in body axes.
 
     The flag `by_stars` is true for an attitude of the star camera, whose misalignment is not included in the
     covariance.

@@ -2,9 +2,10 @@
 
 The attitude error is a small rotation about the body axes (Lefferts, Markley and Shuster 1982). Each
 correction applies the estimated error to the quaternion and then rotates the covariance to the corrected
-axes, which is the reset of Markley and Crassidis 2014, section 6.2.4. The rate is a state driven by Euler's
-equation, because the plant model predicts it more accurately than the gyro measures it. Past attitudes that
-later measurements need are appended to the state (stochastic cloning, Roumeliotis and Burdick 2002).
+axes. This step is the reset of Markley and Crassidis 2014, section 6.2.4. The rate is a state of the filter
+that is propagated by Euler's equation, because the plant model predicts the rate more accurately than the
+gyro measures it. Past attitudes that later measurements need are appended to the state (stochastic cloning,
+Roumeliotis and Burdick 2002).
 
 The filter estimates the age that the inertial unit's samples have at their time stamps. A sample is older
 than its time stamp because of the delays of the serial line, the driver's buffer and the filters inside the
@@ -85,8 +86,8 @@ def rate_change(
 
     The arguments `before` and `after` are the accelerations one standard deviation of the age before and
     after the sample. The two accelerations differ if a coil command begins or ends between their times. Half
-    the difference of the accelerations and the product of the errors of age and acceleration are treated as
-    noise.
+    the difference of the two accelerations, and the product of the errors of age and acceleration, are
+    treated as noise.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
@@ -103,7 +104,7 @@ def rate_change(
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:
-    """Return innovation and Jacobian, corrected for age, of a quantity that changes by `change` per second.
+    """Return innovation and Jacobian, corrected for age, of a quantity with the time derivative `change`.
 
     The argument `more`, s, is the estimated age minus the assumed age that was subtracted from the time
     stamp.

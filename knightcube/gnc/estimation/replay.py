@@ -1,8 +1,8 @@
 """Replay of measurements in order of time, with histories of coil commands and filter checkpoints.
 
-After a late measurement is inserted, all later measurements are applied again. Applying one second of
-measurements takes longer than a control cycle. The work can therefore be spread over several cycles, during
-which the filter continues without the late measurement.
+After a late measurement is inserted, all later measurements are applied again. The application of the
+measurements of one second takes longer than a control cycle. The replay can therefore be distributed over
+several cycles, during which the filter continues without the late measurement.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ class Checkpoint:
     """A measurement, whether it passed the gate, and the state of the filter after its application.
 
     Attributes:
-        innovation: components of the innovation, in the unit of the measurement; empty for the first
-            checkpoint.
+        innovation: components of the innovation, in the unit of the measurement, or an empty tuple for the
+            first checkpoint.
         variance: covariance of the innovation, or None for the first checkpoint.
     """
 
@@ -123,7 +123,7 @@ class Checkpoint:
 
 
 class _Step(NamedTuple):
-    """A step of the propagation under one coil command, and the state and covariance after the step."""
+    """A propagation step under a single coil command, with the state and covariance after the step."""
 
     state: FilterState
     covariance: FloatArray
@@ -242,7 +242,7 @@ class Replay:
         found = innovation(state, measurement, model.body.suspended, change)
         weighed = weigh_innovation(found, covariance)
         used = 0.0 <= weighed.square <= model.gate[len(found.value)]  # a NaN does not pass
-        # The gain may be changed, because the covariance update is valid for any gain.
+        # The gain may differ from the optimal gain, because the covariance update is valid for any gain.
         if is_rate and model.noise.unknown_current and weighed.square > _RATE_ONLY[len(found.value)]:
             rate_gain = np.zeros_like(weighed.gain)
             rate_gain[RATE] = weighed.gain[RATE]
@@ -275,7 +275,7 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Extra length (ns) of the history before old checkpoints are dropped in a batch."""
+"""Additional length (ns) of the history at which old checkpoints are dropped in a batch."""
 _TIME = attrgetter("time_ns")
 
 

@@ -98,7 +98,7 @@ class RigidBody:
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
         dipole_per_ampere: dipole moment per current of each coil (turns times area), m^2.
-        field: magnetic field (3,) in reference axes if a command gives no other field, T.
+        field: default magnetic field (3,) in reference axes, for commands without a field, T.
         suspended: whether the body hangs on the thread and rotates only about its y axis.
         stiffness: nominal torsion stiffness k of the thread, N m/rad.
         damping: nominal damping constant c of the thread, N m s/rad.
@@ -215,12 +215,12 @@ class RigidBody:
 LONGEST_STEP = 0.025
 """Default of the longest propagation step (s), equal to the control period of the testbed."""
 _UNKNOWN_FOR = 0.3
-"""Correlation time (s) of an unknown coil current, for the white noise that models it. The correlation time
+"""Correlation time (s) of an unknown coil current, which is modelled as white noise. The correlation time
 exceeds the delay after which the guardian switches off the coils of a hung control loop."""
 
 
 class ProcessNoise(NamedTuple):
-    """Spectral densities of the process noise, and the largest current of a coil.
+    """Spectral densities of the process noise, and the assumed magnitude of an unknown coil current.
 
     `current` is the spectral density of the current noise of one driven coil, A^2 s. `rate` (3, 3),
     rad^2/s^3, is the spectral density of the unmodelled angular acceleration. The array `walks` (19,)
@@ -357,7 +357,7 @@ def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
 
 
 def tensor(elements: FloatArray) -> FloatArray:
-    """Return the symmetric tensor (3, 3) of the elements (6,) xx, yy, zz, yz, zx, xy."""
+    """Return the symmetric tensor (3, 3) with the elements (6,) xx, yy, zz, yz, zx, xy."""
     xx, yy, zz, yz, zx, xy = elements.tolist()
     return np.array(((xx, xy, zx), (xy, yy, yz), (zx, yz, zz)))
 
@@ -407,8 +407,8 @@ def _folded(quadratic: FloatArray) -> FloatArray:
 def per_trace(inertia: FloatArray, coils: FloatArray) -> FloatArray:
     """Return the Jacobian (15, 15) of inertia and coil matrix, both divided by the trace of the inertia.
 
-    The array `inertia` (6,) holds the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
-    assumed inertia. The array `coils` (9,) holds the matrix of the coils row by row. Only the ratios of
+    The array `inertia` (6,) contains the elements xx, yy, zz, yz, zx and xy, relative to the trace of the
+    assumed inertia. The array `coils` (9,) contains the matrix of the coils row by row. Only the ratios of
     inertia and dipole are observable from the motion of a satellite, because a body with twice the inertia
     and twice the dipole moves in the same way.
     """

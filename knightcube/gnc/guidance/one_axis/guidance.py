@@ -1,4 +1,4 @@
-"""Guidance about one axis: checks plans, follows the last accepted path and then holds the end attitude.
+"""Guidance about one axis, which checks plans, follows the last accepted path and holds its end attitude.
 
 A plan is rejected if it arrives late or out of order, contains values that are not finite, exceeds the
 limits, leads to another target, or does not start at the estimated state. The rejection states the reason. A
@@ -78,10 +78,10 @@ class PathGuidance:
     """The guidance that follows accepted paths towards the current target."""
 
     def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
-        """Create a guidance that checks plans against `plant` and the limits.
+        """Create a guidance that checks plans with the model `plant` and the acceptance rules.
 
         If `arrives` is true, paths must end at the target attitude, which is then held. If `arrives` is
-        false, later plans normally replace a path before its end, so the path may end elsewhere.
+        false, later plans normally replace a path before its end, so the path may end at another attitude.
         """
         self._plant = plant
         self._rules = rules
@@ -104,7 +104,7 @@ class PathGuidance:
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
-        """Set the target attitude and its rate, rad/s; the present path is followed until a plan is accepted.
+        """Set the target attitude and rate (rad/s); the present path is followed until a plan is accepted.
 
         Raises UsageError if a value is not finite or |target_q2| exceeds `AcceptanceRules.q2_limit`.
         """
@@ -140,7 +140,7 @@ class PathGuidance:
         estimate_rate: float,
         disturbance: float = 0.0,
     ) -> PlanVerdict:
-        """Follow `plan` from `origin_ns` if it satisfies the acceptance rules.
+        """Follow the path of `plan` from `origin_ns` on if the plan satisfies the acceptance rules.
 
         The arguments `angle` (rad) and `rate` (rad/s) are the estimated state at the start of the path. The
         current limit is checked for the estimated `disturbance` (rad/s^2).
@@ -220,7 +220,7 @@ class PathGuidance:
     def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:
         if not (math.isfinite(path.horizon) and path.horizon > 0.0):
             return f"not finite: its horizon is {path.horizon} s"
-        # The path is checked until just before the end, because a held attitude begins exactly at the end.
+        # The path is checked until just before its end, because the held attitude begins exactly at the end.
         times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
         angle, rate, acceleration = path.motion(times)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

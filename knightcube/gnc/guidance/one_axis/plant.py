@@ -15,11 +15,12 @@ with V = R Imax, which is dissipated in the coil. The cost R I^2 of Sease, eq. (
 current, which equals V |I| times the duty cycle.
 
 The motion is discretised by the pseudospectral method of Sease, eq. (5.8). The n nodes are -1, 1 and the
-roots of P'(x), where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact up to
-degree 2n - 3, and the differentiation matrix up to degree n - 1. A path is a single polynomial q2(t) of time.
-Angle, rate and acceleration follow exactly from q2 (Sease, eqs. (5.9) and (5.13), corrected), so the
-planner's limits also hold between the nodes. After the end of a path, the commanded motion holds the last
-attitude, or continues at the end rate up to the angle at which the coil has no torque.
+roots of P'(x), where P is the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact for
+polynomials of degree 2n - 3, and the differentiation matrix for polynomials of degree n - 1. A path is a
+single polynomial q2(t) of time. Angle, rate and acceleration follow exactly from q2 (Sease, eqs. (5.9) and
+(5.13), corrected), so the planner's limits also hold between the nodes. After the end of a path, the
+commanded motion holds the last attitude, or continues at the end rate up to the angle at which the coil has
+no torque.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def supply_power(current: FloatArray, voltage: float) -> FloatArray:
     """Return the power V |I|, W, that coils take from the supply.
 
     Args:
-        current: mean coil currents over a PWM period, of any shape, A.
+        current: mean coil currents over a PWM period, as an array of any shape, A.
         voltage: V. With the voltage across a driven coil (`coils.supply_voltage`), the result is the power at
             the coils. With the bus voltage before the H-bridge, the result is the power taken from the bus.
     """
@@ -49,11 +50,11 @@ def supply_power(current: FloatArray, voltage: float) -> FloatArray:
 
 
 def steady_heat(current: FloatArray, resistance: float | FloatArray) -> FloatArray:
-    """Return the heat R I^2 of steady currents, W; pulse-width modulated coils consume more.
+    """Return the heating power R I^2 of steady currents, W; pulse-width modulated coils consume more.
 
     Args:
         current: mean coil currents over a PWM period, A.
-        resistance: coil resistance, of a shape that broadcasts with `current`, ohm.
+        resistance: coil resistance, as a number or an array that broadcasts with `current`, ohm.
     """
     return np.asarray(resistance * current * current)
 
@@ -193,8 +194,8 @@ def current_and_slopes(
 
 
 _ROUNDED = 0.1
-"""Smoothing parameter e of |I| in the cost, relative to Imax. The cost uses sqrt(I^2 + e^2) - e instead of
-|I|, because the slope of |I| is discontinuous."""
+"""Parameter e of the smooth approximation of |I| in the cost, relative to Imax. The cost uses sqrt(I^2 + e^2)
+- e instead of |I|, because the slope of |I| is discontinuous."""
 
 
 class PathCost(StrEnum):

@@ -132,8 +132,8 @@ class HorizonSearch:
         The derivative of the minimum energy with respect to the duration equals the partial derivative at the
         optimal path (envelope theorem). A tried duration is a lower bound of the optimum if a longer duration
         reduces the total cost, and otherwise an upper bound. The next duration T is chosen as if the energy
-        were proportional to 1/T^3, which holds for a slew without limits. Only the last of the solved
-        programs imposes the limits of current and angle.
+        were proportional to 1/T^3, which holds for a slew without limits. Of the solved programs, only the
+        last program imposes the limits of current and angle.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -163,7 +163,7 @@ class HorizonSearch:
         return self.within(time, longest)
 
     def _at_requested(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
-        """Return a path over `asked` s instead of a slightly longer path, if a path over `asked` s exists.
+        """Return a path over `asked` s instead of a slightly longer path, if a path over `asked` s is found.
 
         The search for the shorter path starts from the longer path.
         """
@@ -244,8 +244,8 @@ NODES = 24
 1.1 times the shortest duration, and an extended duration is at most 1.5 % too long. With 16 nodes, planning
 takes half the time and an extended duration is at most 2.5 % too long."""
 FINE_NODES = 40
-"""Number of nodes for paths that reach the current limit near the requested duration. With 24 nodes the cost
-of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
+"""Number of nodes for paths that reach the current limit near the requested duration. The cost of these paths
+is up to 0.3 % above the optimum with 24 nodes, and up to 0.07 % with 40 nodes."""
 _NEARLY = 1.03
 """Largest extension factor of a duration after which a path of the requested duration is searched with more
 nodes."""
@@ -259,7 +259,7 @@ SHORTEST_WITH_TIME_COST = 1.0
 
 
 class PlanStatus(StrEnum):
-    """Whether a plan has the requested duration (OPTIMAL) or a longer one (STRETCHED).
+    """Whether a plan has the requested duration (OPTIMAL) or a longer duration (STRETCHED).
 
     If the duration has a cost, the status is OPTIMAL.
     """
@@ -282,8 +282,7 @@ class StepPlan:
         peak_current: largest absolute coil current along the path, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
-        nu: path control parameters (N,) of virtual motion camouflage, relative to the prey path over
-            `horizon`.
+        nu: path control parameters (N,) of virtual motion camouflage, for the prey path over `horizon`.
         node_times: (N,) s.
         node_q2: (N,).
     """
@@ -557,8 +556,8 @@ def plan_step(
         end_rate: body rate at the end, rad/s.
         time_cost: cost of time, W. If a cost is given, the duration is optimised for minimum energy plus
             `time_cost` times duration. If it is None, the duration is fixed.
-        minimise: "heat" to minimise the integral of R I^2, or "supply" to minimise the integral of V |I|,
-            which is the energy taken from the supply with pulse-width modulation.
+        minimise: "heat" minimises the integral of R I^2, and "supply" minimises the integral of V |I|, which
+            is the energy taken from the supply with pulse-width modulation.
         nodes: number of nodes of the path, 8 to 40.
         max_stretch: largest ratio of the duration to `horizon`.
 

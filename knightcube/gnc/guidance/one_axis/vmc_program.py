@@ -66,8 +66,9 @@ class Discretisation:
 
     Attributes:
         rule: the N nodes.
-        cost: evaluation matrices on the 2 N nodes on which the energy is integrated. With only N nodes, the
-            optimiser would exploit the quadrature error, because I^2 has about twice the degree of the path.
+        cost: evaluation matrices on the 2 N nodes on which the energy is integrated. With N instead of 2 N
+            nodes, the optimiser would exploit the quadrature error, because I^2 has about twice the degree of
+            the path.
         cost_weights: quadrature weights (2 N,) of the energy, whose sum is 2.
         dense: evaluation matrices at the points at which limits are checked; like the extrema of polynomials,
             the points are denser towards the ends.
@@ -89,7 +90,8 @@ def discretisation(count: int) -> Discretisation:
     fine = lgl_rule(2 * count)
     dense = -np.cos(np.linspace(0.0, np.pi, DENSE_POINTS))
     slopes = rule.differentiation[[0, -1]]
-    # The nodes next to the ends change so that q' at the ends stays constant (Sease, eqs. (5.11), (5.12)).
+    # The values at the nodes next to the ends change so that q' at the ends remains constant (Sease, eqs.
+    # (5.11), (5.12)).
     next_to_ends = np.linalg.solve(slopes[:, [1, -2]], -slopes[:, 2:-2])
     free = np.zeros((count, count - 4))
     free[2:-2] = np.eye(count - 4)
@@ -231,7 +233,7 @@ class FreeHorizon:
 
 @dataclass(frozen=True, slots=True)
 class ImposedLimits:
-    """The m imposed limits: index on the dense grid, sign, and whether q2 or the current is limited."""
+    """The m imposed limits: index of the grid point, sign, and whether q2 or the current is limited."""
 
     index: IntArray
     sign: FloatArray
@@ -241,8 +243,8 @@ class ImposedLimits:
     def at(cls, chosen: BoolArray, ratios: FloatArray) -> ImposedLimits:
         """Return the limits to impose at the points that the mask `chosen` (2, dense) selects.
 
-        The first row of the mask selects limits of the current and the second row limits of q2. The signs of
-        `ratios` (2, dense) determine whether the upper or the lower limit is imposed.
+        The first row of the mask selects limits of the current, and the second row selects limits of q2. The
+        signs of `ratios` (2, dense) determine whether the upper or the lower limit is imposed.
         """
         row, index = np.nonzero(chosen)
         return cls(index, np.sign(ratios[row, index]), row == 1)
@@ -270,8 +272,8 @@ class PathProgram:
         # The ends of the path are given, so the margin to the limit of q2 is smaller if an end is close to
         # the limit.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
-        # Iterates of the optimiser may exceed |q2| = 0.707, where the computed current is infinite.
-        # A value of q2 above the limit is clamped, so that the current stays finite.
+        # Intermediate paths of the optimiser may exceed |q2| = 0.707, at which the computed current is
+        # infinite. A value of q2 above the limit is clamped, so that the current stays finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * family.grid.cost_weights
         self._bang = plant.resistance * plant.current_limit**2
@@ -358,7 +360,7 @@ class PathProgram:
         return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
 
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
-        """Return the path with the boundary states of the prey path that differs from it by `apart` (N,)."""
+        """Return the sum of the prey path and the difference `apart` (N,) on the nodes."""
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def from_prey(self, trial: Trial) -> FloatArray:
@@ -373,8 +375,9 @@ class PathProgram:
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
-        # If the start is the optimum, NLopt reports that rounding limits progress, which is not a failure.
-        # At an optimum, half the squared whitened gradient, which estimates the possible saving, is small.
+        # If the start is already the optimum, NLopt reports that rounding errors limit the progress, which is
+        # not a failure. At an optimum, half the squared gradient with respect to the whitened parameters is
+        # small; it estimates the energy that a further step could save.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
@@ -437,7 +440,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except SOLVER_STOPS:
-            # NLopt raises this error for trivial and infeasible problems, after a negligible line search.
+            # NLopt raises such an error for trivial and infeasible problems, after a negligible line search.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in CONVERGED
 

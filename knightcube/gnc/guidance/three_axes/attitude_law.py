@@ -10,7 +10,7 @@ about the first direction.
 The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
 `across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
 the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
-A free roll is the roll of the body when the attitude law begins.
+If the roll is free, the roll of the body when the attitude law begins is kept.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from knightcube.errors import UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
-"""Function from an ephemeris and times (n,) in s to unit vectors (n, 3), ICRS."""
+"""Function that returns unit vectors (n, 3), ICRS, for an ephemeris and times (n,), s."""
 DIFFERENCE = 1.0
 """Time step (s) of the central differences by which rate and acceleration are computed."""
 MINIMUM_SINE = 1e-3
-"""Smallest sine of the angle between the two directions; nearly parallel directions do not determine the
-roll."""
+"""Smallest permitted sine of the angle between the two directions, because nearly parallel directions do not
+determine the roll."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +129,8 @@ class AttitudeLaw:
 
 
 Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
-"""Function from an ephemeris and times (n,), s, to commanded attitudes (n, 4), such as an `AttitudeLaw`."""
+"""Function, such as an `AttitudeLaw`, that returns commanded attitudes (n, 4) for an ephemeris and times
+(n,), s."""
 
 
 def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
@@ -204,7 +205,8 @@ def free_roll(
 ) -> AttitudeLaw:
     """Return a law that aligns `axis` (3,) with `first` and keeps the roll of an attitude (4,) at `time`, s.
 
-    The roll is held inertially if the direction is inertially fixed, otherwise in the orbital axes.
+    The roll is constant in inertial axes if the direction is inertially fixed, and otherwise constant in the
+    orbital axes.
     """
     across = _any_across(axis)
     shown = attitude_matrix(quaternion).T @ across
@@ -254,8 +256,8 @@ def approach(
     """Return the commanded transition from an attitude (4,) and a body rate (3,), rad/s, to an attitude law.
 
     The transition lasts from `begin` to `end` s. The rotation vector relative to the attitude law is a
-    quintic polynomial of time, which starts with the body's relative rate and ends at zero rate. Raises
-    UsageError unless `end` is after `begin`.
+    quintic polynomial of time, which starts with the body's rate relative to the law and ends with zero rate.
+    Raises UsageError unless `end` is after `begin`.
     """
     if not end > begin:
         raise UsageError(f"an approach from {begin} to {end} s: the end must be after the start")
@@ -346,7 +348,7 @@ def law_of(
 def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
     """Return the functions for the direction of a goal and for the direction that defines zero roll.
 
-    The goal INERTIAL is defined by a quaternion and not by two directions.
+    The goal INERTIAL is not supported, because it is defined by a quaternion and not by two directions.
     """
     if target.goal is Goal.GROUND:
         return ground(*target.numbers), velocity

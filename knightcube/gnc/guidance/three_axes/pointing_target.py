@@ -1,4 +1,4 @@
-"""Pointing targets that a configuration or a command can give a satellite.
+"""Pointing targets of a satellite, which a configuration or a command can set.
 
 A target is an immutable value, which is used in configurations, packets and planning jobs. The module
 `attitude_law` computes the attitude law of a target.
@@ -18,7 +18,7 @@ _LENGTH = 1e-3
 
 
 class Goal(IntEnum):
-    """The pointing goals, with the values that represent them in the command packet.
+    """The pointing goals, with their numerical values in the command packet.
 
     The goals NADIR, VELOCITY and SUN have no arguments, INERTIAL has a quaternion, GROUND has latitude and
     longitude, and OBJECT has no arguments or right ascension and declination.

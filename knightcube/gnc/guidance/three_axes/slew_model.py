@@ -11,15 +11,15 @@ axes, and the aerodynamic and solar radiation torques c x A(q) v, which depend o
 the coils has no component along the field, so not every path is feasible. All derivatives are analytic,
 because A(q) v is a quadratic form of q whose second derivatives are twice Davenport's matrix.
 
-Paths are cubic Hermite curves (de Boor 1978, chapter IV), evaluated here because scipy.interpolate would take
-20 MiB of memory in each process that flies or plans a slew.
+Paths are cubic Hermite curves (de Boor 1978, chapter IV). This module evaluates the curves, because
+scipy.interpolate would need 20 MiB of memory in each process that executes or plans a slew.
 
 The end of a slew is either an attitude, which gives three equations, or the direction of a boresight with a
 free roll, which gives two equations. The body rate at the end gives three more equations. All end conditions
 are quadratic in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the
 Sun, that a body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon
-are computed along a predicted orbit. Times of a slew are relative to its start, which is `begin` s after the
-start of the ephemeris.
+are computed along a predicted orbit. Times of a slew are relative to the start of the slew, which is `begin`
+s after the start of the ephemeris.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class SlewEnvironment:
 
 
 EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
-"""Function from times (n,) in s after the start of a slew to the environment at these times."""
+"""Function that returns the environment at times (n,), s after the start of a slew."""
 
 
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
@@ -319,11 +319,11 @@ class SlewPath:
         return float(self.times[-1])
 
     def heat(self, weights: FloatArray) -> float:
-        """Return the heat (J) for heating powers per squared dipole moment (3, 3) or (3,), W/(A m^2)^2."""
+        """Return the heat (J) for heating powers (3, 3) or (3,), W/(A m^2)^2, per squared dipole moment."""
         return float(np.diff(self.times) @ mean_squares(self.dipole, heat_matrix(weights)))
 
     def since(self, time: float, nodes: int) -> SlewPath:
-        """Return the part of the path after a time (s), with that time as the new time zero."""
+        """Return the part of the path after a given time (s), which becomes the new time zero."""
         times = np.linspace(0.0, self.horizon - time, 2 * nodes + 1)
         found = self.references(np.minimum(time + times, self.horizon))
         dipole = self.dipoles(np.minimum(time + times, self.horizon))
@@ -332,7 +332,8 @@ class SlewPath:
     def references(self, times: FloatArray) -> AttitudeReferences:
         """Return the commanded motion at times (m,) s.
 
-        Before the start and after the end of the path, the body rests at the attitude of the nearer end.
+        Before the start of the path, the body rests at the first attitude, and after the end, at the last
+        attitude.
         """
         inside = np.clip(times, 0.0, self.horizon)
         turning = HermiteCubic(self.times, self.rate, self.acceleration)
@@ -385,7 +386,7 @@ class ConeConstraints:
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
-        """Widen the cones by `margin` at `times` (n,) s, because the path between two times is not checked.
+        """Set up cones widened by `margin`, because a path is checked only at `times` (n,), s.
 
         The margin (rad) is a scalar or an array (cones, n).
         """
@@ -421,7 +422,7 @@ class AttitudeEnd:
     def misses(self) -> tuple[FloatArray, FloatArray]:
         """Return the linear part (3, 4) and the quadratic part (3, 4, 4), in q, of the attitude error.
 
-        The error is the vector part of the product of q and the inverse of the target.
+        The attitude error is the vector part of the product of q and the inverse of the target quaternion.
         """
         v, s = self.quaternion[:3], self.quaternion[3]
         linear = np.concatenate([s * np.eye(3) + cross_matrices(v[None])[0], -v[:, None]], axis=1)
@@ -451,7 +452,7 @@ class BoresightEnd:
 
 End = AttitudeEnd | BoresightEnd
 EndLaw = Callable[[float], End]
-"""Function from the duration of a slew, s, to the end conditions of the slew."""
+"""Function that returns the end conditions of a slew for the duration of the slew, s."""
 
 
 class EndConditions:
@@ -532,7 +533,7 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
 
 NODES = 24
 """Default number of collocation intervals. Compared with 48 intervals, the heat of a slew differs by less
-than 0.1 % and the shortest duration by less than 0.6 %."""
+than 0.1 %, and the shortest duration of a slew by less than 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
@@ -555,7 +556,7 @@ class SlewTask:
             the requested duration is found.
         time_cost: weight of the duration in the cost, W. If the time cost is None, the duration is fixed; if
             it is MINIMUM_TIME, only the duration is minimised.
-        cones: exclusion cones that are avoided during the whole slew.
+        cones: exclusion cones that are avoided throughout the slew.
         nodes: number of collocation intervals.
     """
 
@@ -611,8 +612,8 @@ def check(task: SlewTask) -> None:
             raise PlanningError(
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
             )
-        # The cones move by some degrees during a slew.
-        # An end attitude deep inside a cone is therefore inside for every duration of the slew.
+        # The cones move by some degrees during a slew. An end attitude deep inside a cone is therefore inside
+        # the cone for every duration of the slew.
         if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
             clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
             if float(clearance[0]) >= -_DEEP:

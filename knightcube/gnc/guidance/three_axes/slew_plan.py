@@ -1,4 +1,4 @@
-"""The planner of three-axis slews with coils alone, for minimum energy, minimum time or a time cost.
+"""The planner of three-axis slews with magnetic coils alone, for minimum energy, minimum time or a time cost.
 
 Coils cause only torques normal to the magnetic field, so a path is planned together with the dipole moments.
 The whole motion is discretised by collocation and solved by an interior point method (`slew_program`), from
@@ -10,9 +10,9 @@ Newton matrix (multiple shooting with the chord method). The energy of a slew is
 coils, J. The planner is deterministic and has no side effects.
 
 The function `plan_order` plans a slew in orbit between two pointing targets, with a start inside a given time
-window. The direction of the field during the slew changes the energy of the slew by a factor of up to ten
-along an orbit. Slews with several start times are therefore planned on a coarse grid, and the best slew is
-planned again on the fine grid.
+window. The energy of a slew depends on the direction of the field during the slew, and varies by a factor of
+up to ten along an orbit. Slews with several start times are therefore planned on a coarse grid, and the best
+slew is planned again on the fine grid.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> t
 
 
 _DENSE = 16
-"""Number of times at which cones are checked between a node and the next midpoint of a path."""
+"""Number of times, between a node and the next midpoint of a path, at which cones are checked."""
 _ROOM = math.radians(0.005)
 """Minimum angle (rad) between camera axis and exclusion cone at the checked times. Between two checked times,
 the angle to a cone decreases by less than this minimum."""
@@ -128,7 +128,7 @@ the angle to a cone decreases by less than this minimum."""
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
 _ASTRAY = 1.05
-"""Assumed ratio of the dipole to the dipole limit for a path whose integration fails."""
+"""Ratio of the dipole to the dipole limit that is assumed for a path whose integration fails."""
 
 _ENDS = 9
 """Number of durations for which the error message checks whether the slew would end inside a cone."""
@@ -150,9 +150,9 @@ class SlewPlan:
         status: whether the requested duration was kept or extended.
         horizon_asked, horizon: requested and planned duration, s.
         energy: heat of the coils during the slew, J.
-        peak: largest ratio of a coil's dipole moment to the dipole limit.
-        clearance: smallest angle between the path and each exclusion cone, in the order of the task's cones,
-            rad.
+        peak: largest ratio of a component of the dipole moment to the dipole limit.
+        clearance: smallest angle between camera axis and each exclusion cone along the path, in the order of
+            the task's cones, rad.
         steps: total number of Newton steps of the search.
     """
 
@@ -294,7 +294,7 @@ LEAD = 2.0 * DIFFERENCE
 """Time (s) by which the ephemeris must begin before the earliest start of a slew and end after the latest
 end, because rates are computed by central differences."""
 WINDOW_RANGE = (0.0, 2e4)
-"""Permitted range of the length of the window of start times, s."""
+"""Permitted range of the duration of the window of start times, s."""
 _BEGINS = 12
 """Number of equal intervals into which the compared start times divide a window."""
 _COARSE = 12
@@ -311,7 +311,8 @@ class SlewOrder:
         axes: body axis that points to the targets, and body axis from which a roll is measured.
         camera: body axis (3,) that stays outside the exclusion cones.
         start: pointing target that is held until the slew begins; a free roll is set to zero.
-        goal: pointing target at the end; with a free roll, only the direction of the target counts.
+        goal: pointing target at the end; if its roll is free, only the direction of the target is an end
+            condition.
         horizon, longest: requested and longest permitted duration of the slew, s.
         window: length of the time interval in which the slew may begin, s.
         time_cost: weight of the slew duration in the cost, W (see `SlewTask`).
@@ -365,9 +366,9 @@ class OrderedSlew:
 def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedSlew:
     """Return the best slew that begins in the time window of `order`.
 
-    The window opens `first` s after the start of the ephemeris. The ephemeris must begin `LEAD` s before
-    `first`, and end `LEAD` s after the end of the longest slew. Raises PlanningError with the last reason if
-    no slew is found, and UsageError for a window out of range.
+    The window opens `first` s after the start of the ephemeris. The ephemeris must begin at least `LEAD` s
+    before `first`, and end at least `LEAD` s after the end of the longest slew. Raises PlanningError with the
+    last reason if no slew is found, and UsageError for a window out of range.
     """
     low, high = WINDOW_RANGE
     if not low <= order.window <= high:
@@ -440,7 +441,7 @@ def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: f
 
 
 def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArray, FloatArray]:
-    """Return the attitude (4,) and the body rate (3,), rad/s, that an attitude law commands at a time, s."""
+    """Return the attitude (4,) and the body rate (3,), rad/s, commanded by an attitude law at a time, s."""
     found = references(law, ephemeris, np.array([time]))
     return found.quaternion[0], found.rate[0]
 
@@ -482,7 +483,8 @@ def plan_slew(
         elements: two lines of the two-line element set of the orbit.
         time: UTC at the start of the slew or of the window, as a datetime without a time zone.
         start: pointing target that is held until the slew begins; a free roll is set to zero.
-        goal: pointing target at the end; with a free roll, only the direction of the target counts.
+        goal: pointing target at the end; if its roll is free, only the direction of the target is an end
+            condition.
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
             default is three times `duration`.

@@ -17,7 +17,7 @@ by the exclusion cones (cones, 2 k), for k intervals. The interior point method 
 (Mathematical Programming 106, 2006) with second-order corrections. The curvature test of Chiang and Zavala
 (Mathematical Programming, 2016) replaces the usual count of the negative eigenvalues of the Newton matrix.
 Without inequalities, the interior point method reduces to Newton's method. Far from a feasible point, the
-second derivatives of the equations lead to bad steps and are omitted (Gauss-Newton).
+second derivatives of the equations would cause unsuitable steps and are omitted (Gauss-Newton method).
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
 STEP = 31
 """Number of elements (unknowns and multipliers) of one interval."""
 WIDE = STEP + 10
-"""Number of elements that the equations of one interval involve, including the state and the dipole of the
+"""Number of elements on which the equations of one interval depend, including the state and the dipole of the
 next node."""
 EQUATIONS: IntArray = np.r_[10:17, 24:31]
 """Indices of the 14 multipliers of an interval among the 31 elements of the interval."""
 _BAND = 33
-_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, including the rows that pivoting fills
+_ROWS = 3 * _BAND + 1  # rows of LAPACK's band storage, including the rows for fill-in by pivoting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class BandLayout:
         start: indices (7,) of the multipliers of the start conditions.
         end: indices (ends,) of the multipliers of the end conditions.
         begins: indices (k + 1,) of the first element of each interval and of the last node.
-        places: indices of the elements of the flattened band matrix to which the intervals contribute.
+        places: indices, in the flattened band matrix, of the elements to which the intervals contribute.
         entries: indices, in the flattened matrix block of one interval, of the elements copied to `places`.
     """
 
@@ -152,7 +152,7 @@ _AXIS = np.arange(3)
 class Trajectory:
     """States (2 k + 1, 7) at nodes and midpoints, and dipoles (k + 1, 3) at nodes.
 
-    Times are in units of the slew's duration, and dipoles in units of `SlewDynamics`.
+    The unit of time is the slew's duration, and the unit of dipoles is that of `SlewDynamics`.
     """
 
     states: FloatArray
@@ -192,7 +192,7 @@ class LinearisedEquations:
 class Transcription:
     """The collocation equations of a slew of `scale` s from a start state (7,) on `count` intervals.
 
-    Dipoles are in units of `unit` A m^2, and times in units of `scale` s. The cost is the integral of m' W m
+    The unit of dipoles is `unit` A m^2, and the unit of time is `scale` s. The cost is the integral of m' W m
     for dipoles m and the matrix W of `weights` (3, 3).
     """
 
@@ -217,7 +217,7 @@ class Transcription:
         self._step = 1.0 / count
 
     def cost(self, at: Trajectory) -> float:
-        """Return the cost: the exact integral of the weighted squares of the dipoles."""
+        """Return the cost, which is the exact integral of the weighted squares of the dipoles."""
         return self._step * float(np.sum(mean_squares(at.dipoles, self.weights)))
 
     def remainders(self, at: Trajectory) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -348,7 +348,7 @@ class SlewLimits:
         return np.concatenate(found)
 
     def pull(self, at: Trajectory, weights: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of the sum of all inequalities g multiplied by `weights`."""
+        """Return the derivative (size,) of the sum of all inequality values g multiplied by `weights`."""
         layout = self.equations.layout
         result = np.zeros(layout.size)
         dipoles, cones = self._parts(weights, at)
@@ -439,8 +439,8 @@ class Iterate:
 class NewtonStep:
     """A Newton step: the changes of unknowns and multipliers (`change`) and of the dual variables (`dual`).
 
-    The attribute `off` contains the residuals g minus slack of the inequalities, and `factors` the factors of
-    the Newton matrix.
+    The attribute `off` contains the residuals of the inequalities (g minus slack), and `factors` contains the
+    factors of the Newton matrix.
     """
 
     change: FloatArray
@@ -463,7 +463,7 @@ class SlewProgram:
         """Return the factors of the Newton matrix of the smallest path change that removes the residuals.
 
         The matrix omits the second derivatives of the equations, because a matrix with these derivatives
-        hardly penalises large steps near a flat optimum. Raises PlanningError if the matrix is singular.
+        would permit large steps near a flat optimum. Raises PlanningError if the matrix is singular.
         """
         states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
         stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
@@ -496,7 +496,7 @@ class SlewProgram:
     def moved(
         self, point: Iterate, barrier: float, convex: float, error: float
     ) -> tuple[Iterate | None, float]:
-        """Return the next iterate and the next convexification; the iterate is None if no step is found."""
+        """Return the next iterate, or None if no step is found, and the next convexification."""
         lack = self.lack(point)[0]
         is_far = lack > _FAR
         minimum = _DAMPED * min(1.0, lack) if is_far else 0.0
@@ -527,7 +527,8 @@ class SlewProgram:
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
         change = factors.solve(right)
-        # The curvature d.H.d of the step d follows from H d + C' l = a, C d = b: it is a.d - b.l.
+        # The curvature d.H.d of the step d follows from H d + C' l = a and C d = b, and is equal to a.d -
+        # b.l.
         equal, primal = self._equal, self._primal
         bend = right[primal] @ change[primal] - right[equal] @ change[equal]
         if bend <= 1e-8 * min(convex, 1.0) * float(change[primal] @ change[primal]):

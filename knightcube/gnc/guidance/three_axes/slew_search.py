@@ -10,9 +10,10 @@ and other disturbance torques are neglected in the initial guesses. The random s
 in every call.
 
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
-(a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit. A
-guess with large constraint violations after some steps is deferred, because most such guesses never converge.
-If no path of the requested duration is found, a longer slew is shortened in steps (continuation).
+(a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit.
+If the constraint violations of a guess are large after some steps, the guess is deferred, because most such
+guesses never converge. If no path of the requested duration is found, a longer slew is shortened in steps
+(continuation).
 """
 
 from __future__ import annotations
@@ -58,14 +59,14 @@ WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 value)."""
 MET, _FLOWN_MET = 1e-2, 3e-3
 """Constraint violation below which an iterate that is not yet optimal is accepted as a warm start (first
-value), and as a path for the slew (second value). Early acceptance saves time, because many runs converge
-slowly. The final integration of the path removes the remaining violations."""
+value), and as a path for the slew (second value). Early acceptance saves computing time, because many runs
+converge slowly. The final integration of the path removes the remaining violations."""
 _STEPS_FREE = 25
 """Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
 """Stages of an iteration with all limits: the number of Newton steps of each stage, and the constraint
-violation above which the iteration is abandoned after the stage. The bound of the first stage stops half of
-the iterations that would fail, but only one in twenty of the iterations that would succeed."""
+violation above which the iteration is abandoned after the stage. The bound of the first stage abandons half
+of the iterations that would fail, but only one in twenty of the iterations that would succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,7 +185,7 @@ class SlewSolver:
         return found
 
     def found(self, descent: NewtonRun, maximum: int, enough: float = 0.0) -> SolvedPath | None:
-        """Return the path found within `maximum` more Newton steps, or None.
+        """Return the path found within `maximum` further Newton steps, or None.
 
         An iterate whose constraint violation is below `enough` is accepted before it is optimal.
         """
@@ -232,14 +233,14 @@ _ROOM = 0.03
 """Margin between a guess and an exclusion cone, as a difference of cosines."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
-"""Largest step of the mode amplitudes in an iteration of the momentum fit."""
+"""Largest change of the mode amplitudes in an iteration of the momentum fit."""
 _WEAK, _WEAK_END = 1e-3, 0.03
 """Heat of a mode below which the mode is discarded (first value), and singular value below which a direction
 of the end momentum is not controlled (second value). Both values are relative to the largest heat and to the
 largest singular value."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
-"""End error (rad) and depth inside a cone (as a difference of cosines) above which a guess is tried after all
-other guesses."""
+"""End error (rad), and depth inside a cone (as a difference of cosines), above which a guess is tried after
+all other guesses."""
 _SAME = 0.1
 """Relative difference of mode amplitudes below which two momentum curves count as equal."""
 
@@ -262,7 +263,8 @@ def guesses(
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
     found = []
     for states in fit.found():
-        # The smallest dipole is used that produces the component of the required torque across the field.
+        # The dipole is the smallest dipole that produces the component of the required torque across the
+        # field.
         still = motion.flow(states, np.zeros((len(states), 3)))
         wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
         field = motion.field(states[:, :4])
@@ -278,7 +280,7 @@ class _MomentumCurves:
     Attributes:
         base: momentum curve (n, 3) that leads to the attitude and rate at the end of the slew.
         modes: changes (d, n, 3) of the momentum curve that preserve both ends; an amplitude of one
-            corresponds to the torques of a rotation by about half a revolution.
+            corresponds to the torques that rotate the body by about half a revolution.
     """
 
     base: FloatArray
@@ -439,7 +441,7 @@ class HorizonContinuation:
     """Continuation of the paths of a task, with stepwise changes of duration, dipole limit or cones."""
 
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
-        """Create a continuation that starts no further step when the solver's `work` exceeds `budget`."""
+        """Create a continuation that ends when the solver's `work` exceeds `budget`."""
         self._task, self._solver, self._budget = task, solver, budget
         # Coarse paths from which no path on the fine grid was found.
         self._lost: set[tuple[float, float, float]] = set()
@@ -490,8 +492,8 @@ class HorizonContinuation:
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
         """Return a path for wider cones, found from a path that crosses cones between its points, or None.
 
-        The largest depths inside the cones between each two points are `depths` (cones, 2 nodes), rad. The
-        cones at the last point of the path are not widened.
+        The array `depths` (cones, 2 nodes), rad, contains the largest depth inside each cone between two
+        neighbouring points. The cones at the last point of the path are not widened.
         """
         wider = np.where(depths > 0.0, _CROSSED * depths + _BEYOND, 0.0)
         both = wider.copy()
@@ -583,8 +585,8 @@ class HorizonContinuation:
 
 
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
-"""Number of collocation intervals of each successive search, and its budget of work. No further guess is
-tried when the work, measured in Newton steps times intervals, exceeds the budget. A work of 1,000 takes about
+"""Number of collocation intervals of each successive search, and its budget of work. When the work, measured
+in Newton steps times intervals, exceeds the budget, no further guess is tried. A work of 1,000 takes about
 0.1 s. Ten intervals are too coarse for paths around exclusion cones, because coarse paths around cones differ
 too much from paths on the fine grid."""
 _WALKS = 1.8
@@ -638,8 +640,8 @@ class SlewSearch:
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
         """Return a path outside the cones that the path `found` crosses with the given depths, rad.
 
-        The `depths` (cones, 2 nodes) are those between neighbouring points of the path. Returns None if no
-        path is found or the path was corrected too often.
+        The array `depths` (cones, 2 nodes) contains the largest depth inside each cone between neighbouring
+        points of the path. Returns None if no path is found or the path was corrected too often.
         """
         self._widened += 1
         return self._walker.widened(found, depths) if self._widened <= _WIDENED else None

@@ -5,17 +5,17 @@ of the attitude relative to the middle of a prey path. Each parameter is x = r +
 p, a constant reference point r, and path control parameters v on N Legendre-Gauss-Lobatto nodes. Attitude and
 rate are given at both ends, so N - 4 path control parameters per axis are free.
 
-The needed torque follows from a path by inverse dynamics. Coils cause no torque along the magnetic field, so
-an equality constraint sets the component of the needed torque along the field to zero on all nodes. The
-dipole moment is that of least heat among the dipole moments that cause the needed torque, and the cost is the
+The torque that a path needs is computed by inverse dynamics. Coils cause no torque along the magnetic field,
+so an equality constraint sets the component of the needed torque along the field to zero on all nodes. Of all
+dipole moments that cause the needed torque, the dipole moment of least heat is used, and the cost is the
 heat. Limits of the dipole moment and exclusion cones are imposed at those quadrature points at which the
 previous solution exceeded a limit. When the dipole limit is reached, the planner does not reduce the largest
 component by adding a dipole moment along the field.
 
-The prey paths are the smooth rotation about the eigenaxis and the guesses of `slew_search`. A solution is
-corrected and integrated by `slew_plan` in the same way as a path of the collocation, without the optimiser of
-the collocation. Modified Rodrigues parameters are described by Schaub and Junkins, Analytical Mechanics of
-Space Systems, chapter 3.
+The prey paths are the smooth rotation about the eigenaxis and the guesses of `slew_search`. The module
+`slew_plan` corrects and integrates a solution in the same way as a path found by collocation, but the
+optimiser of the collocation is not used. Modified Rodrigues parameters are described by Schaub and Junkins,
+Analytical Mechanics of Space Systems, chapter 3.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ class ObservedPaths:
         return multiply(q, np.broadcast_to(self._middle, q.shape)), w, a
 
     def _needed(self, x: Numbers, drift: Numbers) -> Numbers:
-        """Return the values (m n, 4 + cones) of m paths (3, m n, 3) at the points.
+        """Return the values (m n, 4 + cones) of m paths (3, m n, 3) at the n points.
 
         The acceleration of a body without currents on these paths is `drift` (m n, 3).
         """
