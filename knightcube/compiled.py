@@ -38,7 +38,7 @@ _COMPILING = (
     f"({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []
-"""Functions that are called by loop forms and not yet compiled by numba."""
+"""Functions that loop forms call and that numba has not compiled yet."""
 
 
 class HotFunction(Generic[Parameters, Result]):
@@ -111,7 +111,7 @@ def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, 
 
 
 def in_use() -> bool:
-    """Return whether functions that are called for the first time use their compiled form."""
+    """Return whether functions called for the first time in this process use their compiled form."""
     return os.environ.get(_SWITCH, "1") != "0" and _numba_is_usable()
 
 

@@ -220,7 +220,7 @@ class AdaptiveController:
         self._model = None
 
     def _follow(self, wanted: PathSample, angle: float, rate: float) -> PathSample:
-        """Return the current motion of the reference model, and propagate the model by one period."""
+        """Return the present motion of the reference model, and propagate the model by one period."""
         w = self._settings.reference_bandwidth
         if w is None:
             return wanted

@@ -1,10 +1,11 @@
 """Attitude of a star camera by Delabie's image matching (AIM), mentioned in Michalski, section 3.4.
 
-Attitude estimation using image matching (AIM; Delabie, De Schutter & Vandenbussche, Journal of Guidance,
-Control, and Dynamics 36, 2013) projects the catalogue's stars into an image with a prior attitude. The
-rotation and translation that move this image onto the observed image with the least squared distances have a
-closed form. The rotation in the image is a rotation about the boresight, and the translation is a tilt of the
-boresight. The source thesis only names the method; the formulas of this module were derived independently.
+The method AIM (attitude estimation using image matching: Delabie, De Schutter & Vandenbussche, Journal of
+Guidance, Control, and Dynamics 36, 2013) projects the catalogue's stars into an image with a prior attitude.
+The rotation and translation that move the projected image onto the observed image with the least squared
+distances have a closed form. The rotation in the image is a rotation about the boresight, and the translation
+is a tilt of the boresight. The source thesis only names the method; the formulas of this module were derived
+independently.
 
 A tilt of the camera moves stars far from the boresight by more than stars at the boresight. The error of the
 closed form is therefore proportional to the error of the prior attitude and to the squared field angle. Each

@@ -103,7 +103,7 @@ def interpixel_response(image: FloatArray, neighbours: int) -> FloatArray:
 
 
 def _least_between(first: _Changes, second: _Changes) -> FloatArray:
-    """Return the minimum squared change (rows, columns) over the directions from one diameter to the next."""
+    """Return the minimum squared change (rows, columns) over the directions between two diameters."""
     r, r_second = first.squared, second.squared
     b = first.ahead * (second.ahead - first.ahead) + first.behind * (second.behind - first.behind)
     a = r_second - r - 2.0 * b

@@ -1,13 +1,14 @@
 """Mean body rate over one exposure from the ends of the star streaks (Sease, chapters 3 and 4, corrected).
 
 The order of the two ends of a streak is initially unknown. All stars rotate about a common axis a, so that
-a.(v2 - v1) = 0 for the end directions v1 and v2 of each streak. The axis, except for its sign, is the
-direction that is most nearly perpendicular to all chords v2 - v1. The sign of a.(v1 x v2) then determines the
-order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike a computation with the projected centre of
-rotation, the computation with unit vectors has no singularity. OLAE computes the rotation, and a median-based
-scale of the residuals rejects outliers. The "Combined Indicator" of Sease uses the standard deviation of the
-residuals, which outliers increase. A single frame cannot distinguish the rate omega from -omega, so that a
-prior rate must determine the sign.
+a.(v2 - v1) = 0 for the end directions v1 and v2 of each streak. The axis is determined, up to its sign, as
+the direction that is most nearly perpendicular to all chords v2 - v1. The sign of a.(v1 x v2) then determines
+the order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike a computation with the projected centre of
+rotation, the computation with unit vectors has no singularity. The rotation is computed by OLAE, and outliers
+are rejected by means of a robust, median-based standard deviation of the residuals. In contrast, the
+"Combined Indicator" of Sease uses the ordinary standard deviation of the residuals, which is increased by
+outliers. A single frame cannot distinguish the rate omega from -omega, so that a prior rate must determine
+the sign.
 """
 
 from __future__ import annotations

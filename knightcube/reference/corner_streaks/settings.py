@@ -31,8 +31,8 @@ class StreakSettings(EndpointSettings):
         outlier_sigmas: number of robust standard deviations above which a streak is rejected.
         worst_residual: largest accepted RMS residual of the endpoints, px. True streaks have residuals of at
             most 0.6 px, and fragments that agree by chance have residuals of 1 to 4 px (campaign `streaks`).
-        sign_sigmas: minimum prior rate along the rotation axis, in standard deviations of the prior rate, for
-            which the prior decides the sense of rotation.
+        sign_sigmas: minimum prior rate along the rotation axis, in standard deviations of the prior rate, at
+            which the prior rate determines the sense of rotation.
     """
 
     saturated_fraction: float = 0.25

@@ -93,7 +93,7 @@ class BandLayout:
         band = filled.reshape(self.size, _ROWS)
         row, column = np.indices(tail.shape)
         band[int(self.begins[-1]) + column, 2 * _BAND + row - column] = tail
-        for k in range(7):  # the start conditions contain the first state only
+        for k in range(7):  # the start conditions depend only on the first state
             band[k, 2 * _BAND + 7] = band[k + 7, 2 * _BAND - 7] = 1.0
         return band.T
 
