@@ -3,8 +3,9 @@
 The script install.sh runs board_dropin.py CONFIG FOLDER with the installed Python. The drop-in of
 knightcube.service is written to the file `flight` of the folder, that of knightcube-safe.service to `safe`,
 and that of knightcube-link.service to `link`. The file `link` is empty if the configuration has no link. The
-file `tracker` is made if the star tracker needs the default sky index. Without FOLDER, the script prints the
-drop-in of knightcube.service. For an invalid configuration, the script prints one line and exits with status
+file `tracker` is written if the star tracker needs the default sky index. Without FOLDER, the script prints
+the drop-in of knightcube.service. For an invalid configuration, the script prints one line and exits with
+status
 2.
 """
 
@@ -115,7 +116,10 @@ def _driver_classes(major: int, root: Path) -> tuple[str, ...]:
 
 
 def _network(peers: Sequence[IPv4Network]) -> list[str]:
-    """Return the settings that permit traffic to `peers`; the service file denies all other addresses."""
+    """Return the settings that permit traffic to the hosts `peers`.
+
+    The service file denies other addresses.
+    """
     opened = ["PrivateNetwork=no", "RestrictAddressFamilies=AF_INET"]
     return [*opened, *(f"IPAddressAllow={peer}" for peer in peers)]
 

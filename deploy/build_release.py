@@ -2,7 +2,7 @@
 
 The script install.sh calls `build_release.py PREFIX build|switch|rollback`. The manifest of a release is
 written last, so a release with a manifest is complete, and only complete releases are linked. Each build
-first removes the incomplete releases of interrupted builds. The script needs only the standard library.
+first removes the incomplete releases of interrupted builds. The script needs only Python's standard library.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def _damaged_package(release: Path) -> str:
 
 
 def switch(prefix: Path, name: str) -> None:
-    """Make a release the current one and the former current one the previous one, and remove all others."""
+    """Make a release current, make the former current release previous, and remove all other releases."""
     release, current = prefix / "releases" / name, linked(prefix, "current")
     if current == release:
         return

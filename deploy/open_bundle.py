@@ -103,7 +103,7 @@ def verified(
             FolderFetcher(unpacked),
             bootstrap=root,
         )
-        # Python-tuf has no argument for the time; it reads the system clock when the updater is made.
+        # Python-tuf has no argument for the time, but reads the system clock when the updater is created.
         updater._trusted_set.reference_time = now
         target = updater.get_targetinfo(kind)
         if target is None:

@@ -1,10 +1,10 @@
-"""Chooses the software release to fly: `releases.py choose` prints the release's name and the reason.
+"""Chooses the software release to run: `releases.py choose` prints the release's name and the reason.
 
 The releases are folders in /opt/knightcube/releases, and the links `current` and `previous` select two of
-them. The current release flies unless it is damaged, or was started `UNCLEAN` times without being proven. In
-these two cases an intact previous release flies instead, and reports the reason. A release is proven after it
-has flown for a minute. The script `fly` runs this program, and chooses a release itself if this program
-fails.
+them. The current release is chosen unless it is damaged, or was started `UNCLEAN` times without being proven.
+Otherwise an intact previous release is chosen, and reports the reason. A release is proven after its flight
+software has run for a minute. The script `fly` runs this program, and chooses a release itself if this
+program fails.
 
 The command `releases.py verify` checks every file of both releases. Any Python interpreter can run this
 program, which needs only the standard library.
@@ -147,7 +147,7 @@ class Trials:
 
 
 def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
-    """Return the release to fly, and a text if the current release is damaged, missing or not chosen."""
+    """Return the release to run, and a text if the current release is damaged, missing or not chosen."""
     current, previous = linked(prefix, "current"), linked(prefix, "previous")
     found = [release for release in (current, previous) if release is not None]
     if not found:

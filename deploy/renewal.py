@@ -7,9 +7,10 @@ stores the state and ends. The state is stored before a step is executed, and ea
 so that a kill at any moment leaves the old or the new version, and the next run continues
 (docs/fly/renewal.md).
 
-The link is not trusted. Its requests must be regular files of limited size, and no symbolic link is followed.
-The program `open_bundle.py` checks signatures and content of an artefact before anything is installed. Time
-is counted only while the board has power, by a clock that no command and no time server can set.
+The link is not trusted. The requests of the link must be regular files of limited size, and symbolic links
+are not followed. The program `open_bundle.py` checks signatures and content of an artefact before anything is
+installed. Time is counted only while the board has power, by a clock that no command and no time server can
+set.
 
 Any Python interpreter can run this program, which needs only the standard library.
 """
@@ -78,8 +79,8 @@ class Trial:
         kind: kind of the signed artefact, one of `KINDS`.
         version: signed version of the artefact.
         request: name of the request that began the trial.
-        old: name of the previous kept configuration or release.
-        new: name of the new configuration or release; empty until a release is built.
+        old: name of the previous configuration (stored copy) or release.
+        new: name of the new configuration or release; an empty text until a release is built.
         stage: stage of the trial: `install`, `fly` or `revert`.
         left_s: remaining time (s) with power in which the ground must confirm the renewal.
         despite_faults: whether the trial continues after the flight has reported a fault.
@@ -121,7 +122,7 @@ class State:
         returning: kind, target, replaced version and report of an unfinished return to an earlier version.
         reports: newest reports, each a list of number, request, result, name and text.
         note: text that the flight reports as an event at its next start.
-        note_s: time (s) that the flight has been up since the note was made.
+        note_s: time (s) for which the flight software has run since the note was made.
         boot: the kernel's boot identifier at the last run.
         at: time (s) of the last run, since boot.
         frames: number of authentic frames in the link's last record.
@@ -371,7 +372,7 @@ class Board:
 
 
 class Renewal:
-    """One run of the renewal: requests, trial and command-loss timer."""
+    """One run of the renewal program: requests, trial and command-loss timer."""
 
     def __init__(self, board: Board, now: float, boot: str) -> None:
         """Read the state.
@@ -429,7 +430,7 @@ class Renewal:
         sys.stderr.write(f"renewal: {name} {result}: {text}\n")
 
     def _read_contact(self) -> dict[str, Any]:
-        """Return the link's record of its contact with the ground, empty if it is missing or damaged."""
+        """Return the link's record of its contact with the ground, or an empty record if it is unreadable."""
         with (
             suppress(OSError, *_DAMAGED),
             open_beneath(self._board.link, ["renewal", "contact"], LARGEST_RECORD) as file,

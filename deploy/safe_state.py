@@ -9,7 +9,7 @@ the command. The command `ping` is answered. Other commands are refused, and dat
 get no answer.
 
 The environment variable KNIGHTCUBE_COMMANDS holds the path of the command socket; without it, no commands are
-received. The folder RUNTIME_DIRECTORY keeps the number of tries until the next boot of the board.
+received. The number of tries is stored in the folder RUNTIME_DIRECTORY until the next boot of the board.
 """
 
 from __future__ import annotations

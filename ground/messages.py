@@ -42,7 +42,7 @@ def write_tracking_data(run: Run, path: Path, as_xml: bool = False) -> list[Path
     If the satellite's own orbit was known, the file with the suffix `.oem` beside `path` has the positions of
     the camera at the sightings, as an Orbit Ephemeris Message. Each object has one segment, which contains
     the measured right ascension and declination (ICRS) at mid-exposure of each frame. Stellar aberration due
-    to the camera's velocity is corrected, light time is not. Standard deviations are written as comments,
+    to the camera's velocity is corrected, but light time is not. Standard deviations are written as comments,
     because the message format has no keyword for them. The keyword MAG gives the mean magnitude of the last
     sightings. Raises UsageError if no object was tracked or `path` cannot be written.
     """

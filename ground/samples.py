@@ -1,7 +1,7 @@
 """Sample pictures for other commands, which the simulator renders together with their true parameters.
 
 The pictures are rendered on demand, because 12-bit noise cannot be compressed, and stored pictures would not
-follow changes of the simulator. The same seed gives the same pictures.
+follow changes of the simulator. Pictures rendered with the same seed are identical.
 """
 
 from __future__ import annotations

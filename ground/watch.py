@@ -96,7 +96,7 @@ class LogTail:
         return data
 
     def _following(self) -> Path | None:
-        """Return the segment after the present one, or None."""
+        """Return the log segment after the present segment, or None if there is none yet."""
 
         def number(path: Path) -> int:
             return int(path.stem.rpartition("-")[2])
@@ -158,8 +158,8 @@ class FlightState:
 
     Attributes:
         time: mission time of the newest packet, s.
-        mode: label of the flight's mode, empty until the mode is known.
-        ended: reason for the end of the flight, empty before the end.
+        mode: label of the flight's mode, or an empty text until the mode is known.
+        ended: reason for the end of the flight, or an empty text before the end.
         events: newest events.
         faults: number of events whose severity is fault.
         newest: newest packets by name.
@@ -279,7 +279,7 @@ def state_line(state: FlightState) -> str:
 
 
 def attitude_text(state: FlightState) -> str:
-    """Return a text of attitude and rate, empty without an estimate."""
+    """Return attitude and rate as text, or an empty text without an estimate."""
     rate = state.value("attitude", "rate")
     parts = []
     if (q2 := state.value("control", "q2")) is not None and np.isfinite(q2):

@@ -270,8 +270,8 @@ _Entry = Field | str
 def _forms(layout: Layout) -> Iterator[tuple[str, list[_Entry]]]:
     """Yield the name and the entries of each XTCE form of a command.
 
-    The command `point` has one form for each goal, in which unused numbers are NaN. Each other command has
-    one form.
+    The command `point` has one form for each goal, in which unused numbers are NaN. Every command except
+    `point` has one form.
     """
     packet = layout.packet
     if packet is not POINT:

@@ -3,9 +3,9 @@
 Yamcs connects to `knightcube gateway`, which holds the keys and exchanges unprotected packets with Yamcs
 (`ground.link.gateway`). Yamcs and the gateway listen on the loopback interface only. Yamcs's own data links
 cannot send the gateway's token when they connect. The folder therefore contains `GatewayLink.java`, the
-source of a data link that sends the token. It must be compiled once. Packets are archived by mission time and
-sequence count. A command is verified by `verification` packets that contain the packet identifier and the
-sequence count of the command. Files are transferred by Yamcs's own CFDP service.
+source of a data link that sends the token. This source must be compiled once. Packets are archived by mission
+time and sequence count. A command is verified by `verification` packets that contain the packet identifier
+and the sequence count of the command. Files are transferred by Yamcs's own CFDP service.
 
 Yamcs requires a password, because otherwise any web page in a browser on the same machine could send requests
 to Yamcs.

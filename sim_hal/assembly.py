@@ -273,7 +273,10 @@ def _sense(config: Config, section: Simulation, world: World, circuit: Any) -> C
 
 
 def sky_objects(section: Simulation, now_ns: int, world: World) -> SkyObjects | None:
-    """Return the moving objects of a simulated sky, or None. Raises ConfigError for an invalid object."""
+    """Return the moving objects of a simulated sky, or None if none are configured.
+
+    Raises ConfigError for an invalid object.
+    """
     if not section.objects:
         return None
     from sim_hal.star_camera.objects import SkyObjects  # noqa: PLC0415 - see above

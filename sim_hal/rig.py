@@ -375,7 +375,10 @@ class RemoteFrameSource:
             raise NotResponding("camera", f"the emulated devices have ended ({error})") from error
 
     def poll(self) -> Frame | None:
-        """Return the newest frame announced since the last call, or None. Raises NotResponding."""
+        """Return the newest frame announced since the last call, or None if none was announced.
+
+        Raises NotResponding.
+        """
         newest: Frame | None = None
         try:
             while self._link.pending() or select.select([self._link], [], [], 0.0)[0]:

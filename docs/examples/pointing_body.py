@@ -5,7 +5,7 @@ magnetic control: for the wanted torque T, the dipole is m = (B x T) / |B|^2, so
 perpendicular to the field B. The body has the plant of the testbed, and uses the testbed's estimation and
 detumbling.
 
-Run with `python docs/examples/pointing_body.py`: it flies the demonstration's first step.
+The command `python docs/examples/pointing_body.py` flies the demonstration's first step.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class AtRest:
 
 
 def error_of(estimate: Estimate, wanted: FloatArray) -> FloatArray:
-    """Return the rotation (3,) rad from the wanted attitude to the estimated one, body axes."""
+    """Return the rotation (3,), rad, from the wanted to the estimated attitude, body axes."""
     return to_rotation_vector(multiply(estimate.quaternion, conjugate(wanted)))
 
 
@@ -130,7 +130,7 @@ class CrossProductTracker:
 
 # --8<-- [start:paths]
 class Direct:
-    """Implements `Paths` and `Planner`: the target itself is the reference, and no plan is made."""
+    """Implements `Paths` and `Planner`: the target itself is the reference, without a plan."""
 
     def __init__(self) -> None:
         self._reference: AtRest | None = None

@@ -13,7 +13,7 @@ CONTROL, OUT = 0x09, 0x00
 
 
 class Qmc5883:
-    """Driver of the QMC5883L with the interface of CircuitPython drivers. It may sleep."""
+    """Driver of the QMC5883L with the interface of CircuitPython drivers. The start may sleep."""
 
     def __init__(self, i2c: Any, address: int = 0x0D) -> None:
         self._i2c, self._address = i2c, address

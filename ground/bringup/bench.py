@@ -28,7 +28,7 @@ _FRAME_PATIENCE_NS = 12 * SECOND_NS
 _ATTEMPTS = 3
 """Number of attempts to open a device, so that the measurement can begin despite a loose contact."""
 _LOST_FRAMES = 2
-"""Number of additional triggers if a trigger gives no frame."""
+"""Number of additional triggers if a trigger yields no frame."""
 _LATE_FRAME_S = 2.0
 """Longest time (s) from the end of an exposure to the arrival of the frame."""
 STILL_S = 0.5
@@ -79,8 +79,8 @@ class Session:
         coil_field: expected field of each coil (n, 3) at the magnetometer, T/A, body axes, or None if the
             configuration does not describe it.
         known: outcomes of earlier steps, by name.
-        live: function that shows a text while the user turns the focus ring, and returns whether to go on, or
-            None.
+        live: function that shows a text while the focus is adjusted and returns whether to continue, or None
+            if nobody adjusts the focus.
     """
 
     config: Config

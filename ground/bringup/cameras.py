@@ -191,7 +191,7 @@ def psf_width(pixels: Image) -> tuple[float, int]:
 
 
 def step_focus(session: Session) -> Outcome:
-    """Measure the width of the stars' images, repeatedly while somebody turns the focus ring."""
+    """Measure the width of the stars' images, repeatedly while the user adjusts the focus ring."""
     session.device("camera")
     session.ask("Turn the focus ring until the PSF width is smallest.")
     widths: list[float] = []

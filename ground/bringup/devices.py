@@ -26,7 +26,7 @@ from hal.interfaces.wires import I2cBus, Rig
 _PCA9685 = [0xE2, 0xE4, 0xE8, 0xE0]
 """Registers 2 to 5 (SUBADR1 to ALLCALLADR) of a PCA9685, which our drivers leave at their power-on values."""
 _INA219 = {0x399F, *(config_for(bits) for bits in range(4))}
-"""Values of an INA219's configuration register: after power-on, and as set by our driver."""
+"""Values of an INA219's configuration register: after power-on (first), and as set by our driver."""
 _ADDRESSES = [address for address in range(0x08, 0x78) if address != 0x70]
 """7-bit addresses without the reserved ones and without 0x70, to which every PCA9685 answers."""
 _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}

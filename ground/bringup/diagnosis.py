@@ -1,11 +1,11 @@
 """Diagnosis of a first bench session: noise and rate of the inertial unit, its axes, and the coils.
 
-The coils are compared by the field that each coil makes at the magnetometer per ampere, in both directions of
-the current, and by the current that the supply delivers. The measured response of each coil is compared with
-the expected response of every coil, so that swapped, reversed and weak coils are distinguished. The axes of
-gyro, accelerometer and magnetometer are determined from right-handed rotations of 90 deg by hand about each
-body axis. Before each rotation the z axis points up. Angle and axis of a rotation by hand are accurate to
-about 15 deg, so that only swapped and reversed axes and large misalignments are found. Rotations do not
+The coils are compared by the field that each coil produces at the magnetometer per ampere, in both directions
+of the current, and by the current that the supply delivers. The measured response of each coil is compared
+with the expected response of every coil, so that swapped, reversed and weak coils are distinguished. The axes
+of gyro, accelerometer and magnetometer are determined from right-handed rotations of 90 deg by hand about
+each body axis. Before each rotation the z axis points up. Angle and axis of a rotation by hand are accurate
+to about 15 deg, so that only swapped and reversed axes and large misalignments are found. Rotations do not
 determine the common sign of the magnetometer's axes; the coils determine this sign.
 """
 
@@ -50,7 +50,7 @@ UNRECOGNISED = "different from the configuration, cause unknown"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One fault of a part.
+    """One diagnosed fault of a device.
 
     Attributes:
         part: section of the configuration, for example `coils.windings[0]`.
@@ -320,7 +320,7 @@ def diagnose_axes(turns: Turns) -> AxesFound:
 
 
 def _common(found: dict[str, FloatArray]) -> FloatArray | None:
-    """Return the axes of all sensors if they agree, or None.
+    """Return the common axes of all sensors, or None if the axes differ.
 
     The sign of the magnetometer's axes is not compared.
     """
@@ -407,7 +407,7 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
 def _gyro_scale(turns: Turns) -> list[Finding]:
     """Return the finding about a gyro whose angles about x and y differ from those of gravity, if any.
 
-    Both angles belong to the same rotation, so the accuracy of the hand does not limit the comparison.
+    The gyro and gravity measure the same rotation, so its deviation from 90 deg does not matter.
     """
     first, second = turns.before[:2, 0], turns.after[:2, 0]
     sizes = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
@@ -457,10 +457,10 @@ class FieldFound:
     """Result of a fit of the magnetometer's values before and after the rotations.
 
     Attributes:
-        axes: orthogonal matrix (3, 3) from body axes to measured axes, or None if no matrix explains the
-            values.
+        axes: orthogonal matrix (3, 3) from body axes to measured axes, or None if no orthogonal matrix
+            explains the values.
         size, bias: magnitudes of the site's field and of the body's constant field, T.
-        scales: relative scales (3,) of the measured axes if they differ, or None.
+        scales: relative scales (3,) of the measured axes, or None if the scales are equal.
     """
 
     axes: FloatArray | None
@@ -477,7 +477,7 @@ def _fitted_field(
     The fit starts from the best signed permutation of the axes and from the axes of the gyro.
 
     The common sign is undetermined: of two matrices with opposite signs, the matrix closer to the identity is
-        returned. The axes are None if no matrix explains the fields.
+        returned. The axes in the result are None if no matrix explains the fields.
     """
     values = np.concatenate([*before, *after])
 

@@ -1,4 +1,4 @@
-"""The picture of a bench session: gyro noise, Allan deviation, turns, coil responses, currents and frames."""
+"""Plots of a bench session: gyro noise, Allan deviation, rotations, coil responses, currents and frames."""
 
 from __future__ import annotations
 

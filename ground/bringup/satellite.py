@@ -230,7 +230,7 @@ _STRINGS_S = 2.5
 
 
 def step_strings(session: Session) -> Outcome:
-    """Illuminate one panel after the other, and check that only the string of this panel gives a current."""
+    """Illuminate one panel after the other, and check that only the string on this panel gives a current."""
     strings: SolarStrings = session.device("solar_strings")
     section = session.config.solar_strings
     assert section is not None, "the device is open"

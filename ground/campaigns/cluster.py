@@ -64,7 +64,10 @@ class ShippedCode:
 
 
 def carry_out(version: str, module: str, function: str, case: dict[str, Any]) -> Any:
-    """Run a case with the packages of `version`. Return None if the worker has another version."""
+    """Run a case with the packages of `version`.
+
+    Return None if the worker has a different version of the packages.
+    """
     if os.environ.get("KNIGHTCUBE_CODE") != version:
         return None
     sent = importlib.import_module("ground.campaigns.cluster")

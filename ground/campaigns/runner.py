@@ -1,9 +1,9 @@
 """Runner of campaigns: runs cases on all cores or on a Dask cluster, shows progress, and resumes.
 
-A campaign consists of cases, each with its own key and seed. The function `run` of the campaign turns a case
-into a result that JSON can represent. Each result is appended to the file `results.jsonl` at once, so that
-an interrupted campaign continues with the missing cases. Results do not depend on the order of the cases or
-on the process that runs them. A lock on `results.jsonl` prevents a second process from using the folder.
+A campaign consists of cases, each with its own key and seed. The function `run` of the campaign runs a case
+and returns a result that JSON can represent. Each result is appended to the file `results.jsonl` at once, so
+that an interrupted campaign continues with the missing cases. Results do not depend on the order of the cases
+or on the process that runs them. A lock on `results.jsonl` prevents a second process from using the folder.
 """
 
 from __future__ import annotations
@@ -291,8 +291,8 @@ def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
 def _read(lines: IO[str]) -> tuple[dict[str, Result], int]:
     """Return the results by key, and the length (bytes) of the complete lines.
 
-    The results are ASCII text. A complete line that is not JSON, as a power failure can leave, is skipped, so
-    that its case is run again.
+    The results are ASCII text. A complete line that is not JSON, for example after a power failure, is
+    skipped, so that its case runs again.
     """
     text = lines.read()
     whole = text[: text.rfind("\n") + 1]
@@ -317,8 +317,8 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
     """Run cases on the cores of this machine, and yield each result when its case ends.
 
     If a worker process dies, another process runs its case. Raises CampaignError if three processes die while
-    they run the same case, and passes on the exception of a case that fails. All processes have ended when
-    the function returns or raises.
+    they run the same case, and passes on the exception of a case that fails. All worker processes have ended
+    when the function returns or raises an error.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,4 +1,4 @@
-"""Command `knightcube elements`, which makes or reads two-line elements, or fits them to positions."""
+"""Command `knightcube elements`, which computes, reads or fits two-line elements."""
 
 from __future__ import annotations
 

@@ -294,7 +294,7 @@ def _started(port: int, folder: Path, forecast: _Forecast | None, ended: Callabl
 def _runs(session: Session) -> bool:
     try:
         return bool(session.ask(f"/instances/{INSTANCE}")["state"] == "RUNNING")
-    except (OSError, ValueError):  # ValueError: the answer is not JSON
+    except (OSError, ValueError):  # a ValueError means that the answer is not JSON
         return False
 
 

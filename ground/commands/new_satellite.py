@@ -137,7 +137,7 @@ class Answers:
         self.values: dict[str, Any] = {}
 
     def take_options(self, options: argparse.Namespace) -> None:
-        """Take the given options. Raises UsageError for an impossible value, and if the file exists."""
+        """Store the given options. Raises UsageError for an impossible value, and if the file exists."""
         for question in QUESTIONS:
             given = getattr(options, question.name.replace("-", "_"))
             if given is not None:

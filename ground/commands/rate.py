@@ -112,7 +112,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 
 
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
-    """Return the fit settings from the options, if not given from the configuration, or else the defaults."""
+    """Return the fit settings: from the options, else from the configuration, else the defaults."""
     settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
     if options.line_time is not None and not math.isfinite(options.line_time):
         raise UsageError(f"--line-time {options.line_time}: must be finite")

@@ -43,7 +43,7 @@ class Files(Protocol):
         """Return the local copy of a file. Raises FlightError, and UsageError for an invalid name."""
 
     def put(self, kind: str, name: str, data: bytes) -> Object:
-        """Put a file on the satellite. Raises FlightError, and UsageError for an invalid name."""
+        """Upload a file to the satellite. Raises FlightError, and UsageError for an invalid name."""
 
 
 class RunFiles:
@@ -70,12 +70,12 @@ class RunFiles:
         return self._folder / name
 
     def put(self, kind: str, name: str, data: bytes) -> Object:
-        """Raise UsageError, because files are put on a satellite over its link."""
+        """Raise UsageError, because files can be uploaded to a satellite only over its link."""
         raise UsageError(f"{kind}/{name}: uploading files to a satellite needs its link: start with --link")
 
 
 class LinkFiles:
-    """Files of a satellite over its link. One request runs at a time; other requests wait."""
+    """Files of a satellite over its link. Requests are executed one at a time."""
 
     puts = True
 
@@ -95,7 +95,7 @@ class LinkFiles:
         return self._request(SendFile(name), name)
 
     def put(self, kind: str, name: str, data: bytes) -> Object:
-        """Put a file on the satellite and return its name, size and SHA-256. Raises FlightError."""
+        """Upload a file to the satellite and return its name, size and SHA-256. Raises FlightError."""
         full = f"{kind}/{name}"
         problem = problem_of_name(full) or ("" if kind in KINDS else f"the kind is one of {', '.join(KINDS)}")
         if problem:

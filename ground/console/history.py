@@ -152,7 +152,7 @@ class PageCursor:
     def obey(self, text: str, now: float) -> bool:
         """Process a message {"live": true} or {"at": s, "speed": x} and return whether the shown time jumped.
 
-        `now` is the monotonic time, s. Other messages are ignored.
+        `now` is the monotonic time, s. Messages of any other form are ignored.
         """
         try:
             message = json.loads(text)

@@ -37,7 +37,7 @@ class FlightSurroundings:
 
     Attributes:
         elements: two-line elements, or None on a testbed or without elements in the configuration.
-        lines: text of the elements, or None.
+        lines: text of the two-line elements, or None without elements.
         camera: mounting (4,) of the star camera, body into camera, and its field of view, rad.
         coil_dipole: largest dipole moment along a body axis, A m^2.
         body: kind of body, or None if the configuration cannot be read.

@@ -1,8 +1,8 @@
 """Description of a satellite (inertia, coils, sensors) that its attitude filter has learned in flight.
 
-Each flight packet `description` holds the estimated inertia, coils, sensors and residual dipole with their
-standard deviations. The last packet of a run is compared with the configuration of the run, and the learned
-values are written as sections of a configuration.
+Each packet `description` in the flight log contains the estimated inertia, coils, sensors and residual dipole
+with their standard deviations. The last packet of a run is compared with the configuration of the run, and
+the learned values are written as sections of a configuration.
 
 From the motion, the elements of the inertia and the coils' dipole can be determined only relative to the
 trace of the inertia. The learned inertia is therefore scaled to the configured trace, and the coils' dipole
@@ -174,7 +174,7 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
 
     The text names the folder of the run, `folder`, and contains the accuracies of the learned values.
     Quantities that were not learned are omitted, and so are the gyro bias and the dipole in sunlight.
-    Raises InputError if no body can have the learned inertia.
+    Raises InputError if the learned inertia is physically impossible.
     """
     sections = [_craft(found), _coils(found), _inertial_unit(found), _camera(found)]
     lines = [

@@ -311,7 +311,7 @@ class FileSession:
         return self.entity.send(path, name, SATELLITE, CRC32, utc_ns(), now_ns, NOBODY)
 
     def take(self, packets: Iterable[tuple[int, bytes]], now_ns: int) -> None:
-        """Process received telemetry, given as virtual channels and packets."""
+        """Process received telemetry, given as pairs of virtual channel and packet."""
         for _, packet in packets:
             self.received_ns = now_ns
             if is_unit(packet, DOWN):

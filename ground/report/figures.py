@@ -18,7 +18,7 @@ from ground.report.panels import RunSignals
 from ground.report.signals import seconds
 from ground.telemetry import Run, text_of
 
-if TYPE_CHECKING:  # imported for types only, because these modules import the optimiser
+if TYPE_CHECKING:  # imported only for types, because these modules import the optimiser
     from ground.identification.fit import PlantFit
     from ground.identification.record import Record
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant

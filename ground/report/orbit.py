@@ -112,7 +112,10 @@ class AttitudeErrors:
 
 
 def attitude_errors(run: Run) -> AttitudeErrors:
-    """Return the errors of the attitude estimates against the truth; empty without a truth log."""
+    """Return the errors of the attitude estimates against the truth.
+
+    The arrays are empty without a truth log.
+    """
     packets, truth = run["attitude"], run["truth"]
     known = packets[np.isfinite(packets["quaternion"][:, 0])]
     if not len(known) or not len(truth):

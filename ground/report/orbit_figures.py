@@ -360,7 +360,7 @@ def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
 
 
 def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) -> None:
-    """Draw the paths of the pointing axis and of the star camera's boresight, and the keep-out cones."""
+    """Draw the paths of the pointing axis and of the star camera's boresight, and the exclusion cones."""
     plan = made.plan
     turned = attitude_matrix(plan.path.references(times).quaternion)
     handles: list[Line2D | Patch] = [*_cones(ax, made.task.cones, times[[0, -1]])]
@@ -388,7 +388,7 @@ def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) 
 
 
 def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patch]:
-    """Draw the keep-out cones, shaded at the first time and dashed at the second, and yield legends."""
+    """Draw the exclusion cones (shaded at the first time, dashed at the second), and yield their legends."""
     longitude, latitude = np.meshgrid(np.radians(np.arange(-180, 181)), np.radians(np.arange(-90, 91)))
     level = np.cos(latitude)
     grid = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2)

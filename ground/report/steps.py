@@ -104,7 +104,7 @@ def commanded_steps(
 def flown_steps(
     commanded: Sequence[StepCommand], time: FloatArray, q2: FloatArray, stops: FloatArray
 ) -> list[StepCommand]:
-    """Return the steps as flown, which start at the body's attitude and may end early by a mode change.
+    """Return the executed steps, which start at the body's attitude and may end early by a mode change.
 
     Args:
         commanded: steps between targets.

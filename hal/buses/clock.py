@@ -16,7 +16,7 @@ class ContainedJob:
 
     Attributes:
         name: name of the job.
-        error: exception of the last run as text, empty if the run completed.
+        error: exception of the last run as text, or an empty text if the run completed.
         served_ns: time (ns) at which a run last succeeded, initially the time of creation.
     """
 

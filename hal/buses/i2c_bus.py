@@ -1,8 +1,8 @@
 """Linux I2C bus through smbus2, with a lock for several threads and bounded waiting times.
 
-A call waits until the previous transaction has ended. Its own transaction takes at most the timeout of the
-I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES 0), so
-that the drivers count each failure.
+A call waits until the previous transaction has ended. The transaction of the call then takes at most the
+timeout of the I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled
+(I2C_RETRIES 0), so that the drivers count each failure.
 
 An advisory lock on the device file reserves the bus for one flight process. The kernel releases the lock when
 the process ends. The guardian and `deploy/coils-off` ignore the lock, because they may switch the coils off

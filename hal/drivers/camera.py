@@ -151,7 +151,7 @@ class ServedCamera:
             raise type(self._failure)(self._failure.device, self._failure.message)
 
     def _serve(self) -> None:
-        """Pass requests to the device and take frames from it. This is the periodic job."""
+        """Periodic job: pass requests to the camera device and take frames from it."""
         if not self._open and not self._reopened():
             return
         try:

@@ -70,7 +70,7 @@ class NmeaReceiver:
                 self._sentences += 1
                 reading = self._take(found[1].decode("ascii").split(","), arrival_ns, len(found[0]))
                 readings += [] if reading is None else [reading]
-            if len(self._buffer) - taken > _LONGEST:  # no sentence is as long
+            if len(self._buffer) - taken > _LONGEST:  # longer than any sentence
                 self._discarded += len(self._buffer) - taken
                 taken = len(self._buffer)
             self._buffer = self._buffer[taken:]
@@ -101,7 +101,7 @@ class NmeaReceiver:
         self._port.close()
 
     def _take(self, fields: list[str], arrival_ns: int, length: int) -> GpsReading | None:
-        """Return the reading that a sentence completes, or None."""
+        """Return the reading that a sentence completes, or None if the other sentence is missing."""
         kind = fields[0][2:]
         if kind not in {"RMC", "GGA"} or len(fields) < 10:
             return None

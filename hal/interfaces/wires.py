@@ -33,7 +33,7 @@ class Ticker(Protocol):
 
     @property
     def error(self) -> str:
-        """Exception of the last run as text, empty if the run succeeded."""
+        """Exception of the last run as text, or an empty text if the run succeeded."""
 
     @property
     def served_ns(self) -> int:

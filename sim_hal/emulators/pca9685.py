@@ -59,7 +59,7 @@ _POWER_ON[PRE_SCALE] = 0x1E
 
 
 class EmulatedPca9685:
-    """One chip.
+    """One emulated PCA9685.
 
     Attributes:
         on_stop: function that is called after each write that may have changed outputs, with the bit mask of
@@ -101,7 +101,7 @@ class EmulatedPca9685:
 
     @property
     def frequency(self) -> float:
-        """PWM frequency (Hz), 0 while the oscillator is off."""
+        """PWM frequency (Hz), or 0 while the oscillator is off."""
         # No external clock is wired to the EXTCLK pin.
         if self._registers[MODE1] & _WITHOUT_PULSES:
             return 0.0

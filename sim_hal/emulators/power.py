@@ -60,7 +60,7 @@ class EmulatedPower:
         rails: measured supply lines of battery and bus.
         cells_lost: number of cells without voltage.
         weakness: factor by which the internal resistance is multiplied and the capacity is divided.
-        lost_panel: number of the panel that gives no power, 0 for all panels, or None.
+        lost_panel: number of the failed panel, 0 if all panels have failed, or None without a failure.
     """
 
     def __init__(

@@ -220,7 +220,7 @@ def _windows(register: tuple[str, ...]) -> tuple[int, ...]:
 
 
 def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
-    """Return the binary output that register fields define, or None. Raises UnitError."""
+    """Return the binary output that register fields define, or None if it is off. Raises UnitError."""
     expect_count(fields, 3, 3 + 8)
     try:
         ports, divisor, groups = int(fields[0]), int(fields[1]), int(fields[2], 16)

@@ -56,7 +56,7 @@ class Bench:
         generator: random generator of the faults.
         host: host end of a serial line in memory, or None for a pseudo-terminal.
         flight_process: process identifier of the flight process, or None in lock-step.
-        gps_line: serial line of the GPS receiver, or None.
+        gps_line: serial line of the GPS receiver, or None without a receiver.
     """
 
     hardware: Hardware
@@ -187,7 +187,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """One kind of fault.
+    """Kind of fault, such as `imu: silent`.
 
     Attributes:
         device, kind: the two parts of the fault's name "device: kind".

@@ -125,7 +125,7 @@ class ProcessFaults:
 
 
 def host_faults(section: Simulation, clock: Clock, realtime: bool) -> ProcessFaults | None:
-    """Return the faults of a section that act inside the flight process, or None."""
+    """Return the faults of a section that occur inside the flight process, or None if there are none."""
     faults = ProcessFaults(schedule(section.faults), clock, realtime)
     return faults if faults.concerns(*DEVICES) else None
 

@@ -103,7 +103,7 @@ def source_tracks(
 
     `epoch` is the Julian date (TT) at time 0 of the orbits. The times of the returned tracks count from
     `zero` s, as in an attitude history. An object that is in the umbra or behind the Earth the whole time is
-    omitted. An object that is partly lit, or lit for part of the time, has its mean brightness over the
+    omitted. An object that is partly sunlit, or sunlit for part of the time, has its mean brightness over the
     track. For a rolling shutter, `end` is the end of the last row's exposure. Raises OutOfRange for times
     outside the orbits, and for an object within 1 m of the camera.
     """

@@ -132,15 +132,15 @@ class Start(Protocol):
 def propagate(elements: Start, duration: float, j2: float = J2) -> Orbit:
     """Return the orbit over `duration` s that starts with `elements` at time 0 (Sease, eqs. 2.13, 2.14).
 
-    The integrator is the eighth-order method of Dormand and Prince with dense output. `j2` = 0
-    gives the two-body orbit. Raises OutOfRange if `duration` is not positive.
+    The integrator is the eighth-order method of Dormand and Prince with dense output. With `j2` = 0 the
+    result is the two-body orbit. Raises OutOfRange if `duration` is not positive.
     """
     if not 0.0 < duration < math.inf:
         raise OutOfRange(DEVICE, "duration", duration, 0.0, math.inf, "s")
     oblateness = 1.5 * j2 * GRAVITATIONAL_PARAMETER * EARTH_RADIUS**2
 
     def derivative(_: float, state: FloatArray) -> list[float]:
-        # Plain floats are used because numpy takes five times as long for three components.
+        # Python floats are used, because numpy takes five times as long for three components.
         x, y, z, vx, vy, vz = state.tolist()
         squared = x * x + y * y + z * z
         cubed = squared * math.sqrt(squared)
@@ -338,8 +338,8 @@ _STORM_TIMES = np.array([3.0, 7.0, 17.0]) * 3600.0
 class Chunk:
     """Interpolation of the environment over 1,000 s.
 
-    `cubics` (knots, 4, columns) holds polynomial coefficients, highest power first. `sunlit` (seconds,) holds
-    the visible fraction of the Sun's disc.
+    `cubics` (knots, 4, columns) contains cubic polynomial coefficients, highest power first. `sunlit`
+    (seconds,) holds the visible fraction of the Sun's disc.
     """
 
     start: float

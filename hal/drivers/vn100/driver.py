@@ -173,7 +173,7 @@ def set_up(settings: Vn100Settings) -> Dialogue:
         yield from _write(75, settings.unit_port, divisor, groups, *words)
     else:
         yield from _switch_off(75)
-        # ASCII lines get a CRC16, because an 8-bit XOR does not detect two flips of the same bit.
+        # ASCII lines are sent with a CRC16, because an 8-bit XOR does not detect two flips of the same bit.
         yield from _write(30, 0, 0, 0, 0, 3, 0, 1)
         yield from _write(7, settings.rate_hz)
         yield from _write(6, 8)
