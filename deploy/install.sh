@@ -247,7 +247,7 @@ install_settings() {
 
 # The link's unit is installed only if the configuration has a link.
 remove_link() {
-    [ -e "$units/knightcube-link.service" ] || return 0
+    [ -e "$units/knightcube-link.service" ] || [ -e "$units/knightcube-link.service.d" ] || return 0
     if systemd_runs; then
         run systemctl stop knightcube-link.service || true
     fi

@@ -88,10 +88,15 @@ def test_everything_is_put_in_its_place_once(image: Image) -> None:
     before = image.files()
     assert image.install("--config", str(TESTBED))[0] == 0
     assert image.files() == before
+    # A renewal may write the settings of the link's unit although the unit itself is not installed.
+    settings = image.root / "etc/systemd/system/knightcube-link.service.d"
+    settings.mkdir()
+    (settings / "board.conf").touch()
     assert image.call("--uninstall")[0] == 0
     assert sorted(path.name for path in image.files()) == ["flight.yaml", "flight.yaml.sha256"]
     assert image.call("--uninstall", "--purge")[0] == 0
     assert not image.files()
+    assert not list(image.root.rglob("knightcube*"))
 
 
 def test_the_checksum_is_one_that_sha256sum_checks(image: Image) -> None:
