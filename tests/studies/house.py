@@ -1,4 +1,4 @@
-"""Sizes of the product's files, classes and functions, and the number of files that each activity enters.
+"""Sizes of the product's files, classes and functions, and the number of files that each activity uses.
 
 Command: `python -m tests.studies.house [--touched]`. Import-linter checks layers and cycles (pyproject.toml).
 
@@ -40,7 +40,8 @@ from tests.support.scenes import exposed
 ROOT = Path(__file__).resolve().parents[2]
 PRODUCT = ("knightcube", "flight", "ground", "hal", "sim_hal")
 MOST_LINES = {"file": 900, "class": 350, "function": 50}
-"""Largest number of lines; a class may be longer if its docstring gives a reason ("... lines: ...")."""
+"""Largest number of lines by kind; a class may be longer if its docstring gives a reason ("... lines:
+...")."""
 MOST_LONG_FUNCTIONS = 20
 _REASON = re.compile(r"\blines\b", re.IGNORECASE)
 LIMITS = {"control cycle": 30, "opening of a flight": 45, "star fix": 20}
@@ -96,11 +97,11 @@ def _definitions(node: ast.AST, place: str) -> Iterator[Piece]:
 
 
 class Touched:
-    """The files of the product entered while a block is measured, relative to `ROOT`."""
+    """Recorder of the product's files that a measured block enters, relative to `ROOT`."""
 
     def __init__(self) -> None:
         self.files: set[str] = set()
-        self._outside = 0  # nested calls into and below code that does not count
+        self._outside = 0  # depth of nested calls into code that does not count
 
     def _profile(self, frame: FrameType, event: str, _: Any) -> None:
         if event not in {"call", "return"}:
@@ -197,7 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def kept(long: Sequence[Piece]) -> bool:
-    """Return whether only functions are too long, and no more of them than permitted."""
+    """Return whether only functions are too long, and at most the permitted number of them."""
     return all(piece.kind == "function" for piece in long) and len(long) <= MOST_LONG_FUNCTIONS
 
 

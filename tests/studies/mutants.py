@@ -1,8 +1,9 @@
-"""Share of random one-line faults that the fast tests find: `python -m tests.studies mutants`.
+"""Fraction of random one-line faults that the fast tests find: `python -m tests.studies mutants`.
 
-Each mutant changes one place on one line of product code and is tested in a temporary copy of the repository:
-the tracked files with their uncommitted changes. The fast tests of the mirrored file run first, then those of
-the mirrored folder, up to the first failure. A failure counts if the same test passes on the unchanged code.
+Each mutant changes one expression on one line of product code and is tested in a temporary copy of the
+repository: the tracked files with their uncommitted changes. The fast tests of the mirrored file run first,
+then those of the mirrored folder, up to the first failure. A failure counts if the same test passes on the
+unchanged code.
 
 Docstrings, strings, annotations, decorators, imports, `raise` statements and the `strict` of `zip` are not
 changed. Known equivalent mutants are listed in `equivalent_mutants.yaml`, each with a reason.
@@ -35,8 +36,8 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.yaml")
 PACKAGES = ("knightcube", "flight", "hal", "sim_hal", "ground")
-LIMIT_S = 600.0  # limit for the tests of one mutant: a longer run counts as a hang
-MEMORY = 6 << 30  # most bytes of data that the tests of a mutant may allocate
+LIMIT_S = 600.0  # time limit (s) for the tests of one mutant; a longer run counts as a hang
+MEMORY = 6 << 30  # largest memory (bytes) that the tests of a mutant may allocate
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.GtE, ast.LtE),
     ast.LtE: (ast.Gt, ast.Lt),
@@ -88,7 +89,7 @@ class Mutant:
 
 @dataclass
 class Verdict:
-    """The result of one mutant: `killed`, `survived` or `equivalent`, and the test or reason for it."""
+    """The result of one mutant: `killed`, `survived` or `equivalent`, and the test or the reason."""
 
     mutant: Mutant
     result: str
@@ -169,7 +170,7 @@ def mutants_of(source: str, path: str) -> list[Mutant]:
 
 
 class _Finder(ast.NodeVisitor):
-    """Collects the mutants of a syntax tree."""
+    """Visitor that collects the mutants of a syntax tree."""
 
     def __init__(self, source: str, path: str) -> None:
         self._lines = source.splitlines()
@@ -265,7 +266,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
-        """Remove a minus."""
+        """Remove a minus sign."""
         if isinstance(node.op, ast.USub):
             self._add(node, "minus removed", node.operand)
         self.generic_visit(node)
@@ -282,7 +283,8 @@ class _Finder(ast.NodeVisitor):
         if isinstance(value, bool):
             self._add(node, "constant", str(not value))
         elif isinstance(value, int):
-            self._add(node, "constant", str(value + max(1, value // 2)))  # adding 1 ns to 2 s changes nothing
+            # Adding 1 ns to 2 s would have no effect.
+            self._add(node, "constant", str(value + max(1, value // 2)))
         elif isinstance(value, float):
             self._add(node, "constant", repr(1.5 * value if value else 1.0))
 
@@ -293,7 +295,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Expr(self, node: ast.Expr) -> None:
-        """Remove a call."""
+        """Remove a statement that is a call."""
         if isinstance(node.value, ast.Call):
             self._add(node, "call removed", "pass")
         self.generic_visit(node)
@@ -339,7 +341,7 @@ class _Copy:
     _writes: int = 0
 
     def stop(self) -> None:
-        """Stop the running tests, and start no others."""
+        """Stop the running tests, and do not start others."""
         self.stopped = True
         if self._process is not None:
             _kill_group(self._process)
@@ -477,7 +479,8 @@ def _copied(root: Path, folder: Path) -> _Copy:
     with tarfile.open(archive) as tar:
         tar.extractall(folder, filter="data")
     archive.unlink()
-    (folder / "tests" / "order.txt").unlink(missing_ok=True)  # it would run the longest files first
+    # This list would put the longest test files first.
+    (folder / "tests" / "order.txt").unlink(missing_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(folder), "OPENBLAS_NUM_THREADS": "1"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return _Copy(folder, environment)

@@ -1,4 +1,4 @@
-"""`python -m tests.studies.object_picture RUN`: draws a pass that a satellite followed, from its packets.
+"""`python -m tests.studies.object_picture RUN`: draws an object's pass that a satellite followed, from a log.
 
 The frame is rendered with the attitude that the flight estimated and the object position of its track.
 """

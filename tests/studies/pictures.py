@@ -46,9 +46,9 @@ CONFIG = ROOT / "config" / "step_demo.yaml"
 ORBIT = ROOT / "config" / "orbit.yaml"
 POWER = ROOT / "docs" / "examples" / "power.yaml"
 RATE = 0.03
-"""Rate (rad/s) of the frame: the peak rate of a 0.1 rad step."""
+"""Body rate (rad/s) in the drawn frame: the peak rate of a 0.1 rad step."""
 ORION_DEG = 84.0, -2.0, 15.0
-"""Right ascension, declination and roll (deg) of the solved picture."""
+"""Right ascension, declination and roll (deg) of the picture whose stars are identified."""
 HORIZON_SEEDS = 2, 4, 6
 _OF_TESTBED, _IN_ORBIT = ("overview", "paths"), ("spin", "knowledge", "pointing")
 _OF_BATTERY = ("battery",)

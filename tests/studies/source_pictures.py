@@ -1,4 +1,4 @@
-"""`python -m tests.studies.source_pictures`: figures of Sease 2013 with this camera and these estimators.
+"""`python -m tests.studies.source_pictures`: draws figures of Sease 2013 with this project's software.
 
 Fig. 2.1: the star table over the whole sky.
 
@@ -70,7 +70,7 @@ _ORANGE, _BLUE, _GREEN = "#D55E00", "#0072B2", "#009E73"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Draw all figures and name them."""
+    """Draw all figures, and print their names."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.source_pictures", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs") / "source_pictures", metavar="DIR")
     parser.add_argument("--only", default="", metavar="TEXT", help="only pictures whose name contains it")
@@ -153,7 +153,7 @@ def draw_centre() -> Figure:
     true = camera.pinhole.project(np.sign(scene.rate[2]) * scene.rate)
     away = float(np.linalg.norm(centre - true))
     left.set_title(f"centre of rotation, {away:.2f} px from the true one", fontsize=10)
-    # The streak that spans the largest angle at the centre has vectors of similar lengths.
+    # The streak with the largest angle at the centre is drawn, because its vectors have similar lengths.
     one = ends[int((lengths(ends) / np.linalg.norm(ends.mean(axis=1) - centre, axis=1)).argmax())]
     middle = one.mean(axis=0)
     _show(right, scene.pixels)
@@ -237,7 +237,7 @@ def flown_simulation(duration: float = 700.0) -> Run:
 
 
 def draw_indicators() -> Figure:
-    """Draw slope, length and OLAE residual of every streak beside an object: Fig. 4.2 to 4.4."""
+    """Draw slope, length and OLAE residual of every streak in a frame with an object: Fig. 4.2 to 4.4."""
     camera = StarCameraModel(field_of_view=FIELD)
     generator = np.random.default_rng(OBJECT_SEED)
     sky = draw_sky(camera, generator, tracked=False)

@@ -46,7 +46,7 @@ from tests.support.scenes import BRIGHTEST, FIELD
 from tests.support.star_lists import ListKind, draw
 
 Rows = list[list[str]]
-"""Cells of a table; the first row is the head."""
+"""Cells of a table; the first row is the header."""
 _NO_FOLDER = Path()
 _ARCSECONDS = float(np.degrees(3600.0))
 
@@ -119,7 +119,7 @@ def table_4_4(runs: int, seed: int) -> Rows:
 
 
 def end_biases(runs: int, seed: int) -> Rows:
-    """Return the inward bias of the ends of the thesis's streaks, which `streaks-thesis` removes."""
+    """Return the inward bias of streak ends in the thesis's frames, which `streaks-thesis` removes."""
     rows = [["detector", "bias in use, px", "measured, px"]]
     for name in DETECTOR_NAMES:
         rows.append([f"`{name}`", f"{THESIS_BIAS[name]:.2f}", f"{measured_bias(name, runs, seed):.3f}"])

@@ -1,12 +1,12 @@
 """`python -m tests.studies.tune_controllers`: tunes every gain of the baseline controllers by one criterion.
 
 The search minimises R I^2 over the demonstration's steps. Every step must settle (5 % band) within 9 s and
-overshoot by at most 1 %, on a thread of 1e-5 N m/rad that no controller models. The PID controller has four
-free gains (angle, integral, rate, target weight). The adaptive controller has three (bandwidth, adaptation,
-reference bandwidth). The search uses the method of Nelder and Mead from several starts. It simulates body and
-controller only, without noise, with the loop's delay of one cycle. `tests.studies.campaigns controllers`
-flies the resulting gains in the whole loop. The limits leave a margin for noise; `--settling`, `--overshoot`
-and `--stiffness` change them.
+overshoot by at most 1 %, on a thread of 1e-5 N m/rad, which the controllers do not model. The PID controller
+has four free gains (angle, integral, rate, target weight). The adaptive controller has three (bandwidth,
+adaptation, reference bandwidth). The search uses the method of Nelder and Mead from several starts. It
+simulates body and controller only, without noise, with the loop's delay of one cycle.
+`tests.studies.campaigns controllers` flies the resulting gains in the whole loop. The limits leave a margin
+for noise. `--settling`, `--overshoot` and `--stiffness` change limits and thread.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ STARTS: dict[str, tuple[Callable[[Sequence[float]], AngleController], tuple[tupl
 def tune(
     name: str, criterion: Criterion, progress: Callable[[str], object] = lambda _: None
 ) -> tuple[tuple[float, ...], Flown]:
-    """Return the best variables of a baseline, and the flight with them."""
+    """Return the best variables of a baseline controller, and the results of the steps with them."""
     make, starts = STARTS[name]
     best: tuple[float, tuple[float, ...]] | None = None
     for start in starts:

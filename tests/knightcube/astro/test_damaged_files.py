@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def checksummed(data: bytes) -> bytes:
-    """Return the lines of two-line elements with right checksums."""
+    """Return the lines of two-line elements with corrected checksums."""
     lines = [line.ljust(69)[:68] for line in data.split(b"\n")]
     sums = [sum(byte - 48 if 48 <= byte <= 57 else int(byte == 45) for byte in line) % 10 for line in lines]
     return b"\n".join(line + b"%d" % total for line, total in zip(lines, sums, strict=True))

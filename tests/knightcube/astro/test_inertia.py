@@ -46,7 +46,7 @@ def test_a_diagonal_tensor_keeps_its_moments_exactly() -> None:
 @pytest.mark.parametrize(
     ("inertia", "words"),
     [
-        (np.diag([1.0, 1.0, 2.0]), ""),  # a thin disc
+        (np.diag([1.0, 1.0, 2.0]), ""),  # a thin disc, the limit of possible moments
         (np.diag([1.0, 1.0, 2.001]), "largest must not exceed the sum of the other two (2)"),
         (np.diag([1.0, 1.0, -0.5]), "moments -0.5, 1, 1: all must be positive"),
         (np.diag([1.0, 1.0, 0.0]), "all must be positive"),

@@ -97,7 +97,7 @@ def test_matrix_round_trip(q: FloatArray) -> None:
 
 @pytest.mark.parametrize("axis", np.eye(3))
 def test_matrix_of_a_half_turn_has_no_singularity(axis: FloatArray) -> None:
-    """At pi the scalar part is 0: a method that divides by it would fail."""
+    """At a rotation of pi the scalar part is 0, so a method that divides by it would fail."""
     q = np.append(axis, 0.0)
     assert _close(np.abs(quaternion.from_matrix(quaternion.attitude_matrix(q))), np.abs(q))
 

@@ -121,8 +121,8 @@ CELLS = tuple((orbit, law) for orbit in ("sso", "iss", "equator") for law in LAW
 LONGEST = 6000.0
 """Time (s) after which a body that still rotates counts as lost."""
 WALK, LIGHTEST = 4.0, 1.04
-"""Largest random walk of the residual dipole, in standard deviations of an axis, and largest solar pressure,
-as a multiple of that at one astronomical unit.
+"""Largest random walk of the residual dipole, in standard deviations per axis, and largest solar pressure
+relative to that at one astronomical unit.
 """
 LEAST_CYCLES = 16
 """Smallest number of coil commands in a control window; a flight has 152."""
@@ -132,7 +132,7 @@ ATTITUDE_SIGMA = np.radians(1.0)
 """Error (rad per axis) of the coarse attitude from Sun and field."""
 FIELD_SIGMA = 2e-7
 TORQUE_WALK = {"knightcube": 3e-4, "cubesat_3u": 3e-5}
-"""Random walk of the torque over the inertia (rad/s per sqrt(s)): a tenth of the coils' torque over a few
+"""Random walk of torque / inertia (rad/s per sqrt(s)), by craft: a tenth of the coils' torque over a few
 seconds.
 """
 TARGETS = {

@@ -41,8 +41,8 @@ CRAFT = {"knightcube": "orbit.yaml", "cubesat_3u": "orbit_3u.yaml"}
 LIT, BLIND = 900.0, 300.0
 """Times (s) from the release, and from the last star fix, to the shadow."""
 SETTLED, LAST = 300.0, 120.0
-"""Time (s) from the release after which star fixes count, and duration (s) of the counted ends of sunlight
-and shadow.
+"""Time (s) after the release from which errors with star fixes are evaluated, and length (s) of the
+evaluated intervals at the end of sunlight and of shadow.
 """
 NODES = (9.5, 14.5)
 """Range (h) from which the mean local time of the ascending node of each run is drawn."""

@@ -34,8 +34,8 @@ DRIVEN = 6.0e-3
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
 """Absolute (A) and relative difference of two readings of the same current that can still be noise."""
 LOOKED_FROM, LOOKED = 2.0, 3.0
-"""Time (s) from which the monitor's mean is complete, and time (s) after an upset in which its effect is
-searched for.
+"""Time (s) from which the monitor's mean is complete, and time (s) after a bit flip within which an effect
+is expected.
 """
 FEW = 3
 """Largest difference in the number of IMU samples that does not count as an effect."""

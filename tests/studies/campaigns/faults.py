@@ -33,7 +33,8 @@ MODES = ("boot", "safe", "detumble", "hold", "slew", "testbed-demo")
 LASTING = ("coil", "bridge")
 
 COIL_FIELD = ((5e-4, 0.0, 0.0), (0.0, 5e-4, 0.0), (0.0, 0.0, 5e-4))
-"""Field of the coils at the magnetometer (T/A): 0.07 mT at full current, in a total field of 0.45 mT."""
+"""Field that the coils cause at the magnetometer (T/A): 0.07 mT at full current, in a total field of 0.45
+mT."""
 
 _LOOKS = {"camera", "vision"}
 

@@ -63,7 +63,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return a row for each arc: the determined quantities, their normalised errors, and their errors."""
+    """Return a row for each arc length: the determined quantities, their normalised errors, their errors."""
     rows = [_row(arc, [result for result in results if result["arc"] == arc]) for arc in ARCS]
     for row in rows:
         if not row["passes"]:

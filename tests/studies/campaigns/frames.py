@@ -90,7 +90,7 @@ def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
 
 
 def _frame(kind: str, past: list[bytes], forged: list[bytes], draw: np.random.Generator) -> bytes:
-    """Return a frame of the attacker, who has recorded `past` and has authentic frames `forged`."""
+    """Return a frame of an attacker with recorded frames `past` and authentic frames `forged`."""
     known = forged if kind == "edge" else past
     some = known[draw.integers(len(known))]
     match kind:

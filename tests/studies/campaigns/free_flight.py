@@ -113,7 +113,7 @@ class FreeFlight:
         return multiply(error, self.motion.quaternion)
 
     def ephemeris(self, duration: float) -> Ephemeris:
-        """Return the prediction of the flight software from a GPS fix now, over `duration` s."""
+        """Return the flight software's orbit prediction over `duration` s from a present GPS fix."""
         truth = self.body.orbit_truth()
         position = truth.position + FIX_SIGMA * self.generator.standard_normal(3)
         velocity = truth.velocity + FIX_VELOCITY_SIGMA * self.generator.standard_normal(3)

@@ -19,7 +19,8 @@ from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
 from tests.support.supersampled import Optics, coma, disc, gaussian, halo, moffat, ring
 
 Stage = Callable[[FloatArray, np.random.Generator], FloatArray]
-"""Function that changes electrons or counts (rows, columns); the generator draws what differs between frames.
+"""Function that changes electrons or counts (rows, columns), with a random generator for effects that
+differ by frame.
 """
 
 Encoder = Callable[[FloatArray], Image]

@@ -51,7 +51,7 @@ def run(case: Case) -> Result:
 
 
 def judged(flown: Run, since: float) -> Result:
-    """Return the share of frames with each attitude, its rms error and claim per axis (deg), and its NEES."""
+    """Return each attitude's share of frames, rms error and claimed sigma per axis (deg), and NEES."""
     rows, truth = flown["separate_attitudes"], flown["truth"]
     rows = rows[rows["middle_ns"] > since * 1e9]
     seen = flown["directions"]

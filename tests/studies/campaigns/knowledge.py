@@ -196,7 +196,7 @@ def _measured(receiver: Receiver, seconds: float, *, with_field: bool = True) ->
 
 
 def _field_sigma(strength: float) -> float:
-    """Return the standard deviation of a measured strength, T, with the default accuracies of a unit."""
+    """Return the standard deviation (T) of a measured field strength, with a unit's default accuracies."""
     return math.hypot(5e-7, 0.01 * strength) / math.sqrt(3.0)
 
 
@@ -281,7 +281,8 @@ orbits.
 The KnightCube flies the orbit of its configuration, and the 3U that of the ISS.
 """
 FOLLOWED, STARS_UNTIL, FILTER_STEP = 300, 60, 2
-"""Time (s) for which the attitude is followed, time until which there are star attitudes, and filter step."""
+"""Duration (s) of the attitude estimation, time (s) until which star attitudes are available, and filter
+step (s)."""
 ROLLOVER = "2038-11-20T23:15:00"
 """UTC three quarters of an hour before the ten-bit week of GPS restarts."""
 LEAP = "2035-06-30T23:15:00"
@@ -420,7 +421,7 @@ def _angle_deg(one: FloatArray, other: FloatArray) -> float:
 
 
 def _as_received(sound: GpsReading, given: Result) -> GpsReading:
-    """Return a fix as the driver reads it, with the date of the previous week epoch or with a leap second."""
+    """Return a fix as the driver reads it, with the date of the previous week epoch or a leap second."""
     utc_ns = sound.utc_ns
     leap_ns = round(datetime(2035, 7, 1, tzinfo=UTC).timestamp()) * SECOND_NS
     if given["utc"] == LEAP and utc_ns >= leap_ns:

@@ -120,7 +120,7 @@ def row(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def _worth_a_line(result: Result) -> bool:
-    """Return whether a frame is listed: wrong, unanswered, far beyond its covariance, or with a warning."""
+    """Return whether a frame is listed: its result is wrong, missing, inconsistent or has a warning."""
     return bool(result["verdict"] != RIGHT or result["nees"] > 20.0 or result["warnings"])
 
 

@@ -30,15 +30,15 @@ from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, Poi
 from tests.support.short_arcs import flow, passing_object
 
 NEAREST, END = 120.0, 210.0
-"""Time (s) at which the object rotates the line of sight at the drawn rate, and time (s) at which the flight
-ends.
+"""Time (s) at which the line of sight to the object rotates at the drawn rate, and time (s) at which the
+flight ends.
 """
 FIELD = np.radians(10.0)
 """Angle (rad) from the boresight to the nearest edge of a frame of 512 px over 20 deg."""
 PIXEL = 2.0 * FIELD / 512
 FASTEST, DEAR = np.radians(1.0), 0.8
-"""Largest rate (rad/s) of a path that is flown (`fastest_rate` of orbit_object.yaml), and the fraction of it
-above which the planner adds a cost.
+"""Largest rate (rad/s) of an accepted path (`fastest_rate` of orbit_object.yaml), and the fraction of this
+rate above which the planner adds a cost.
 """
 SIGHTING = {
     2.0: (0.004, 0.005, 0.99),
@@ -124,7 +124,10 @@ class ObjectChase(PointingFlight):
         return TipOff(rate=(0.0, 0.0, 0.0), attitude=(qx, qy, qz, qw))
 
     def _passing(self, own: FloatArray) -> FloatArray:
-        """Return the closest state (6,) of an object whose line of sight rotates at the drawn rate."""
+        """Return an object's state (6,) at the closest distance.
+
+        Its line of sight rotates at the drawn rate.
+        """
         rng, wanted = self._draw, self._wanted["rate_deg"]
         while True:
             direction, away, other = passing_object(rng, own)

@@ -77,7 +77,7 @@ def least_deviation(
 
 
 def _polygons(count: int, authority: float) -> tuple[csr_array, FloatArray]:
-    """Return the constraints: each deviation at most the largest, accelerations within the authority."""
+    """Return the constraints: deviations are at most the largest one, accelerations within the authority."""
     sides = np.arange(_SIDES) * 2.0 * np.pi / _SIDES
     corner = np.stack([np.cos(sides), np.sin(sides)], axis=1)
     bounds, most = lil_array((2 * _SIDES * count, 7 * count + 1)), np.zeros(2 * _SIDES * count)
@@ -101,7 +101,7 @@ def _carried(directions: FloatArray) -> FloatArray:
 
 
 def _turned(directions: FloatArray, axes: FloatArray, field: FloatArray) -> FloatArray:
-    """Return the accelerations (n, 3, 2) of deviation and roll by each of two torques across the field."""
+    """Return the accelerations (n, 3, 2) of deviation and roll due to either torque across the field."""
     found = np.zeros((len(directions), 3, 2))
     for n, (direction, both, strength) in enumerate(zip(directions, axes, field, strict=True)):
         along = strength / np.linalg.norm(strength)

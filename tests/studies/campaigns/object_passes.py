@@ -1,4 +1,4 @@
-"""Campaign `object-passes`: passes of an object in rendered frames, through star tracker, sighting and track.
+"""Campaign `object-passes`: passes of an object in rendered frames, with star tracker and tracking.
 
 Craft and object orbit the Earth. The object moves at 0.05 to 0.6 deg/s at closest approach. The camera holds
 its attitude for six frames, in which the object leaves a streak. Then it rotates with the object, and the

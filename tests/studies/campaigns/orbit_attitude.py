@@ -81,7 +81,7 @@ def _parts(notes: FloatArray) -> dict[str, float]:
 
 
 def _figures(parts: Sequence[dict[str, float]], name: str) -> dict[str, float | None]:
-    """Return the rms over the runs, that of the worst run, the median claim, and the mean NEES."""
+    """Return the rms error of all runs and of the worst run, the median claimed error, and the mean NEES."""
     rms = np.array([part[name] for part in parts])
     known = rms[np.isfinite(rms)]
     if not known.size:
@@ -112,8 +112,8 @@ VARIANTS: dict[str, frozenset[str]] = {
     "restless gyros": frozenset(),
 }
 RESTLESS = {"bias_walk": 3.5e-6}
-"""Random walk of the gyro bias (rad/s per sqrt(s)): 0.002 deg/s in 100 s, the short-term stability of the
-QRS-11's class interpreted as a random walk.
+"""Random walk of the gyro bias (rad/s per sqrt(s)): 0.002 deg/s in 100 s, which is the short-term
+stability of gyros like the QRS-11, interpreted as a random walk.
 """
 SECOND = 1_000_000_000
 NOTED = round(10.0 / STEP)
@@ -241,7 +241,7 @@ class _Flight:
         )
 
     def result(self) -> Result:
-        """Return the samples: time, sunlit, errors (3) and sigmas (3) in deg, NEES, Sun and nadir in use."""
+        """Return the samples: time, sunlit, errors (3) and sigmas (3), deg, NEES, Sun and nadir in use."""
         notes = np.array(self._notes)
         return {
             **self._case.parameters,
@@ -254,7 +254,7 @@ class _Flight:
 
 
 def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tuple[FloatArray, float]:
-    """Return the attitude error (3,), rad, body axes, and error^T P^-1 error of attitude and bias."""
+    """Return the attitude error (3,), rad, body axes, and the squared normalised error with bias."""
     turn = rotation_vector(multiply(attitude, conjugate(estimate.quaternion)))
     error = np.concatenate([turn, bias - estimate.bias])
     pick = np.r_[ATTITUDE, BIAS]

@@ -32,15 +32,16 @@ SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 DIPOLE_PER_AMPERE = 0.648
 """Dipole moment per current (A m^2/A) of the coils of config/orbit.yaml."""
 LOOKED, FEW = 3.0, 3
-"""Time (s) after an upset in which its effect is searched for, and largest number of missing IMU samples
-without effect.
+"""Time (s) after a bit flip within which an effect is expected, and largest number of missing IMU samples
+that does not count as an effect.
 """
 LAST = 12.0
 """Duration (s) of the end of a flight, in which the body must fulfil the purpose of its mode again."""
 SET_UP = 0.53
 """Time (s) until the PWM chip is set up. Losses before this time are not counted."""
 ACTS, RATE_OFF = 2e-3, 0.0175
-"""Current (A) of coils that steer with little torque, and error (rad/s) of the rate from the magnetometer."""
+"""Smallest current (A) of coils that control the body, and largest error (rad/s) of the magnetometer's
+rate."""
 
 ORBIT_OWN: Mapping[str, frozenset[str]] = {
     **OWN,

@@ -43,8 +43,8 @@ from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, Pointi
 
 REVOLUTION = 5_700.0
 LOST = 60.0
-"""Angle (deg) off the target at the end of a turn, or at any time of a hold, above which a body counts as
-lost.
+"""Angle (deg) from the target at the end of a cell `turn`, or at any time of a cell `hold`, above which a
+body counts as lost.
 """
 ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
 """Largest angle (deg) of arrival: the KnightCube is the lighter body, and issue 19 permits it a larger error.

@@ -62,7 +62,8 @@ SAMPLES = 4
 """Number of magnetometer samples in a pause of the coils."""
 COIL_ERROR = FreeFilterSettings().coil_error
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
-"""Times (s): between star attitudes, between plans, before a plan is repeated, and of the prediction."""
+"""Times (s): between star attitudes, between plans, before a failed plan is repeated, and length of the
+prediction."""
 COAST = 12.0
 """Time (s) with the coils off while the attitude estimate settles."""
 STAR_SIGMA = 5e-5
@@ -77,7 +78,8 @@ SLEW = {"knightcube": 300.0, "cubesat_3u": 900.0}
 CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
 """Boresight of the star camera, body axes; the camera has no exclusion cone in this campaign."""
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
-"""Expected torque (N m) and its random walk (N m per sqrt(s)) in the filter, as in the configurations."""
+"""Prior torque (N m) of the filter and its random walk (N m per sqrt(s)), by craft, as in the
+configurations."""
 
 
 class PointingFlight:
@@ -297,7 +299,7 @@ class PointingFlight:
 
 
 def density_ratio(orbit: str, density: float | None) -> float:
-    """Return a mean density of the air, kg/m^3, relative to that of the simulated world; 1 for None."""
+    """Return a mean air density, kg/m^3, relative to the simulated world's; 1 if `density` is None."""
     if density is None:
         return 1.0
     position = np.array([[EARTH_RADIUS + ORBITS[orbit][0], 0.0, 0.0]])

@@ -180,7 +180,7 @@ def star_streaks(
 def count_indicators(
     report: ObjectReport, truth: FloatArray, ends: FloatArray, magnitudes: FloatArray, rule: str
 ) -> list[list[int]]:
-    """Return correct, overlapping and false streaks (3, 3) that each indicator singles out by a rule."""
+    """Return the counts (3, 3) of correct, overlapping and false streaks that each indicator selects."""
     streaks = report.indicators.endpoints
     fired = _strict(report.indicators.deviations) if rule == "strict" else report.indicators.fired
     counts = np.zeros((3, 3), dtype=int)

@@ -37,7 +37,8 @@ MEMORY_BYTES_PER_HOUR = 8 << 20
 BUDGET_BYTES = 4 << 20
 _SEGMENT_BYTES = 256 << 10
 _UNHEARD = ("camera", "vision", "disk")
-"""Parts without faults. The flight has no camera, and a full disk would lose the records of other faults."""
+"""Parts that receive no faults, because the flight has no camera, and a full disk would lose the records
+of other faults."""
 
 
 def cases(hours: int, seed: int) -> list[Case]:

@@ -58,7 +58,7 @@ class Point:
 
 
 def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
-    """Return all points of a start from the numbers of calls: all, and those before the configuration."""
+    """Return all points of a start, from the numbers of all calls and of those before the configuration."""
     return [
         Point(number > before[call], call, number, error)
         for call in CALLS

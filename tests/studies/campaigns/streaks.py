@@ -1,4 +1,4 @@
-"""Campaigns `streaks` and `streaks-thesis`: Table 3.1, Figures 3.7-3.10, five estimators, Cramer-Rao bound.
+"""Campaigns `streaks` and `streaks-thesis`: five estimators as in Table 3.1 and Figures 3.7-3.10.
 
 A cell is one theta (axis to boresight) and one rotation in percent of the field (3.28). All estimators get
 the same frames. The error of the magnitude is the thesis's metric for the rate. The error of the vector has
@@ -134,7 +134,7 @@ def measured_bias(
 
 
 def _nearest(ends: FloatArray, true: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return distance (n,), px, and index of the true streak (m, 2, 2) nearest to each of (n, 2, 2)."""
+    """Return distance (n,), px, and index of the true streak (m, 2, 2) nearest to each streak (n, 2, 2)."""
     distance = np.linalg.norm(true[None] - ends[:, None], axis=-1).max(axis=-1)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     star = distance.argmin(axis=1)

@@ -3,14 +3,14 @@
 Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another position of the orbit with a
 tumble, whose rate is lower than the configured one so that all phases fit into the flight. Body, coils and
 sensors differ from the configuration within the accuracies that the configuration states
-(`simulation.free_body.errors`). Cells `NAME-tumble` are the beginnings of these flights, in which most bodies
-are still tumbling; they show within minutes whether the claimed uncertainty is correct.
+(`simulation.free_body.errors`). Cells `NAME-tumble` are only the beginnings of such flights, in which most
+bodies still tumble. They show within minutes whether the claimed uncertainty is correct.
 
-The attitude is judged in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse. NEES
-is that of one axis, from samples 10 s apart, about the body axes and about those of the star camera. The
-share of the samples beyond 5 sigma and the longest excursion are counted in all attitude packets (10 Hz)
-while the attitude is fine. `learned_refused` counts the events `learned-refused`, which are false alarms in
-these flights.
+The attitude is evaluated in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse.
+The NEES is given per axis, from samples 10 s apart, about the body axes and about the axes of the star
+camera. The share of the samples beyond 5 sigma and the longest excursion are counted in all attitude packets
+(10 Hz) while the attitude is fine. `learned_refused` counts the events `learned-refused`, which are false
+alarms in these flights.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ PHASES = ("tumble", "acquisition", "slew", "sunlit", "eclipse")
 EVERY = 10.0
 """Time (s) between the samples of a NEES."""
 BEYOND = 5.0
-"""Error of an axis, in standard deviations, beyond which a sample counts as an excursion."""
+"""Error about an axis, in standard deviations, above which a sample counts as an excursion."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each configuration, and the beginnings of as many."""
+    """Return `runs` flights of each configuration, and `runs` cells `NAME-tumble`."""
     found = []
     for k, name in itertools.product(range(runs), FLOWN):
         short = {"name": name, "label": f"{name}-tumble", "seconds": BEGINNINGS[name]}
@@ -70,7 +70,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly the case; its parameters `seconds` and `speed` (rad/s) may shorten it and slow the release."""
+    """Run the case; its parameters `seconds` and `speed` (rad/s) may replace duration and release rate."""
     given = case.parameters
     name = given["name"]
     duration, speed = given.get("seconds", FLOWN[name]), given.get("speed", SPEED[name])
@@ -85,7 +85,7 @@ def _flight(
 ) -> tuple[OrbitConfig, Simulation]:
     """Return configuration and world of a flight to the first target.
 
-    The elements are omitted, because they fit one orbit.
+    The configuration has no orbital elements, because elements fit only one orbit.
     """
     config, world = configured(name)
     config = configuration.replace(config, elements=None, duration=duration, targets=config.targets[:1])
@@ -102,10 +102,10 @@ def _flight(
 
 
 def facts(flown: Run, config: OrbitConfig) -> Result:
-    """Return the figures of one flight."""
+    """Return the results of one flight."""
     body, camera = attitude_errors(flown), camera_errors(flown)
     packets, stars, rates = flown["navigation"], flown["stars"], flown["streak"]
-    # The filter has not rejected a measurement that comes before the first estimate.
+    # Measurements before the first estimate are not counted, because the filter cannot reject them.
     begun = body.times[0] if len(body.times) else math.inf
     measured = np.isfinite(stars["quaternion"][:, 0]) & (seconds(stars) > begun)
     rated = np.isfinite(rates["rate"][:, 0]) & (seconds(rates) > begun)
@@ -173,7 +173,7 @@ def _figures(errors: AttitudeErrors, inside: BoolArray) -> list[float]:
 
 
 def _excursions(flown: Run, body: AttitudeErrors) -> dict[str, float]:
-    """Return the counts of fine and of excessive samples of an axis, and the longest excursion (s)."""
+    """Return the numbers of fine samples and of excursions per axis, and the longest excursion (s)."""
     packets = flown["navigation"]
     at = np.maximum(np.searchsorted(seconds(packets), body.times, side="right") - 1, 0)
     fine = packets["knowledge"][at] == FINE
@@ -224,7 +224,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 
 def _phase(parts: Sequence[Result]) -> dict[str, float | None]:
-    """Return the figures of a phase over all flights; angles are deg rms of three axes."""
+    """Return the results of a phase over all flights; angles are deg rms over three axes."""
     row: dict[str, float | None] = {}
     for name in ("body", "camera", "stars"):
         count, error, claim, nees = np.sum([part[name] for part in parts], axis=0).tolist()
@@ -238,7 +238,7 @@ def _phase(parts: Sequence[Result]) -> dict[str, float | None]:
 
 
 def _flights(mine: Sequence[Result]) -> dict[str, Any]:
-    """Return the figures of the flights of one configuration."""
+    """Return the results of the flights of one configuration."""
     out = [result["excursions"] for result in mine]
     samples, beyond = (sum(one[key] for one in out) for key in ("samples", "beyond"))
     inertia = [result["inertia"] for result in mine if result["inertia"] is not None]

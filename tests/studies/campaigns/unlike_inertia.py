@@ -1,18 +1,19 @@
 """Campaign `unlike-inertia`: the coil monitor on a satellite that differs from its description.
 
 Each flight runs the loop of the 3U or of the KnightCube. The true moments and principal axes, coils, gyro and
-magnetometer differ from the configuration within the accuracies that the configuration states. Two phases are
-flown. In the phase `tumble`, the satellite is released at 10 deg/s and detumbled. In the phase `slow`, it is
-released at 0.2 deg/s, turns to the Sun and holds the Sun. The coils are then hardly used, so that the
-self-test must find a fault. The self-test runs every minute, ten times as often as by default. The cameras
-are left out, because a tumble does not use the cameras, and rendering would cost most of the time. In the
-phase `slow`, the solar cells and the magnetometer give the attitude.
+magnetometer differ from the configuration within the accuracies that the configuration states. A flight has
+one of two phases. In the phase `tumble`, the satellite is released at 10 deg/s and detumbled. In the phase
+`slow`, it is released at 0.2 deg/s, rotates to the Sun and holds this attitude. The coils are then driven so
+little that only the self-test can find a fault. The self-test runs every minute, ten times as often as by
+default. The cameras are left out, because a tumble does not use the cameras, and rendering would cost most of
+the time. In the phase `slow`, the solar cells and the magnetometer give the attitude.
 
-The coils are healthy, or one of them becomes reversed or open at a random time in the first ten seconds. From
-the log: which healthy coils were suspected, isolated or corrected, and how long after its onset the fault was
-handled. A reversed coil is handled when its sign is changed, and an open coil when it is isolated.
+The coils are healthy, or one of them becomes reversed or open at a random time in the first ten seconds. The
+log shows which healthy coils were suspected, isolated or corrected, and how long after its onset the fault
+was handled. A reversed coil is handled when its sign is changed, and an open coil when it is isolated.
 
-The campaign `coil-faults` judges the attitude estimate during coil faults on the testbed, not the monitor.
+The campaign `coil-faults` evaluates the attitude estimate during coil faults on the testbed, and not the
+monitor.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ DURATIONS = {
 }
 """Time (s) of the flights of each phase and state of the coils."""
 _FIRST = 4
-"""Number of the states that were flown first; their numbers and seeds stay the same."""
+"""Number of coil states in the first version of this campaign, whose case numbers and seeds stay the same."""
 ONSET = 10.0
-"""Latest onset (s) of a fault."""
+"""Latest time (s) at which a fault begins."""
 SOON = 30.0
 """Time (s) from its onset within which a fault must be handled in a tumble."""
 TEST_INTERVAL = 60.0
@@ -57,7 +58,7 @@ SLOW_SPEED = 0.0035
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each craft in each phase and state, with the faults on x, y and z in turn."""
+    """Return `runs` flights of each craft in each phase and state, with faults on x, y and z in rotation."""
     kinds = tuple(DURATIONS)
     return [
         Case(f"{name} {kind} {k}", (seed, number, k), {"name": name, "kind": kind, "axis": "xyz"[k % 3]})
@@ -96,7 +97,7 @@ def run(case: Case) -> Result:
 
 
 def _slow(config: OrbitConfig, world: Simulation) -> tuple[OrbitConfig, Simulation]:
-    """Return configuration and world of a satellite that is released slowly and turns to the Sun."""
+    """Return configuration and world of a satellite that is released slowly and rotates to the Sun."""
     assert world.free_body is not None
     release = configuration.replace(world.free_body.release, speed=SLOW_SPEED)
     body = configuration.replace(world.free_body, release=release)

@@ -2,8 +2,8 @@
 
 Each photograph of ../shared/data/sky is warped about its centre by 1 to 4 %: `stretch` along the columns or
 the rows, `shear`, or `tangential` distortion (displacement of a corner relative to its distance). In the
-cases `all`, each of the three deformations has half that size. The truth is the attitude found in the
-original photograph; its uncertainty is added to the claimed one.
+cases `all`, each of the three deformations has half that amplitude. The truth is the attitude found in the
+original photograph, whose uncertainty is added to the claimed one.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ PHOTOGRAPHS = Path(__file__).resolve().parents[4] / "shared/data/sky"
 KINDS = ("stretch", "shear", "tangential", "all")
 LEAST, MOST = 0.01, 0.04
 _FIELD_DEG = 10.8
-"""Field of view of the photographs without a known one."""
+"""Field of view (deg) of photographs whose field of view is not known."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` warps of each kind of each photograph, none without ../shared/data/sky."""
+    """Return `runs` warps of each kind of each photograph; without ../shared/data/sky, no case."""
     names = sorted(each.name for each in PHOTOGRAPHS.glob("*.*") if each.suffix not in (".json", ".md"))
     return [
         Case(f"{name}-{kind}-{run}", (seed, place, number, run), {"name": name, "kind": kind})
@@ -87,7 +87,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return how often warped photographs of each kind are solved within their claims."""
+    """Return how often warped photographs of each kind are solved within their claimed uncertainty."""
     rows = []
     for kind in dict.fromkeys(r["kind"] for r in results):
         of = [r for r in results if r["kind"] == kind]

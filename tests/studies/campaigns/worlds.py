@@ -1,7 +1,7 @@
 """Campaign `worlds`: runs of the same craft in the project's world and in Basilisk.
 
 `detumble/` flies the KnightCube of the campaign `detumble`, alternately by two laws. `nadir/` holds nadir as
-`orbit-pointing` does, alternately with 3U and KnightCube, at SHARE of the worst torques. Only the worlds
+in `orbit-pointing`, alternately with 3U and KnightCube, at SHARE of the worst torques. Only the worlds
 differ. Basilisk has no day bulge, no ring current and no random walks of air density and dipole, so they are
 off in both worlds. Its field is WMM2025; that of this project is IGRF-14. Times, errors and coil energies
 should agree within 20 % in the median. The campaign needs the extra `worlds`.
@@ -22,11 +22,11 @@ from tests.studies.campaigns import detumble, free_flight, orbit_pointing
 
 WORLDS = ("free_body", "basilisk")
 LAWS = ("magnetometer", "attitude")
-"""Laws of the campaign `detumble` that both worlds fly."""
+"""Control laws of the campaign `detumble` that are simulated in both worlds."""
 WITHIN = 0.2
 SHARE = 0.3
 FIGURES = {"detumble": ("seconds",), "nadir": ("nadir_rms", "knowledge_rms", "mean_square")}
-"""Compared figures of each kind of flight: time (s); angle (deg) off nadir; attitude error (deg); squared
+"""Compared results of each kind of flight: time (s); angle (deg) from nadir; attitude error (deg); squared
 dipole (A^2 m^4) of the coils.
 """
 _FLY = {"detumble": detumble.run, "nadir": orbit_pointing.run}
@@ -69,7 +69,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return each flight's figures in both worlds, and their comparison."""
+    """Return each flight's results in both worlds, and their comparison."""
     facts: dict[str, Any] = {"lost": sum(result["lost"] for result in results)}
     lines: list[str] = []
     for kind, figures in FIGURES.items():
@@ -83,7 +83,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 
 
 def _compared(results: Sequence[Result], figure: str, lines: list[str]) -> dict[str, Any]:
-    """Return the comparison of one figure over the flights of both worlds; add its table to `lines`."""
+    """Return the comparison of one result over the flights of both worlds; add its table to `lines`."""
     values: dict[str, dict[str, float]] = {}
     for result in results:
         values.setdefault(result["flight"], {})[result["world"]] = result[figure]

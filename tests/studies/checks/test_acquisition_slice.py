@@ -1,4 +1,4 @@
-"""Runs a slice of the campaign `acquisition`: one run in the loop with stars in view."""
+"""Runs one case of the campaign `acquisition` in the whole loop, with stars in view."""
 
 from __future__ import annotations
 

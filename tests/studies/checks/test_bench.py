@@ -34,7 +34,7 @@ def test_an_unknown_bench_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.parametrize("name", ["plan", "likelihood", "mid_exposure"])
 def test_a_bench_gets_its_own_arguments(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Test a main function with a list of arguments, and one that reads the command line."""
+    """Test a main function that takes a list of arguments, and one that reads the command line."""
     with pytest.raises(SystemExit) as stopped:
         bench.main([name, "--help"])
     assert stopped.value.code == 0

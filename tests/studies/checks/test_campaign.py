@@ -82,7 +82,7 @@ def test_broken_off_it_goes_on_and_runs_nothing_twice(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_part_of_the_cases_gives_what_these_give_in_the_whole(tmp_path: Path) -> None:
     whole = fly_here(TOY, 12, 3)
-    found = fly(TOY, 12, 3, tmp_path, workers=1, only="1")  # 1, 10 and 11
+    found = fly(TOY, 12, 3, tmp_path, workers=1, only="1")  # selects cases 1, 10 and 11
     total = whole[1]["value"] + whole[10]["value"] + whole[11]["value"]
     assert found.facts == {"total": pytest.approx(total), "runs": 3}
     with pytest.raises(UsageError, match="give another folder"):

@@ -25,7 +25,7 @@ from knightcube.errors import UsageError
 
 distributed = pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of Dask's own libraries
+pytestmark = pytest.mark.filterwarnings("ignore")  # ignores warnings of Dask's own libraries
 
 
 def cases(runs: int, seed: int) -> list[Case]:

@@ -1,4 +1,4 @@
-"""Runs a slice of the control campaigns: the lower bound, one unlike world, and the table."""
+"""Runs a slice of the control campaigns: lower bound, a world that differs from the model, and the table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs a slice of the campaign `damaged-files`, and tests that damage would be detected."""
+"""Runs a slice of the campaign `damaged-files`, and tests that the campaign would report a failed start."""
 
 from __future__ import annotations
 

@@ -76,13 +76,13 @@ class Sky:
         sensors: frozenset[str],
         gyro: bool = True,
     ) -> Report:
-        """Give measurements twice a second, and return the report at the end."""
+        """Give the filter measurements twice a second, and return its report at the end."""
         for half in range(round(2 * begin), round(2 * end)):
             self.show(estimator, 0.5 * half, sensors, gyro)
         return estimator.report(round((end - 0.5) * SECOND))
 
     def errors(self, report: Report) -> FloatArray:
-        """Return the attitude error over its sigma (3,)."""
+        """Return the attitude error (3,) in units of its claimed sigma."""
         assert report.estimate is not None
         truth = self.attitude(report.time_ns / SECOND)
         return rotation_vector(multiply(truth, conjugate(report.estimate.quaternion))) / report.sigma
@@ -97,7 +97,7 @@ def begun(sensors: frozenset[str] = ALL, seconds: float = 60.0) -> tuple[Sky, At
 
 @pytest.mark.parametrize("pair", [{"sun", "nadir"}, {"sun", "field"}, {"nadir", "field"}])
 def test_any_two_of_three_begin_honestly(pair: set[str]) -> None:
-    """Check the NEES of the first attitude and of that 15 s later over 24 seeds (99.9 % band)."""
+    """Check the NEES over 24 seeds, of the first attitude and of the attitude 15 s later (99.9 % band)."""
     for seconds in (1.5, 15.0):
         total = 0.0
         for seed in range(24):
@@ -146,7 +146,7 @@ def test_without_what_is_lost_it_goes_on_and_says_how_well(left: set[str], statu
     if status is Status.COASTING:
         assert np.all(report.sigma > 5.0 * before.sigma)
     elif status is Status.AIDED and "sun" in left:
-        # Across the Sun the attitude stays known; about the Sun it drifts.
+        # The attitude across the Sun direction remains accurate; the rotation about it drifts.
         assert report.estimate is not None
         about = attitude_matrix(report.estimate.quaternion) @ SUN
         spread = report.estimate.covariance[ATTITUDE, ATTITUDE]

@@ -33,7 +33,7 @@ def test_the_filter_is_judged_with_stars_and_at_the_end_of_the_shadow(tmp_path: 
     given = {"learned": 100.0, "settled": 60.0, "last": 60.0, "seconds": 240.0}
     results = [
         eclipse.run(Case("slice", (9, run), {"kind": "filter", "craft": "knightcube", **given}))
-        for run in (6, 13)  # their shadows begin within five minutes
+        for run in (6, 13)  # in both cases the shadow begins within five minutes
     ]
     for result in results:
         assert result["shadow_s"] == pytest.approx(240.0)
@@ -63,7 +63,7 @@ class Driven(eclipse.DarkFlight):
 
 
 def test_a_body_that_is_driven_hard_is_known_within_its_claim() -> None:
-    """Compare the gyro's mean over pause and command with the filter's mean over the same time."""
+    """Compare the gyro's mean rate over a pause and a command with the filter's mean over the same time."""
     flight, off, speeds = Driven("knightcube", 5), [], []
     for cycle in range(60):
         flight.cycle(cycle * CYCLE)

@@ -1,7 +1,7 @@
 """Tests of the benchmark `executive`: a bare loop, workers that are kept busy, and a few seconds of a flight.
 
 The criteria for the flight do not depend on the load of the machine: the kernel reports for how long the
-control thread had no processor. The lateness counts only if the machine was calm.
+control thread had no processor. The lateness is checked only if the machine was calm.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tests.support.executive_figures import (
 )
 
 CALM = 0.05
-"""Largest share of the time that the control thread may wait for a processor on a calm machine."""
+"""Largest fraction of time for which the control thread waits for a processor on a calm machine."""
 
 
 def test_the_bare_loop_wakes_at_its_slots_and_never_before() -> None:
@@ -50,7 +50,7 @@ def test_the_bare_loop_wakes_at_its_slots_and_never_before() -> None:
     assert np.diff(slots).min() >= 1
     assert slots[0] > begun // 5_000_000
     assert np.median(wakes % 5_000_000) < 2_500_000
-    # The host can take at most the time of all cores.
+    # The stolen time is at most the elapsed time of all cores.
     assert 0 <= stolen_ns[-1] - stolen_ns[0] <= (os.cpu_count() or 1) * (wakes[-1] - wakes[0]) + 20_000_000
 
 
@@ -58,7 +58,7 @@ runs: list[Any] = []
 
 
 def run(job: Any) -> int:
-    """Record a job; this module replaces that of a worker."""
+    """Record a job; the tests use this module instead of a worker's module."""
     runs.append(job)
     time.sleep(0.001)
     return len(runs)
@@ -85,7 +85,7 @@ def test_a_busy_worker_does_its_last_job_again_until_the_next_one_comes() -> Non
 
 @pytest.mark.parametrize("name", ["orbit.yaml", "step_demo.yaml"])
 def test_every_worker_of_a_flight_is_kept_busy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight.app.flight.workers", workers)  # restores it at the end
+    monkeypatch.setattr("flight.app.flight.workers", workers)  # the patch is undone after the test
     busy_jobs.keep_busy()
     config = configuration.load(ROOT / "config" / name)
     made, plain = opening.workers(config), workers(config)
@@ -101,7 +101,7 @@ def test_four_seconds_of_flight_keep_the_grid_with_planner_and_vision_at_work(tm
     figures = flown.figures
     assert figures["slots"] >= 130
     assert figures["slips"] == pytest.approx(figures["slips_computed"], abs=1)
-    # A late cycle is never followed by a burst, and no cycle waits for a worker.
+    # After a late cycle the loop does not catch up with a burst, and no cycle waits for a worker.
     assert figures["closest_s"] >= 0.499e-9 * PERIOD_NS
     assert figures["blocked"] < 0.1
     assert figures["processor_control"] < 0.8
@@ -115,7 +115,7 @@ def test_four_seconds_of_flight_keep_the_grid_with_planner_and_vision_at_work(tm
         assert figures["lateness_s"]["p50"] < 0.5e-9 * PERIOD_NS
         assert figures["execution_s"]["p50"] < 1e-9 * PERIOD_NS
         assert figures["first_command_s"] < 30.0
-    # The same flight with a higher processor load, or with one more lost cycle, would fail.
+    # The same flight would fail with a higher processor load or one more lost cycle.
     assert "processor_control" in misses(figures | {"processor_control": 0.36})
     assert "lost_beyond_machine" in misses(figures | {"lost_beyond_machine": 1})
     assert "memory_slope_mib_per_hour" in misses(figures | {"memory_slope_interval": (1.5, 3.0)})

@@ -22,7 +22,7 @@ _FRAMES = 6
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Return a frame whose rate is the truth for invented answers."""
+    """Return a frame whose rate is the truth for artificial results."""
     return slew(np.random.default_rng(_SEED), 1.0, 0.1, 0.2, limit=4.0)
 
 
@@ -41,7 +41,7 @@ def test_the_first_call_of_a_process_loads_code_and_is_not_timed() -> None:
 
 
 def _answer(scene: Scene, error: float, sigma: float) -> MotionResult:
-    """Return an answer with a relative rate error of `error` and a claimed relative sigma of `sigma`."""
+    """Return a result with a relative rate error of `error` and a claimed relative sigma of `sigma`."""
     size = float(np.linalg.norm(scene.rate))
     covariance = (sigma * size) ** 2 * np.eye(3)
     return MotionResult(
@@ -100,7 +100,7 @@ def test_every_frame_has_five_usable_stars_and_is_the_same_again() -> None:
 
 @pytest.fixture(scope="module")
 def results() -> list[Result]:
-    """Return a slice of the campaign, run as by the command."""
+    """Return the results of a slice of the campaign, run as the command does."""
     return fly_here(failures.FAILURES, _FRAMES, _SEED)
 
 

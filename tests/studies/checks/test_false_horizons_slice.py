@@ -15,8 +15,8 @@ from tests.studies.campaigns.false_horizons import FALSE_HORIZONS, HARD, run
 from tests.studies.campaigns.limbless import MAKERS, photographed
 
 SEED = 3
-# Each of these pictures has a significant horizon, with or without known altitude, if the number of trials is
-# ignored.
+# Each of these pictures would give a significant (false) horizon, with or without known altitude, if the test
+# ignored the number of trials.
 FALSE_ONCE = ("clouds-15", "coast-16", "terminator-12", "gradient-6", "stars-4", "flares-11")
 
 
@@ -27,7 +27,7 @@ def test_pictures_that_once_gave_a_horizon_give_none_and_a_crescent_is_found(tmp
     results = [run(cases[key]) for key in (*FALSE_ONCE, "limb-crescent-0")]
     verdicts = [[answer["verdict"] for answer in result["answers"]] for result in results]
     assert not any({"right", "wrong"} & set(each) for each in verdicts[:-1])
-    # The last verdict is that with the prior knowledge of a flight.
+    # The last verdict is the one with the prior knowledge of a flight.
     assert verdicts[-1][-1] == "right"
     summary = FALSE_HORIZONS.summarise(results, tmp_path)
     json.dumps(summary.facts, allow_nan=False)

@@ -20,7 +20,7 @@ from tests.support.packed_run import WritablePackets
 
 AT = 5.0
 BRIEF = 14.0
-"""Duration (s) of a flight with one fault: long enough to find the fault, end it, and recover."""
+"""Duration (s) of a flight with one fault, long enough to detect the fault, end it, and recover."""
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch
 def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any) -> None:
     """The log of a flight with a silent unit is changed as if the loop had continued.
 
-    Both figures must show it.
+    Both results of the evaluation must show the fault.
     """
     entry = FaultEntry(fault="imu: silent", at=AT, span=3.0)
     section = configuration.replace(demo_world(), seed=3, faults=(entry,))
@@ -119,7 +119,7 @@ def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
 def test_the_twin_without_a_fault_reports_none_of_their_events(mode: str, tmp_path: Any) -> None:
     """Fly the seeds and modes of the faulty flights above without a fault.
 
-    Another test has the other two modes.
+    Another test covers the other two modes.
     """
     section = configuration.replace(demo_world(), seed=3)
     run = fly(config_for(mode, camera=False, duration=BRIEF), tmp_path, section=section)

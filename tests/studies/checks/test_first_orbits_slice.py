@@ -1,4 +1,4 @@
-"""Runs a small slice of the campaign `first-orbits`: errors as claimed, and short arcs refused."""
+"""Runs a small slice of the campaign `first-orbits`: errors agree with claims, and short arcs are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_orbits_of_four_minutes_are_as_good_as_they_claim(tmp_path: Path) -> Non
     made = [result for result in results if result["refused"] is None]
     assert len(made) >= 2
     total = sum(result["nees"] for result in made)
-    # 99.8 % interval of chi-square with 12 to 24 degrees of freedom
+    # The limits contain the 99.8 % intervals of chi-square with 12 to 24 degrees of freedom.
     assert 2.2 < total < 51.0
     assert sum(result["covered"] for result in made) >= len(made) - 1
     json.dumps(FIRST_ORBITS.summarise(results, tmp_path).facts, allow_nan=False)

@@ -26,7 +26,7 @@ def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> 
 
 
 def test_the_magnetometer_alone_knows_the_rate_that_the_coils_brake() -> None:
-    """The component along the field first grows across it; some magnetometer samples are outliers."""
+    """The component along the field becomes observable as the field rotates; some samples are outliers."""
     wanted = {**CASE, "law": "magnetometer", "speed": 0.1, "longest": 240.0, "spikes": 0.05}
     result = detumble.run(Case("m", (20_261_123, 1), wanted))
     assert not result["lost"]
@@ -49,7 +49,10 @@ def test_a_body_that_did_not_stop_is_counted_as_lost(tmp_path: Path) -> None:
 
 
 def test_a_satellite_that_starts_with_nothing_learned_turns_to_its_target(tmp_path: Path) -> None:
-    """A KnightCube starts 60 deg off nadir; the planner's slew of 300 s brings it there, as in the loop."""
+    """A KnightCube starts 60 deg off nadir.
+
+    The planner's slew of 300 s rotates it to nadir, as in the loop.
+    """
     parameters = {"craft": "knightcube", "share": 0.1, "target": "nadir"}
     start = {"kind": "turn", "turn_deg": 60.0, "speed_deg": 0.1, "seconds": 340.0}
     turn = orbit_pointing.run(Case("turn", (20_261_123, 1), parameters | start))

@@ -1,4 +1,4 @@
-"""Tests that the summaries of the kill campaigns report faults; the runs themselves are campaigns."""
+"""Tests that the summaries of the kill campaigns report faults; the kills themselves run in the campaigns."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def test_claims_with_old_elements_are_honest_and_only_good_fixes_are_used(kind: 
     ],
 )
 def test_place_sun_field_shadow_and_attitude_are_known_throughout_the_mission(craft: str, utc: str) -> None:
-    """Two ordinary dates, the rollover of the GPS week, and a leap second."""
+    """The cases are two ordinary dates, the rollover of the GPS week, and a leap second."""
     [case] = [case for case in months(132, 1) if case.key.startswith(f"{craft}.yaml/{utc}")]
     result = fly_month(case)
     assert (result["unknown"], result["eclipse_wrong"]) == (0, 0)

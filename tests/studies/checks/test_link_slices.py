@@ -1,4 +1,4 @@
-"""Runs a slice of the link kills, and tests that they would detect a link that stores too late."""
+"""Runs a slice of the benchmark `link_kills`, and tests that it would detect a link that stores too late."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ LISTS = 6
 
 @pytest.fixture(scope="module")
 def results() -> list[Result]:
-    """Return the results of nominal lists."""
+    """Return the campaign's results for nominal lists."""
     cases = [
         Case(f"nominal/0/{run}", (20_261_121, 0, run), {"axis": "nominal", "value": 0.0})
         for run in range(LISTS)
@@ -50,7 +50,7 @@ def test_no_two_cases_share_a_key_or_a_seed() -> None:
 
 
 def test_an_answer_off_by_more_than_the_noise_allows_is_wrong() -> None:
-    """The true attitude is right, and the same attitude rotated by half a degree is wrong."""
+    """The true attitude counts as right, and the same attitude rotated by half a degree as wrong."""
     sky = lost_in_space.known_sky(15.0)
     drawn = draw(ListKind(field_deg=15.0, known_deg=0.0), sky.index.stars, np.random.default_rng(7))
     field = drawn.field()

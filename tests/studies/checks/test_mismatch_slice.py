@@ -103,7 +103,10 @@ def test_an_axis_5_px_off_is_within_what_is_claimed_unless_the_lens_is_called_ex
 
 @pytest.mark.slow
 def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rate() -> None:
-    """The distortion is 1 % at the corner. A correction after the fit leaves up to 1.5 % of the rate."""
+    """The distortion is 1 % at the corner.
+
+    A correction after the fit alone would leave a rate error of up to 1.5 %.
+    """
     for run in range(3):
         case = next(c for c in mismatch.mismatch_cases(run + 1, _SEED) if c.key == f"distortion 1 % 30 {run}")
         result = mismatch.run_mismatch(case)
@@ -114,7 +117,7 @@ def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rat
 
 @pytest.mark.slow
 def test_an_elongated_point_spread_that_nobody_described_is_refused_on_short_streaks() -> None:
-    """A body that vibrates fast along one axis draws the same streaks with other end points."""
+    """A body that vibrates fast along one axis causes the same streaks with other end points."""
     result = mismatch.run_mismatch(_case("ellipse 1:2 turned", 0))
     assert result["nees"] is None
 

@@ -89,7 +89,7 @@ def changes(source: str) -> set[str]:
     ],
 )
 def test_one_line_is_changed(source: str, expected: set[str]) -> None:
-    """Check each kind of change."""
+    """Check each kind of change that makes a mutant."""
     assert changes(source) == expected
 
 
@@ -117,7 +117,7 @@ def test_a_change_without_an_effect_is_not_a_mutant(source: str) -> None:
 def test_killed_survived_and_equivalent(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Check each verdict, the file of results, and the unchanged checkout.
+    """Check each verdict and the file of results, and that the checkout is unchanged.
 
     A test that always fails kills no mutant.
     """

@@ -1,4 +1,4 @@
-"""Runs a slice of the campaign `object-flights`, and tests its bound against a manual result."""
+"""Runs a slice of the campaign `object-flights`, and tests its bound against an analytical result."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS, cases, least_
 def test_the_bound_is_that_of_a_catch_up_by_hand(lean: float) -> None:
     """An object at w = 0.3 deg/s outruns a body that starts at rest with a = 0.012 deg/s^2 by w^2 / 2 a.
 
-    The object starts 1 deg before the boresight, which reduces the deviation by that angle. With a field that
-    leans towards the axis of rotation, only the cosine of the authority remains.
+    The object starts 1 deg before the boresight, which reduces the deviation by 1 deg. If the field leans
+    towards the axis of rotation, the authority is multiplied by the cosine of that angle.
     """
     rate, authority, step = np.radians(0.3), np.radians(0.012), 0.5
     times = np.arange(0.0, 60.0, step)

@@ -23,6 +23,6 @@ def test_an_object_is_sighted_near_the_bound_and_an_empty_sky_shows_none(tmp_pat
         assert frame["bound"] < frame["claim"]
         assert frame["error"] < min(frame["bound"] + 0.1, 4.0 * frame["claim"])
     assert shown["nees"]
-    assert np.max(shown["nees"]) < 18.4  # 99.99 % of two degrees
+    assert np.max(shown["nees"]) < 18.4  # 99.99 % quantile of chi-square with two degrees of freedom
     assert shown["false_tracks"] == empty["false_tracks"] == 0
     json.dumps(OBJECT_PASSES.summarise([shown, empty], tmp_path).facts, allow_nan=False)

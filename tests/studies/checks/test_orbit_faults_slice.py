@@ -1,4 +1,4 @@
-"""Runs a slice of the campaign `orbit-faults`: two reported faults, and a detected coil current."""
+"""Runs a slice of the campaign `orbit-faults`: two reported faults, and a detected wrong coil current."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
     date = 2_461_120.0
     off = np.linalg.norm(known.at(date).position - old.at(date).position)
     assert off == pytest.approx(4.0 * 7.6e3, rel=0.05)
-    # After a week the unknown drag dominates the growth of 1.5 km per day.
+    # After a week the error due to unknown drag exceeds the growth of 1.5 km per day.
     assert 1500.0 + 7.0 * 1500.0 < old.at(date).sigma < 2e5
     assert off < 3.0 * old.at(date).sigma
 
@@ -123,9 +123,10 @@ def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
 def test_braking_goes_on_with_a_unit_that_restarted_at_another_phase(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Flight 0 of seed 4: the samples of the unit came a millisecond before the commands.
+    """In flight 0 of seed 4, the unit's samples came a millisecond before the commands.
 
-    The detumbler rejected all of them, and used its prediction for half a minute, which was 2.5 deg/s off.
+    A detumbler that rejected all these samples would use its prediction for half a minute, which is wrong by
+    2.5 deg/s.
     """
     found = refly(monkeypatch, 4, 0, "imu: off", "detumble", 56.0)
     assert found["works"]

@@ -18,8 +18,8 @@ def test_rendered_frames_start_the_filter_and_keep_it_within_its_claim(tmp_path:
     assert len(notes) == 5
     assert result["starts"] == 1
     assert np.isfinite(notes[-1, 2:9]).all()
-    # The limit is that across nadir (body z). The Sun or, in this run, the field determines the rotation
-    # about nadir.
+    # The limit applies to the errors across nadir (body z). The rotation about nadir is determined by the Sun
+    # or, in this run, by the magnetic field.
     assert np.abs(notes[-1, 2:4]).max() < 0.15
     assert np.all(np.abs(notes[-1, 2:5]) < 5.0 * notes[-1, 5:8])
     assert (notes[:, 10] > 0).any(), "a nadir of the cameras' limbs"

@@ -15,7 +15,7 @@ def flown(run: tuple[int, int], **parameters: Any) -> dict[str, Any]:
 
 
 def test_a_planned_path_is_held_at_little_more_than_its_heat(tmp_path: Path) -> None:
-    """The third slew of seed 1 of the KnightCube is 149 deg in 300 s, without the learned torques."""
+    """The third slew of seed 1 of the KnightCube rotates by 149 deg in 300 s, without estimated torques."""
     slew = flown((1, 2), craft="knightcube", orbit="sso", share=0.0, learn=60.0)["0.0"]
     assert slew["off"] <= orbit_slews.WANTED["knightcube"]
     assert slew["heat"] <= 1.3 * slew["optimum"]
@@ -24,9 +24,9 @@ def test_a_planned_path_is_held_at_little_more_than_its_heat(tmp_path: Path) -> 
 
 
 def test_a_body_that_was_held_at_one_attitude_knows_enough_of_the_air_to_slew() -> None:
-    """The sixth slew of seed 7 of the 3U is 53 deg in 976 s at 420 km.
+    """The sixth slew of seed 7 of the 3U rotates by 53 deg in 976 s at 420 km.
 
-    Without learned areas it ends 1.4 deg off.
+    Without estimated areas it would end 1.4 deg from the target.
     """
     slew = flown((7, 5), craft="cubesat_3u", orbit="iss", share=0.1)["0.1"]
     assert slew["off"] <= orbit_slews.WANTED["cubesat_3u"]
@@ -34,9 +34,9 @@ def test_a_body_that_was_held_at_one_attitude_knows_enough_of_the_air_to_slew() 
 
 
 def test_what_torques_do_that_are_learned_on_the_way_is_gone_at_the_end() -> None:
-    """The second slew of seed 8 of the 3U is 45 deg in 938 s at 420 km.
+    """The second slew of seed 8 of the 3U rotates by 45 deg in 938 s at 420 km.
 
-    Without an end cost it ends 0.73 deg off.
+    Without an end cost it would end 0.73 deg from the target.
     """
     slew = flown((8, 1), craft="cubesat_3u", orbit="iss", share=0.3)["0.3"]
     assert slew["off"] <= 0.5 * orbit_slews.WANTED["cubesat_3u"]
@@ -44,7 +44,7 @@ def test_what_torques_do_that_are_learned_on_the_way_is_gone_at_the_end() -> Non
 
 
 def test_a_body_that_is_not_the_described_one_ends_in_its_target() -> None:
-    """In the second flight of seed 34 of the 3U, the first slew ends far off without plans for the rest."""
+    """In the second flight of seed 34 of the 3U, the first slew would miss its target without later plans."""
     slews = flown((34, 1), craft="cubesat_3u", orbit="iss", share=0.3, unknown=True, learn=60.0)
     for slew in slews.values():
         assert slew["off"] <= orbit_slews.WANTED["cubesat_3u"]

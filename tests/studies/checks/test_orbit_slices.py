@@ -27,9 +27,9 @@ def seen() -> list[Result]:
 
 
 def test_vt_has_the_horizon_in_all_three_cameras_to_14_deg_of_tilt() -> None:
-    """Section 4.1 states 15 deg.
+    """Section 4.1 of the paper states 15 deg.
 
-    Its field of 67 deg and a limb at 19.3 deg down give 33.5 - 19.3 = 14.2 deg.
+    A field of 67 deg and a limb 19.3 deg below the horizontal give 33.5 - 19.3 = 14.2 deg.
     """
     dip = np.degrees(np.arccos(6378.1366 / (6378.1366 + 380.0)))
     assert np.degrees(coverage.all_three_up_to()) == pytest.approx(33.5 - dip, abs=0.2)
@@ -40,10 +40,11 @@ def test_the_shares_are_the_paper_s(seen: list[Result]) -> None:
     for share in shares:
         assert share["vt/level"]["horizon"][3] == 1.0
         assert share["uw/level"]["horizon"][4] == 0.0
-        # 4.1: within 15 deg of tilt the horizon is in all three cameras, except in the last degree.
+        # Section 4.1: within 15 deg of tilt all three cameras show the horizon, except in the last degree.
         assert share["vt/within 15 deg"]["horizon"][3] > 0.97
         assert sum(share["vt/within 15 deg"]["horizon"][:2]) == 0.0
-        # 4.3: pitched back and forth by 90 deg, at least two cameras have the horizon at all times.
+        # Section 4.3: when pitched back and forth by 90 deg, at least two cameras show the horizon at all
+        # times.
         assert sum(share["usu/tipped 90 deg"]["horizon"][:2]) == 0.0
         assert sum(share["vt/tipped 90 deg"]["horizon"][:2]) > 0.1
         assert share["vt/level"]["sun"] == 0.0
@@ -51,9 +52,9 @@ def test_the_shares_are_the_paper_s(seen: list[Result]) -> None:
 
 
 def test_uw_sees_the_sun_for_74_percent_of_sunlight_in_the_right_heading(seen: list[Result]) -> None:
-    """Section 4.2 states no heading and no date.
+    """Section 4.2 of the paper states neither heading nor date.
 
-    Two cameras on the Sun's side and a low Sun give its figure.
+    Two cameras on the Sun's side and a low Sun give its value.
     """
     tables = {result["beta"]: result["shares"] for result in seen if result["kind"] == "heading"}
     assert tables[15.0][coverage.BEST]["cone"] == pytest.approx(0.74, abs=0.03)
@@ -98,10 +99,10 @@ def piece(variant: str, run: int, **parameters: float) -> Result:
 
 @pytest.mark.slow
 def test_into_the_eclipse_the_filter_errs_by_no_more_than_it_says() -> None:
-    """Two orbits for 15 minutes around sunset have a NEES in its 99.9 % band and errors within limits."""
+    """Two orbits, each 15 minutes around sunset, have a NEES in its 99.9 % band and errors within limits."""
     results = [piece("all sensors", run) for run in range(2)]
     facts = orbit_attitude.variant_facts(results)
-    # Errors last for minutes, so an orbit counts as two independent instants.
+    # Errors are correlated over minutes, so an orbit counts as two independent instants.
     low, high = band(2 * 6 * 2, 0.999)
     assert low < facts["nees_mean"] < high
     assert facts["both"]["rms"] < 0.05

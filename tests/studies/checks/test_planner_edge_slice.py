@@ -29,6 +29,6 @@ def test_against_a_strong_thread_the_body_is_swung(
 
 
 def test_a_horizon_slightly_shorter_than_the_first_path_found_is_kept() -> None:
-    """Case 149 of seed 6: the first path is 0.4 % longer than the requested horizon."""
+    """In case 149 of seed 6, the first path found lasts 0.4 % longer than requested."""
     case = cases(150, 6)[149]
     assert verdict(run(case)) != "late"

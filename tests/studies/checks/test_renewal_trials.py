@@ -1,4 +1,4 @@
-"""Runs a slice of the campaign `renewal-trials`: one confirmed renewal, and one that cannot start."""
+"""Runs a slice of the campaign `renewal-trials`: one confirmed update, and one whose release cannot start."""
 
 from __future__ import annotations
 

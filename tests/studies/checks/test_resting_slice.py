@@ -1,4 +1,4 @@
-"""Runs a small slice of the campaign `resting`: claims agree with errors, also for unlike cameras."""
+"""Runs a small slice of the campaign `resting`: claimed sigmas agree with errors, also for other cameras."""
 
 from __future__ import annotations
 

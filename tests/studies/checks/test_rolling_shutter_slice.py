@@ -7,7 +7,7 @@ from tests.studies.campaigns.rolling_shutter import ALONE, PRIOR, ROLLING_SHUTTE
 
 
 def test_no_rate_is_beyond_its_covariance_with_a_prior_or_without() -> None:
-    """A chi-square of 3 degrees of freedom exceeds 16.3 once in a thousand."""
+    """A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand cases."""
     results = fly_here(ROLLING_SHUTTER, 3, 20_261_123)
     for result in results:
         assert result[PRIOR]["status"] == "rate"

@@ -36,7 +36,7 @@ def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -
     assert frame["error_px"] < 0.5
     assert frame["false"] == 0
     assert np.array(frame["strict"]).shape == np.array(THESIS).shape
-    # The thesis states less than 1 % and 0.4 deg over the ten orbits, with Harris's corners.
+    # With Harris's corners, the thesis states errors below 1 % and 0.4 deg over the ten orbits.
     for name in ESTIMATORS:
         assert abs(frame[name][0]) < 0.01
         assert frame[name][1] < 0.8
@@ -50,7 +50,7 @@ def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -
 
 
 def test_fewer_stars_are_the_brightest_and_table_4_4_counts_them_apart() -> None:
-    """In a first frame with the 7,000 brightest stars, every rule selects the object only."""
+    """In the first frame with only the 7,000 brightest stars, every rule selects the object alone."""
     stars = catalogue(faintest(BRIGHTEST))[0]
     # Magnitudes have two decimals, so several stars share the last magnitude.
     assert BRIGHTEST <= len(stars.magnitude) < 1.02 * BRIGHTEST

@@ -1,4 +1,4 @@
-"""Runs a slice of the campaign `safe-sun` with the Sun behind the body, and tests its figures."""
+"""Runs a slice of the campaign `safe-sun` with the Sun behind the body, and tests its results."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def event_logs(folder: Path, old: str, new: str) -> tuple[Path, Path]:
 
 
 def answer_folders(folder: Path, old: object, new: object) -> tuple[Path, Path]:
-    """Write two folders of answers to one command."""
+    """Write two folders with the results of one command."""
     for name, answer in (("old", old), ("new", new)):
         (folder / name).mkdir(parents=True)
         (folder / name / ANSWERS_FILE).write_text(json.dumps({"solve it.png": answer}))
@@ -360,7 +360,7 @@ def test_the_packet_table_is_the_checkouts_own_in_the_old_layout_too(tmp_path: P
 def test_a_short_flight_and_the_plans_of_the_last_commit_repeat_themselves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both sides are checkouts of HEAD, so uncommitted changes have no effect."""
+    """Both compared checkouts are of HEAD, so uncommitted changes have no effect."""
     try:
         commit = resolve("HEAD")
     except CheckoutError as error:

@@ -16,7 +16,8 @@ def test_the_claim_of_a_rate_shrinks_from_the_first_frame_to_the_third(
     assert [one["before"] for one in frames] == [0, 1, 2]
     assert frames[0]["claim"] > 5.0, "the camera is known to 2 px, 0.5 % and 30 us a line"
     assert frames[2]["claim"] < 0.5 * frames[0]["claim"]
-    # A chi-square of three degrees of freedom exceeds 21 once in 10,000 frames, and one of six 28.
+    # Once in 10,000 frames a chi-square with three degrees of freedom exceeds 21, and one with six exceeds
+    # 28.
     assert max(one["nees"] for one in frames) < 21.0
     assert max(one["lens_nees"] for one in frames) < 28.0
     assert max(one["contradictions"] for one in frames) == 0

@@ -21,7 +21,7 @@ from tests.support.scenes import FIELD
 def test_one_command_draws_every_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The campaign's cells are invented, and the flight is shortened to 12 s."""
+    """The results of the campaign are artificial, and the flight is shortened to 12 s."""
     figures: dict[str, float | None] = {"magnitude": 0.003, "across_px": None}
     cell: dict[str, Any] = {"theta": 45, "percent": 10}
     cell |= dict.fromkeys(DETECTOR_NAMES, figures)

@@ -1,4 +1,4 @@
-"""Runs slices of the tables of the three sources, and tests the list of the tables."""
+"""Computes parts of the tables of the three source documents, and tests the list of these tables."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def test_limits_of_eq_31_identify_the_lists_that_limits_of_angles_identify() -> 
 
 @pytest.mark.slow
 def test_one_frame_gives_rate_and_axis_within_the_theses_figures() -> None:
-    """One frame of each scene, with two estimators: Table 4.1 states 0.9 % and 0.65 deg."""
+    """One frame of each scene is estimated by two methods.
+
+    Table 4.1 of the thesis states 0.9 % and 0.65 deg.
+    """
     _, *rows = sources.one_frame_tables(1, SEED)
     assert [row[1] for row in rows] == 2 * ["`harris`", "`likelihood`"]
     for row in rows:

@@ -1,4 +1,4 @@
-"""Runs a small slice of the benchmark `starid_hard`: few lists of some rows, with another seed."""
+"""Runs a small slice of the benchmark `starid_hard`: a few lists of some rows, with another seed."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def test_the_command_prints_a_row_as_json(capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.slow
 def test_a_lens_fitted_wrongly_is_refused_and_a_hidden_half_is_not() -> None:
-    """An answer to one list would be 175 arcsec off, at 5 sigmas.
+    """Without the refusal, the result for one list would be wrong by 175 arcsec, or 5 sigmas.
 
-    In the good lists only the left part is visible.
+    In the accepted lists only the left part is visible.
     """
     sky = default_index()
     name = "known to 1 deg, distorted 2-8 %"

@@ -1,4 +1,4 @@
-"""Runs a small slice of the campaign `streaked`: attitudes within their claims with any shutter."""
+"""Runs a small slice of the campaign `streaked`: attitude errors agree with claims for any shutter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path)
 
 
 def test_a_shutter_that_is_described_costs_nothing(tmp_path: Path) -> None:
-    """On the same frames, the claim without a known line time is larger."""
+    """On the same frames, the claimed uncertainty is larger if the line time is not known."""
     stated, unstated = (
         STREAKED.summarise(_flown(f"rolling 0 us, {how}", 2), tmp_path).facts["all"]
         for how in ("stated", "unstated")

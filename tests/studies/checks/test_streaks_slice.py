@@ -1,4 +1,4 @@
-"""Runs a small slice of the campaign `streaks`: five estimators against bound and truth."""
+"""Runs a small slice of the campaign `streaks`: five estimators are compared with bound and truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def results() -> list[Result]:
 
 @pytest.mark.slow
 def test_the_likelihood_estimator_is_at_the_bound_and_knows_it(results: list[Result]) -> None:
-    """Check the ratio of rms errors to the bound, and the NEES of 15 degrees of freedom (99.9 %)."""
+    """Check the ratio of rms error to bound, and the NEES with 15 degrees of freedom (99.9 % limits)."""
     found = [result["likelihood"] for result in results]
     assert all(one["status"] == "rate" for one in found)
     ratios = [
@@ -36,7 +36,7 @@ def test_the_likelihood_estimator_is_at_the_bound_and_knows_it(results: list[Res
 
 @pytest.mark.slow
 def test_the_thesis_detectors_stay_within_table_3_1(results: list[Result]) -> None:
-    """Table 3.1 states mean magnitude errors of 0.69 and 1.20 % at 10 % for Harris and minimum eigenvalue."""
+    """At 10 %, Table 3.1 states mean magnitude errors of 0.69 % (Harris) and 1.20 % (minimum eigenvalue)."""
     for name, limit in (("harris", 0.0069), ("minimum-eigenvalue", 0.0120)):
         errors = [abs(r[name]["magnitude"]) for r in results if r[name]["status"] == "rate"]
         assert len(errors) >= FRAMES - 1
@@ -52,12 +52,12 @@ def test_the_summary_has_a_row_for_every_cell(results: list[Result]) -> None:
 
 @pytest.mark.slow
 def test_the_thesis_s_own_camera_gives_the_thesis_s_table() -> None:
-    """Table 3.1 states 0.07 % at 50 % for Harris, and 0.19 % for minimum eigenvalue.
+    """At 50 %, Table 3.1 states errors of 0.07 % (Harris) and 0.19 % (minimum eigenvalue).
 
     The mean of two frames may be twice that.
 
-    The model of the likelihood estimator is not this camera. It must refuse a frame, or be better than the
-    best result of the thesis.
+    The model of the likelihood estimator does not describe this camera. The estimator must refuse a frame, or
+    be better than the best result of the thesis.
     """
     cases = [Case(f"60/50/{run}", (20_261_123, run), {"theta": 60, "percent": 50}) for run in range(2)]
     seen = [streaks.run_thesis(case) for case in cases]

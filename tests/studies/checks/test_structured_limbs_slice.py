@@ -17,7 +17,7 @@ def test_limbs_behind_structure_are_found_with_honest_claims(tmp_path: Path) -> 
     answers = [answer for result in results for answer in result["answers"]]
     assert len(answers) == 15
     assert all(answer["status"] == "found" and answer["nees"] < 6.0 for answer in answers)
-    # With a field of view that is wrong by 5 %, the plain search would be 0.5 to 2 deg off.
+    # With a field of view that is wrong by 5 %, a search with a fixed field would be wrong by 0.5 to 2 deg.
     assert all(answer["error_deg"] < 0.5 for answer in answers if answer["known"] == "flight")
     facts = STRUCTURED_LIMBS.summarise(results, tmp_path).facts
     json.dumps(facts, allow_nan=False)

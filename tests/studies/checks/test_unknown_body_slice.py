@@ -17,9 +17,9 @@ ROWS = ("orbit", "orbit-tumble", "orbit_3u", "orbit_3u-tumble")
 
 
 def largest(count: int) -> float:
-    """Return the mean square of `count` normal errors that a correct filter exceeds once in 1,000 flights.
+    """Return the mean square of `count` normal errors that a consistent filter exceeds once in 1,000 flights.
 
-    The approximation of the chi-square distribution is that of Wilson and Hilferty (1931).
+    The chi-square distribution is approximated by the formula of Wilson and Hilferty (1931).
     """
     spread = 2.0 / (9.0 * count)
     return (1.0 - spread + 3.09 * math.sqrt(spread)) ** 3

@@ -13,7 +13,7 @@ from tests.studies.campaigns.warped_photographs import PHOTOGRAPHS, WARPED_PHOTO
 @pytest.mark.slow
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="needs ../shared/data/sky")
 def test_warped_photographs_are_solved_within_their_claims_or_refused(tmp_path: Path) -> None:
-    """The error of the fourth picture is 4.2 sigma if lenses are assumed to have little decentring."""
+    """The error of the fourth picture would be 4.2 sigma if lenses were assumed to have little decentring."""
     keys = (
         "orion2.jpg-stretch-0",
         "pleiades.jpg-shear-0",

@@ -1,4 +1,4 @@
-"""Tests of the campaign `worlds`: both worlds fly the same cases, and the summary shows a difference."""
+"""Tests of the campaign `worlds`: the same cases run in both worlds, and the summary shows a difference."""
 
 from __future__ import annotations
 

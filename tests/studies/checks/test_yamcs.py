@@ -40,7 +40,7 @@ def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch:
 
 
 def test_stacks_and_displays_name_commands_arguments_and_parameters_of_the_tables() -> None:
-    """Every required argument is given, every state is one of its field, and Yamcs has every name."""
+    """Every required argument is given, every state is a state of its field, and Yamcs knows every name."""
     fields = {f"/{SPACE}/{name}": field for layout in LAYOUTS.values() for name, field in spread(layout)}
     steps = []
     for name, text in stacks_and_displays().items():
@@ -71,7 +71,7 @@ def test_a_replay_writes_packets_at_their_mission_time_and_one_file_at_a_time(tm
     replay = Replay(packets, tmp_path, 2.0, begun=100.0)
 
     def read() -> list[bytes]:
-        """Read and delete the files as Yamcs does."""
+        """Read and delete the files in a folder, as Yamcs does."""
         found = sorted((tmp_path / RECORDED).iterdir())
         content = [path.read_bytes() for path in found]
         for path in found:

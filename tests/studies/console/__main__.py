@@ -1,9 +1,9 @@
 """`python -m tests.studies.console`: opens the console's page in Chromium and measures its requirements.
 
 The study measures by how much the page lags behind the log, and the memory and processor time of the server
-beside a 40 Hz flight. It checks that a replayed moment shows the same as live, that the browser reports no
-errors and makes no request beyond loopback, and that the light turns red when telemetry stops. At each of
-three sizes and in both themes, the page may not scroll sideways, and axe-core may find no violation.
+beside a 40 Hz flight. It checks that a replayed instant shows the same as live, that the browser reports no
+errors and makes no request beyond loopback, and that the status light turns red when telemetry stops. At each
+of three sizes and in both themes, the page must not scroll sideways, and axe-core must not find a violation.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ CONFIG = Path("config/step_demo.yaml")
 class Figures:
     """Measured lag (s), memory (MiB), share of a core, and time (s) from the last telemetry to the red light.
 
-    `weight_kb` is the size of all files of the page. `violations` names the findings of axe-core and each
-    size at which the page scrolls sideways. `filed` is the error of the page when it put, listed and got a
-    file.
+    `weight_kb` is the size of all files of the page. `violations` lists the findings of axe-core and each
+    size at which the page scrolls sideways. `filed` is the page's error when it uploads, lists and downloads
+    a file, or empty.
     """
 
     weight_kb: float
@@ -54,7 +54,7 @@ class Figures:
 
 
 ASKED = {"weight_kb": 250.0, "lag_s": 0.5, "memory_mib": 120.0, "processor": 0.15, "red_s": 3.0}
-"""Limits of the issue: 250 kB, live within 0.5 s, 120 MB, 15 % of a core, a dead link shown within 3 s."""
+"""Required limits: page of 250 kB, lag of 0.5 s, memory of 120 MB, 15 % of a core, red light within 3 s."""
 SIZES = ((1600, 1150), (1024, 768), (390, 844))
 """Tested sizes (width, height) of the page, px."""
 
@@ -83,10 +83,10 @@ def main() -> int:
 
 
 def missed(figures: Figures, by_link: bool) -> list[str]:
-    """Return the names of the figures that exceed their limits.
+    """Return the names of the results that exceed their limits.
 
-    Over a link, packets of one instant may come in two frames, so a moment between them may show the first
-    only.
+    Over a link, packets of one instant may arrive in two frames, so for a moment the page may show only those
+    of the first frame.
     """
     wrong = [name for name, bound in ASKED.items() if not getattr(figures, name) <= bound]
     wrong += [name for name in ("complaints", "strangers", "violations", "filed") if getattr(figures, name)]
@@ -97,7 +97,7 @@ def missed(figures: Figures, by_link: bool) -> list[str]:
 def measure(
     config: Path, seconds: float, pictures: Path | None, looks: Path | None, by_link: bool = False
 ) -> Figures:
-    """Fly for `seconds` s and examine the page."""
+    """Run a flight for `seconds` s, and examine the page."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         run, way = Path(place) / "run", _linked if by_link else _flown
         with way(config, run) as (url, server, source), opened(url) as page:
@@ -120,7 +120,7 @@ def measure(
 
 
 def _filed(page: Page, place: Path) -> str:
-    """Put, list and get a file through the page; return the error, or an empty text."""
+    """Upload, list and download a file through the page; return the error, or an empty text."""
     sent, got = place / "tle.txt", place / "got.txt"
     sent.write_bytes(bytes(range(256)) * 40)
     page.page.evaluate("document.getElementById('files').open = true")

@@ -1,1 +1,1 @@
-"""Comparison of a run as ground software of other authors reads it with our own reader."""
+"""Comparisons of a run as other authors' ground software reads it with the same run in our own reader."""

@@ -2,7 +2,8 @@
 
 `python -m tests.studies.interop.files FOLDER [--megabytes M] [--loss P ...] [--seed S]` starts link, gateway
 and Yamcs as separate processes, with a relay between link and gateway that loses frames in both directions.
-One file is commanded down, and Yamcs sends another one up. The study prints one JSON line for each loss
+The satellite is commanded to send one file, and Yamcs uploads another one. The study prints one JSON line for
+each loss
 probability: whether both files arrived complete (SHA-256) and were closed at both ends, and the durations
 (s). With `--endings` each side cancels a transfer in each direction instead, and one transfer is suspended on
 board and resumed; there is one JSON line for each. The exit status is 1 if a transfer does not end as
@@ -41,7 +42,7 @@ _TRANSFERS = f"/filetransfer/{INSTANCE}/{CFDP}/transfers"
 
 
 def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
-    """Transfer a file in each direction; return the results."""
+    """Transfer a file in each direction, and return the results."""
     data = np.random.default_rng(seed).bytes(size)
     (place / "runs" / _RUN).mkdir(parents=True)
     (place / "runs" / _RUN / _NAME).write_bytes(data)
@@ -62,7 +63,7 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
 
 
 def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str, Any]]:
-    """Cancel a transfer in each direction by each side, and suspend one; yield the result of each."""
+    """Cancel a transfer in each direction from each side, and suspend one; yield the result of each."""
     (place / "runs" / _RUN).mkdir(parents=True)
     (place / "runs" / _RUN / _NAME).write_bytes(np.random.default_rng(seed).bytes(size))
     http = free_port()
@@ -91,7 +92,7 @@ def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str
 
 
 def _begun(server: Yamcs, way: str) -> dict[str, Any]:
-    """Start a transfer; return it after data have arrived."""
+    """Start a transfer, and return it after its first data have arrived."""
     known = {one["id"] for one in _transfers(server)}
     if way == "up":
         _send_up(server)
@@ -127,7 +128,7 @@ def _number(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
-    """Command the file down, repeatedly until the transfer begins; return whether and when it arrived."""
+    """Command a downlink repeatedly until the transfer begins; return whether and when the file arrived."""
     begun = time.monotonic()
     while time.monotonic() - begun < _LONGEST_S and not any(map(_is_download, _transfers(server))):
         server.command("send-file", {"entity": "another-ground-station", "name": f"log/{_RUN}/{_NAME}"})
@@ -135,13 +136,13 @@ def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
     until(lambda: all(one["state"] == "COMPLETED" for one in _transfers(server)), _LONGEST_S)
     seconds = round(time.monotonic() - begun, 1)
     came = place / "yamcs" / DOWN_BUCKET
-    until(lambda: bool(list(came.iterdir())), _ASK_S)  # Yamcs stores a completed file beside
+    until(lambda: bool(list(came.iterdir())), _ASK_S)  # Yamcs stores a completed file in the background
     sums = [hashlib.sha256(path.read_bytes()).digest() for path in came.iterdir()]
     return {"down_whole": sums == [wanted], "down_seconds": seconds}
 
 
 def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
-    """Let Yamcs send a file up; return whether and when it arrived."""
+    """Make Yamcs upload a file; return whether and when it arrived."""
     begun = time.monotonic()
     (place / "yamcs" / UP_BUCKET / "release.whl").write_bytes(data)
     _send_up(server)

@@ -33,7 +33,7 @@ def _sockets_of(pid: int) -> set[str]:
     for name in os.listdir(f"/proc/{pid}/fd"):
         try:
             target = os.readlink(f"/proc/{pid}/fd/{name}")
-        except OSError:  # closed meanwhile
+        except OSError:  # the socket has been closed in the meantime
             continue
         if target.startswith("socket:["):
             found.add(target[len("socket:[") : -1])

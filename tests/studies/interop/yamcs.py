@@ -6,9 +6,9 @@ and a refused one is reported; the archive holds every packet of the flight log,
 the same values as this project; no process has a socket beyond loopback. The exit status is 1 if a check
 fails. The study is skipped with a message if Java or the bundle is missing.
 
-The testbed flies all commands except those that point a satellite. With `--orbit` a satellite flies two of
-these, which needs minutes. `--short`, which CI uses, flies the commands that complete in any state of the
-flight.
+The testbed executes all commands except those that point a satellite. With `--orbit` a satellite executes two
+pointing commands, which needs minutes. With `--short`, which CI uses, only the commands that complete in any
+state of the flight are executed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _DEADLINE_S = 120.0
 
 
 def _same_table(name: str) -> dict[str, Any]:
-    """Return the arguments that load the table that a configuration already uses."""
+    """Return the command arguments that load the parameter table that a configuration already uses."""
     config = load(_CONFIGS / name)
     values = [
         float(getattr(getattr(config, section), key))
@@ -83,7 +83,7 @@ _POINT = [("point-ground", {"latitude": 52.5, "longitude": 13.4, "roll": 90.0}),
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A configuration, its commands in order, faults, and the timeout (s) of each command."""
+    """A configuration with its sequence of commands, its faults, and the timeout (s) of each command."""
 
     config: str
     commands: list[tuple[str, dict[str, Any]]]
@@ -99,7 +99,7 @@ PLANS = {
 _ENDED = ("TM Connection closed", "read TM socket")
 """Warnings of Yamcs when the study ends the gateway; the second appears if data are still in transit."""
 _RACE = 'because "paramProcessor" is null'
-"""Text of an exception in Yamcs 5.12.8: a finished verifier unsubscribes while a packet is delivered to it.
+"""Text of an exception in Yamcs 5.12.8, in which a finished verifier unsubscribes during a packet's delivery.
 
 The packet is archived with correct values, but is not sent to displays. These exceptions are counted
 separately.
@@ -108,7 +108,7 @@ _LOST_S = 15.0
 """Time (s) after which a command is issued again if Yamcs has lost a report."""
 _REFUSED = ("clear", {"event": "too-hot"})
 _STEADY = LAYOUTS["health"].identifier.to_bytes(2, "big")
-"""First bytes of the packet that the flight process writes each second once it steers."""
+"""First bytes of the packet that the flight process writes each second once its control loop runs."""
 _LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION, TRANSFER)}
 """First bytes of the packets that the link process creates; flight logs do not contain them."""
 _EPOCH = "2026-01-01T00:00:00"
@@ -159,7 +159,8 @@ def _command(server: Yamcs, flight: LinkedFlight, plan: Plan) -> bool:
 def _followed(server: Yamcs, name: str, arguments: dict[str, Any], seconds: float) -> dict[str, Any]:
     """Issue a command; return its history when it has completed or timed out.
 
-    If Yamcs loses a report in its race (`_RACE`), the command never completes and is issued again.
+    If Yamcs loses a report because of its race condition (`_RACE`), the command never completes and is issued
+    again.
     """
     races, begun = _races(server), time.monotonic()
     command = server.command(name, arguments)
@@ -178,7 +179,7 @@ def _followed(server: Yamcs, name: str, arguments: dict[str, Any], seconds: floa
 
 
 def _races(server: Yamcs) -> int:
-    """Return how many packets Yamcs has lost in its race."""
+    """Return how many packets Yamcs has lost because of its race condition (`_RACE`)."""
     return sum(_RACE in line for line in troubles(server.log.read_text()))
 
 

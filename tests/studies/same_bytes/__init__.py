@@ -1,1 +1,1 @@
-"""Comparison of this checkout's logs with those of another revision, packet by packet."""
+"""Comparison of this checkout's flight logs with those of another revision, packet by packet."""

@@ -1,7 +1,8 @@
 """Checks that this checkout behaves as REV does: `python -m tests.studies.same_bytes --against REV`.
 
 The study flies ten flights and runs commands in this checkout, with its uncommitted changes, and in a
-temporary checkout of REV, with the same interpreter on the same machine. It compares logs and answers.
+temporary checkout of REV, with the same interpreter on the same machine. It compares the flight logs and the
+commands' results.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from tests.studies.same_bytes.comparison import Difference, Verdict, compare
 from tests.studies.same_bytes.flights import FLIGHTS, SHORT, Flight, fly
 from tests.studies.same_bytes.texts import Texts
 
-AT_ONCE = 2  # runs
+AT_ONCE = 2  # number of runs at the same time
 Run = Flight | Answers
-"""A flight or a group of answers."""
+"""A flight, or a group of commands with results."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: bool) -> list[Verdict]:
-    """Run what the cache lacks, two runs at a time, and compare; store the results of this side in `keep`.
+    """Perform the runs that the cache lacks, two at a time, and compare; store this side's results in `keep`.
 
     Raises CheckoutError if REV's side fails, and ValueError for a wrong table of renamed texts.
     """
@@ -102,7 +103,10 @@ def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
 
 
 def _verdict(run: Run, old: Path, new: Path, job: Future[None], texts: Texts) -> Verdict:
-    """Return the verdict of a run when its job is done. A run that failed in this checkout is different."""
+    """Return the verdict of a run when its job is done.
+
+    A run that failed in this checkout counts as different.
+    """
     try:
         job.result()
     except CheckoutError as error:

@@ -1,7 +1,7 @@
-"""Records the answers of a checkout's star tracker, streaks, horizon, planners and identification.
+"""Records the results of a checkout's commands: star tracker, streaks, horizon, planners, identification.
 
-The questions are commands of `python -m flight`, which any revision has even if modules move. Both revisions
-process the same pictures: those that the old one rendered, and photographs if there are any.
+The results are those of `python -m flight` commands, which any revision has even if modules move. Both
+revisions process the same pictures: those that the old one rendered, and photographs if there are any.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tests.studies.same_bytes.checkout import repository, run_script
 
 ANSWERS_FILE = "answers.json"
 PHOTOGRAPHS = repository().parent / "shared/data"
-# One process runs all commands of a group, because imports and the sky index take longer than an answer.
+# One process runs all commands of a group, because imports and the sky index take longer than a command.
 _ASK = """
 import contextlib, io, json, os, runpy, sys
 checkout, *commands = sys.argv[1:]
@@ -41,14 +41,14 @@ json.dump(answers, sys.stdout)
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """A group of commands that one process answers, each a line as in a shell, without `python -m flight`."""
+    """A group of commands that one process runs, each a line as in a shell, without `python -m flight`."""
 
     name: str
     commands: tuple[str, ...]
 
     @property
     def key(self) -> object:
-        """Everything on which the answers depend, besides revision and machine."""
+        """Text of everything on which the results depend, besides revision and machine."""
         return [_ASK, self.commands]
 
 
@@ -58,7 +58,7 @@ _STREAKS = "rate pictures/streaks.png --fov 15 --exposure 0.4"
 _LIMB = "horizon pictures/limb.png --fov 67"
 _SLEW = "plan --at 2026-03-01T12:00:00 --orbit"
 
-# Renders the pictures of the other groups; their bytes are compared too.
+# This group renders the pictures of the other groups; the pictures' bytes are compared too.
 PICTURES = Answers(
     "pictures",
     (
@@ -69,7 +69,9 @@ PICTURES = Answers(
 )
 GROUPS: tuple[Answers, ...] = (
     PICTURES,
-    Answers(  # lost in space, by each method of identification, attitude, centroids; index; lens calibration
+    # Star tracker: lost in space by each method of identification, attitude, centroids; index; lens
+    # calibration.
+    Answers(
         "stars",
         (
             "solve pictures/stars.png",
@@ -96,7 +98,8 @@ GROUPS: tuple[Answers, ...] = (
             f"calibrate {' '.join(_NIGHTS)} --fov 15",
         ),
     ),
-    Answers(  # rates, with a satellite among the streaks; attitude from streaks; stars that do not move
+    # Streaks: rates, with a satellite among the streaks; attitude from streaks; stars that do not move.
+    Answers(
         "streaks",
         (
             _STREAKS,
@@ -112,7 +115,7 @@ GROUPS: tuple[Answers, ...] = (
             "solve pictures/turn.png --camera step_demo --exposure 0.3",
         ),
     ),
-    Answers(  # nadir, with and without the altitude, by each method; a picture without a limb
+    Answers(  # horizon: nadir with and without the altitude, by each method; a picture without a limb
         "horizon",
         (
             f"{_LIMB} --altitude 515",
@@ -123,7 +126,8 @@ GROUPS: tuple[Answers, ...] = (
             "horizon pictures/stars.png --fov 15 --altitude 515",
         ),
     ),
-    Answers(  # one axis: stretched, with rates, minimum supply energy, with a cost of time, out of range
+    # One-axis planner: extended duration, with rates, minimum supply energy, time cost, out of range.
+    Answers(
         "plan",
         (
             "plan --from 0.4 --to -0.3",
@@ -134,7 +138,8 @@ GROUPS: tuple[Answers, ...] = (
             "plan --from 2 --to 0",
         ),
     ),
-    Answers(  # three axes: minimum energy, within cones, minimum time, best start, a time that is too short
+    # Three-axis planner: minimum energy, exclusion cones, minimum time, best start, a time that is too short.
+    Answers(
         "slew",
         (
             f"{_SLEW} orbit --from nadir --to sun --within 600",
@@ -144,7 +149,7 @@ GROUPS: tuple[Answers, ...] = (
             f"{_SLEW} orbit --from nadir --to 'inertial 0 0 0 1' --within 20",
         ),
     ),
-    # Constants of a body, from a simulated flight.
+    # Identification of a body's constants from a simulated flight.
     Answers("identify", ("identify step_demo --duration 60 --run identified",)),
 )
 
@@ -165,7 +170,7 @@ def _pictures(folder: Path, part: str) -> Iterable[str]:
 
 
 def ask(checkout: Path, answers: Answers, folder: Path) -> None:
-    """Let a checkout answer in `folder`; store the answers there, with digests of the PNG files it wrote.
+    """Run a checkout's commands in `folder`; store results there, with digests of the written PNG files.
 
     Raises CheckoutError if a command raises.
     """

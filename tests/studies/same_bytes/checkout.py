@@ -58,7 +58,8 @@ def run_script(checkout: Path, script: str, *arguments: str, folder: Path | None
 def run_python(checkout: Path, *arguments: str, folder: Path | None = None) -> str:
     """Return the output of the interpreter in `folder` (default: the checkout).
 
-    The checkout's modules come before installed ones. Raises CheckoutError if the exit status is not 0.
+    The checkout's modules take precedence over installed modules. Raises CheckoutError if the exit status is
+    not 0.
     """
     try:
         done = subprocess.run(
@@ -85,7 +86,7 @@ def cache_folder(root: Path, commit: str, name: str, key: object) -> Path:
 
 
 def _machine() -> str:
-    """Return the name of the processor, by which linear algebra libraries choose their code."""
+    """Return the name of the processor, according to which linear algebra libraries select their code."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

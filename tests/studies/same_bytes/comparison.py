@@ -1,4 +1,4 @@
-"""Compares the logs of two revisions' flights packet by packet, and their answers value by value.
+"""Compares the logs of two revisions' flights packet by packet, and their command results value by value.
 
 Each log is read with the packet table of the software that wrote it. Packets whose APID the old table lacks
 are counted as added and otherwise ignored. Sequence counts are per APID, so these packets do not affect the
@@ -6,9 +6,9 @@ others. If a new packet definition only appends fields and has a higher version,
 All other bytes must be equal, in the same order. Three labels of the RUN packet are not compared: UTC, the
 version of the software, and the checksum of the configuration's text, in which a comment may change.
 
-In the answers, these labels and times of the machine are not compared. Keys that only the new answer has are
-counted as added. Texts that differ are accepted if the table of renamed texts converts the old into the new
-text.
+In the command results, these labels and times of the machine are not compared. Keys that only the new result
+has are counted as added. Texts that differ are accepted if the table of renamed texts converts the old into
+the new text.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.studies.same_bytes.texts import Texts
 
 STEMS = ("flight", "truth")
 LABELS = {"run": ("utc_ns", "software", "config_crc")}
-# Keys of answers that are not compared: the labels, and times of the machine.
+# Keys of command results that are not compared: the labels, and times of the machine.
 UNCOMPARED = frozenset(
     {
         *LABELS["run"],
@@ -47,10 +47,10 @@ _SHORT = 100  # number of displayed characters of a value
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """First position at which two logs or answers differ.
+    """First position at which two logs or command results differ.
 
     Attributes:
-        log: flight or truth; answers; run, if a run failed.
+        log: "flight", "truth" or "answers", or "run" if a run failed.
         packet: name of the packet, of the command, or of the run.
         time: mission time (s) of the old packet, or None without one.
     """
@@ -65,10 +65,10 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Result of the comparison of one flight or one group of answers.
+    """Result of the comparison of one flight, or of one group of command results.
 
     Attributes:
-        compared: number of compared packets and values of answers.
+        compared: number of compared packets and values.
         added: numbers of packets and keys of answers that only the new side has, by name.
         extended: packets whose new definition has more fields.
         difference: the first difference, or None.
@@ -86,7 +86,7 @@ class Verdict:
 
 
 def compare(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
-    """Compare the answers in two folders, and the logs if the folders hold a flight."""
+    """Compare the command results in two folders, and the logs if the folders contain a flight."""
     logs = compare_logs(name, old, new, texts) if (old / TABLE_FILE).is_file() else None
     answers = compare_answers(name, old, new, texts) if (old / ANSWERS_FILE).is_file() else None
     if logs is None or answers is None:
@@ -101,7 +101,7 @@ def compare(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
 
 
 def compare_answers(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
-    """Compare the answers in two folders."""
+    """Compare the command results in two folders."""
     first, second = (json.loads((folder / ANSWERS_FILE).read_text(encoding="utf-8")) for folder in (old, new))
     pairs = list(_pairs((), first, second, texts))
     added = Counter(f"key {place[-1]}" for place, a, _ in pairs if a is _NONE)
@@ -120,7 +120,7 @@ def compare_answers(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
 def _pairs(
     place: tuple[str, ...], a: Any, b: Any, texts: Texts
 ) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
-    """Yield each key path of two answers with the old and new value; _NONE for a missing value."""
+    """Yield each key path of two results with the old and the new value; a missing value is _NONE."""
     if isinstance(a, dict) and isinstance(b, dict):
         names = {key: key if key in b else texts.renamed(key) for key in a}
         for key, name in names.items():
@@ -233,7 +233,10 @@ def _kinds(fields: Iterable[Field]) -> list[tuple[str, str, int]]:
 
 
 def _core(packet: bytes, layout: Layout, longer: bool) -> bytes:
-    """Return a packet without checksum and labels; if `longer`, also without length, version, new fields."""
+    """Return a packet without checksum and labels.
+
+    If `longer`, also without length, version and new fields.
+    """
     raw = bytearray(packet[: layout.length - CRC_BYTES])
     for label in LABELS.get(layout.packet.name, ()):
         if label in layout.offsets:

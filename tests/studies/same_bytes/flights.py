@@ -32,7 +32,7 @@ json.dump([dataclasses.asdict(packet) for packet in table], sys.stdout)
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One flight, and the commands that are run on it.
+    """One flight, and the commands that are run on its folder.
 
     Attributes:
         duration: duration (s), or None for that of the configuration.
@@ -56,7 +56,7 @@ class Flight:
 
     @property
     def key(self) -> object:
-        """Everything on which the flight depends, besides revision and machine."""
+        """Text of everything on which the flight depends, besides revision and machine."""
         return [_DUMP_TABLE, self.config, self.options, self.changes, Answers(self.name, self.questions).key]
 
 
@@ -91,9 +91,9 @@ FLIGHTS: tuple[Flight, ...] = (
         60,
         ("bus: nack @ 12 for 4", "pwm: brown-out @ 25", "monitor: bits @ 30 for 10", "bus: hang @ 48 for 3"),
     ),
-    # The KnightCube starts at 0.6 deg/s: streak rates, detumbling, attitude acquisition, slews that avoid
-    # exclusion cones to Sun and nadir, Earth in star frames, Sun and limb in the horizon cameras; GPS and a
-    # camera fail for a time.
+    # The KnightCube starts at 0.6 deg/s. Its flight has streak rates, detumbling, attitude acquisition, slews
+    # to Sun and nadir that avoid exclusion cones, the Earth in star frames, and Sun and limb in the horizon
+    # cameras. GPS and a camera fail for a time.
     Flight(
         "orbit",
         "config/orbit.yaml",
@@ -102,16 +102,16 @@ FLIGHTS: tuple[Flight, ...] = (
         "{targets: [{at: 0.0, point: sun}, {at: 120.0, point: nadir, roll_deg: 0.0}],"
         " simulation: {free_body: {release: {speed: 0.01}}}}",
     ),
-    # A 3U as configured: a tumble at 10 deg/s, streaks, rate from the magnetometer, Sun and limb.
+    # A 3U flies as configured, with a tumble at 10 deg/s, streaks, rates from the magnetometer, Sun and limb.
     Flight("orbit_3u", "config/orbit_3u.yaml", 60),
     # An object passes among the stars, is detected and followed, and its orbit is determined.
     Flight("orbit_object", "config/orbit_object.yaml", 90, questions=("report . --no-figures", "orbit .")),
 )
-SHORT = Flight("short", _DEMO, 8)  # for tests
+SHORT = Flight("short", _DEMO, 8)  # used only by tests
 
 
 def fly(checkout: Path, flight: Flight, folder: Path) -> None:
-    """Fly in `checkout`; store logs, the revision's packet table and answers about the flight in `folder`.
+    """Fly in `checkout`; store logs, the revision's packet table and command results in `folder`.
 
     Raises CheckoutError if the flight fails.
     """

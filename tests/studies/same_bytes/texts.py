@@ -13,7 +13,7 @@ _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 
 
 class Texts:
-    """The renamed texts."""
+    """Converter of renamed texts."""
 
     def __init__(self, pairs: Iterable[Mapping[str, str]] = ()) -> None:
         """Create the table from pairs of `old` and `new`.
@@ -44,7 +44,7 @@ def _compiled(pair: Mapping[str, str]) -> tuple[re.Pattern[str], str]:
     """Return the pattern of the old text, and the new text."""
     if not isinstance(pair, dict) or set(pair) != {"old", "new"}:
         raise ValueError(f"renamed text {pair!r}: a pair has the keys old and new")
-    pieces = _PLACEHOLDER.split(pair["old"])  # text, name, text, ...
+    pieces = _PLACEHOLDER.split(pair["old"])  # texts alternate with placeholder names
     if set(_PLACEHOLDER.findall(pair["new"])) - set(pieces[1::2]):
         raise ValueError(f"renamed text {pair['new']!r}: a placeholder is not in the old text")
     pattern = "".join(

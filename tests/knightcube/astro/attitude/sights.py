@@ -1,4 +1,4 @@
-"""Star directions measured by a simulated camera, and their optimal attitude in higher precision."""
+"""Star directions measured by a simulated camera, and the information that they give about the attitude."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def sight(
     sigma: float,
     angle: float | None = None,
 ) -> Sight:
-    """Return n stars within `half_field` rad of a random boresight, or all over the sky.
+    """Return n stars within `half_field` rad of a random boresight; None distributes them over the whole sky.
 
     `sigma` (rad) is the approximate error of each measured direction; `angle` (rad) is the rotation about a
     random axis; if None, the rotation is drawn uniformly from all rotations.

@@ -23,7 +23,7 @@ from knightcube.astro.quaternion import (
 from tests.knightcube.astro.attitude.sights import unit
 
 _solve = SOLVERS["esoq2"]
-_NARROW = 0.17  # half of a 20 deg field of view, rad
+_NARROW = 0.17  # half of a 20 deg field of view (rad)
 
 
 def _reference(rng: np.random.Generator, n: int, half_field: float | None) -> FloatArray:
@@ -91,7 +91,7 @@ def test_it_is_the_solution_of_scipy() -> None:
 def test_no_angle_and_no_axis_is_singular(angle: float, axis: tuple[float, float, float], n: int) -> None:
     """ESOQ2's axis is undefined at 0 deg and its scalar part vanishes at 180 deg.
 
-    Sequential rotations solve both cases.
+    The method of sequential rotations solves both cases.
     """
     q = from_rotation_vector(angle * unit(np.array(axis)))
     reference = _reference(np.random.default_rng(44), n, _NARROW)
@@ -123,7 +123,8 @@ def test_the_covariance_and_the_loss_are_those_of_the_errors() -> None:
         error = to_rotation_vector(multiply(found.quaternion, conjugate(q)))
         squared.append(error @ np.linalg.solve(found.covariance, error))
         losses.append(2.0 * found.loss)
-    # Means of chi-squares of 3 and of 2n - 3 = 9 degrees of freedom, within three standard errors.
+    # The expected means are those of chi-squares with 3 and with 2n - 3 = 9 degrees of freedom, to three
+    # standard errors.
     assert np.mean(squared) == pytest.approx(3.0, abs=3.0 * np.sqrt(6.0 / runs))
     assert np.mean(losses) == pytest.approx(9.0, abs=3.0 * np.sqrt(18.0 / runs))
 

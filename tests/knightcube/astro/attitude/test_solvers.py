@@ -45,7 +45,7 @@ def _error(fix: AttitudeFix, quaternion: FloatArray) -> FloatArray:
 
 
 def _least_eigenvalue(seen: Sight) -> float:
-    """Return the smallest eigenvalue of the information, relative to the sum of weights."""
+    """Return the smallest eigenvalue of the information matrix, relative to the sum of the weights."""
     return float(np.linalg.eigvalsh(information(seen.observed, seen.sigma))[0] / np.sum(seen.sigma**-2.0))
 
 
@@ -80,7 +80,7 @@ def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
 def test_a_solver_loses_no_more_than_the_profile_matrix_has_lost(
     name: str, angle: float | None, n: int, half_field: float | None
 ) -> None:
-    """Before the refinement the error is rounding over the gap between K's eigenvalues."""
+    """Before the refinement the error is the rounding error divided by the gap between K's eigenvalues."""
     rng = np.random.default_rng([61, n])
     for _ in range(20):
         seen = sight(rng, n, half_field, 1e-5, angle)
@@ -98,7 +98,8 @@ def test_the_polynomials_root_is_the_largest_eigenvalue(seed: int, n: int) -> No
         unit(rng.normal(size=(n, 3))), unit(rng.normal(size=(n, 3))), np.full(n, 1.0 / n)
     )
     values = np.linalg.eigvalsh(davenport_matrix(profile))
-    # The error of a simple root is rounding over the slope; that of two close roots is the root of rounding.
+    # The error of a simple root is the rounding error divided by the slope; that of two close roots is the
+    # square root of the rounding error.
     slope = np.prod(values[3] - values[:3])
     assert largest_eigenvalue(profile) == pytest.approx(values[3], abs=min(1e-6, 1e-14 / slope))
 
@@ -111,8 +112,8 @@ def test_directions_without_noise_give_the_true_attitude(name: str) -> None:
             true = sight(rng, n, half_field, 1e-5, angle)
             exact = true.reference @ attitude_matrix(true.quaternion).T
             fix = SOLVERS[name](unit(exact), true.reference, true.sigma)
-            # Directions are rounded by 1e-16, so the rotation about the boresight errs by this, divided by
-            # the separation.
+            # Directions have a rounding error of 1e-16, so the rotation about the boresight has this error
+            # divided by the separation.
             assert angle_between(fix.quaternion, true.quaternion) < 1e-15 / np.sqrt(_least_eigenvalue(true))
 
 
@@ -140,7 +141,10 @@ def test_the_default_is_scipys_solution() -> None:
 
 
 def test_two_close_stars_are_settled_to_the_digits_that_their_directions_have() -> None:
-    """B alone gives the rotation about stars 1e-4 rad apart to 1e-8 rad only; a closed form is exact."""
+    """The profile matrix B gives the rotation about stars 1e-4 rad apart only to 1e-8 rad.
+
+    A closed form is exact.
+    """
     rng = np.random.default_rng(65)
     for _ in range(20):
         seen = sight(rng, 2, None, 1e-9)
@@ -181,13 +185,13 @@ def test_what_is_not_optimal_is_off_the_optimum_by_the_difference_of_the_covaria
         seen = sight(rng, 8, None, 1e-5)
         fix, best = _by(name, seen), _by(DEFAULT, seen)
         excess = fix.covariance - best.covariance
-        # Both attitudes are formed from directions with errors of 1e-5.
+        # Both covariances are computed from directions with errors of 1e-5.
         assert np.linalg.eigvalsh(excess)[0] > -1e-4 * np.trace(best.covariance)
         apart = _error(fix, best.quaternion)
         ratios.append(float(apart @ apart / np.trace(excess)))
         worse.append(np.trace(fix.covariance) / np.trace(best.covariance))
         assert fix.loss >= best.loss * (1.0 - 1e-9)
-    # The squared length's variance is at most twice its mean squared.
+    # The variance of the squared length is at most twice the square of its mean.
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / runs))
     assert np.median(worse) > 1.001
 
@@ -229,7 +233,7 @@ def test_directions_that_share_no_attitude_give_the_least_loss_or_none(name: str
 
 @pytest.mark.parametrize("name", _ALL)
 def test_a_field_seen_backwards_has_no_attitude(name: str) -> None:
-    """If all three axes are measured reversed, half a rotation about any axis fits equally well."""
+    """If all three axes are measured reversed, a rotation by 180 deg about any axis fits equally well."""
     axes = np.eye(3)
     if name in OPTIMAL:
         with pytest.raises(AttitudeError):

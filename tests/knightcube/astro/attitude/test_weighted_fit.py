@@ -31,7 +31,7 @@ def scene(
     observations = []
     for reference, sigma in zip(references[:2], (SUN_SIGMA, NADIR_SIGMA), strict=True):
         root = sigma * np.eye(3)
-        if lopsided:  # short arc of limb: the error along one direction is ten times larger
+        if lopsided:  # a short arc of limb has a ten times larger error along one direction
             axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
             root = sigma * axes * np.array([1.0, 3.0, 10.0])
         seen = attitude_matrix(truth) @ reference + root @ rng.standard_normal(3)
@@ -47,7 +47,7 @@ def error(truth: FloatArray, fix: AttitudeFix) -> FloatArray:
 
 
 def by_sigma(solver: str, *observations: VectorObservation) -> AttitudeFix:
-    """Return the attitude of a solver that uses one sigma per direction."""
+    """Return the attitude that a solver finds with one sigma per direction."""
     return SOLVERS[solver](
         np.array([one.observed for one in observations]),
         np.array([one.reference for one in observations]),

@@ -15,7 +15,7 @@ from knightcube.errors import UsageError
 
 
 def _source() -> build.Source:
-    """Return a replacement of the catalogue with the published counts per magnitude."""
+    """Return an artificial source catalogue with the published counts per magnitude."""
     rows = build.ENTRIES
     magnitude: npt.NDArray[Any] = np.full(rows, 9.0)
     limits = sorted(build.PUBLISHED_COUNTS.items(), reverse=True)

@@ -20,7 +20,7 @@ STARS = catalogue.load()
 PUBLISHED = {6.0: (4_995, 3), 6.5: (8_789, 4), 7.0: (15_404, 7), 8.0: (41_074, 17), 8.5: (61_320, 27)}
 
 # SIMBAD, ICRS, epoch J2000 (van Leeuwen 2007; 61 Cygni A is Gaia's): the old and the new reduction of
-# Hipparcos differ by some mas/yr for the brightest, 13 mas/yr for 61 Cygni.
+# Hipparcos differ by some mas/yr for the brightest stars, and by 13 mas/yr for 61 Cygni.
 POSITIONS = {
     "Sirius": (32349, "06 45 08.91728", "-16 42 58.0171", -1.44, 0.002),
     "Canopus": (30438, "06 23 57.10988", "-52 41 44.3810", -0.62, 0.005),
@@ -56,7 +56,10 @@ def _index(hip: int) -> int:
 def test_counts_are_the_published_ones_less_the_entries_without_a_position(
     limit: float, published: int, unplaced: int
 ) -> None:
-    """Three of the stars without position are added; HIP 115125 has V 6.97 and counts only below 7."""
+    """The table includes three of the stars without position.
+
+    HIP 115125 has V 6.97 and counts only below 7.
+    """
     added = 2 if limit < 6.97 else 3
     assert len(STARS.brighter_than(limit)) == published - unplaced + added
 
@@ -70,7 +73,7 @@ def test_position_at_j2000_is_the_published_one(name: str) -> None:
 
 
 def test_61_cygni_moves_as_measured() -> None:
-    """5.28" a year towards position angle 51.9 degrees."""
+    """The measured proper motion is 5.28" a year towards position angle 51.9 degrees."""
     star = _index(104214)
     a, b = STARS.directions_at(2000.0)[star], STARS.directions_at(2010.0)[star]
     assert _arcseconds(a, b) == pytest.approx(52.81, abs=0.02)

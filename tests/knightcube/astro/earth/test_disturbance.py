@@ -1,4 +1,4 @@
-"""Tests of the drag on bodies other than boxes by their projected area."""
+"""Tests of the drag torque on bodies other than boxes, computed from projected areas."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ SPEED, DENSITY = 7_600.0, 1e-12
 
 @pytest.mark.parametrize("name", ["knightcube", "cubesat_3u"])
 def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> None:
-    """Sizes fitted to the drag of ten attitudes fit 190 other attitudes.
+    """Coefficients fitted to the drag torque at ten attitudes also fit 190 other attitudes.
 
-    Without areas, those of a 3U do not.
+    Without projected areas, the coefficients of a 3U do not.
     """
     craft = CRAFTS[name]
     faces = box(craft.size, ARM, np.zeros(6))

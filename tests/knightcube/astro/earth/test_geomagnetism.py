@@ -65,7 +65,7 @@ def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tup
 
 
 def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
-    """At 400 km, 2025 to 2029.9, the models agree within 40 nT and 0.15 deg, 10 nT on average."""
+    """At 400 km, from 2025 to 2029.9, the models agree within 40 nT and 0.15 deg, and to 10 nT on average."""
     rng = np.random.default_rng(5)
     away = rng.standard_normal((60, 3))
     positions = 6.778e6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
@@ -80,7 +80,7 @@ def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
 
 
 def test_the_true_field_has_no_sources_and_no_currents() -> None:
-    """Divergence and curl by central differences over 20 km are below 1e-6 of the slope of the field."""
+    """Divergence and curl, by central differences over 20 km, are below 1e-6 of the field's gradient."""
     place, step = np.array([3.1e6, -4.2e6, 4.3e6]), 2e4
     slope = np.empty((3, 3))
     for axis in range(3):
@@ -161,7 +161,10 @@ def test_the_stored_table_is_the_builder_s() -> None:
 
 
 def test_many_positions_give_exactly_the_fields_of_each() -> None:
-    """Positions reach from below the ground to the geostationary orbit, also after the model's years."""
+    """Positions range from below the ground to the geostationary orbit.
+
+    Dates include years after the model's.
+    """
     generator = np.random.default_rng(3)
     directions = generator.normal(size=(100, 3))
     heights = np.geomspace(6.3e6, 4.2e7, 100)[:, None]

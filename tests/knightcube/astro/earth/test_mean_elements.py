@@ -51,14 +51,15 @@ def test_an_orbit_with_oblateness_is_fitted_to_a_kilometre_over_a_day(orbit: Orb
 
 
 def test_a_short_arc_of_fixes_with_velocities_tells_how_far_it_can_be_trusted() -> None:
-    """With ten minutes of fixes, the error after a day is a few of the stated standard deviations."""
+    """With ten minutes of fixes, the error after a day is at most a few stated standard deviations."""
     known, rng = TwoLineElements(*LINES), np.random.default_rng(4)
     dates = DATE + np.arange(0.0, 600.0, 10.0) / 86_400.0
     states = [known.at(float(date)) for date in dates]
     positions = np.array([state.position for state in states]) + rng.normal(0.0, 5.0, (60, 3))
     velocities = np.array([state.velocity for state in states]) + rng.normal(0.0, 0.05, (60, 3))
     made, without = fit_elements(dates, positions, velocities), fit_elements(dates, positions)
-    # Noise of 8.7 m, plus 12 m by rounding of the angles to 1e-4 deg in the columns.
+    # The residual consists of noise of 8.7 m and of 12 m due to the rounding of angles to 1e-4 deg in the
+    # columns.
     assert 7.0 < made.rms < 14.0
     for fitted in (made, without):
         later = TwoLineElements(*fitted.lines).at(DATE + 1.0).position

@@ -102,7 +102,7 @@ FORMS = {"json": as_json, "strings": as_strings, "csv": as_csv, "kvn": as_kvn, "
 
 
 def far(one: tuple[str, str], other: tuple[str, str], days: float = 1.0) -> float:
-    """Return the distance (m) of two element sets some days after the epoch of the first one."""
+    """Return the distance (m) between two element sets' positions, some days after the first one's epoch."""
     first, second = TwoLineElements(*one), TwoLineElements(*other)
     date = first.epoch + days
     return float(np.linalg.norm(first.at(date).position - second.at(date).position))

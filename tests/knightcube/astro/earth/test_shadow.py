@@ -19,7 +19,7 @@ def _behind(depth: float, aside: float) -> FloatArray:
 
 @pytest.mark.parametrize("depth", [3000e3, 6500e3, 42_164e3, 384_400e3])
 def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
-    """The lengths follow by similar triangles from the radii, to first order in the cone angle."""
+    """The expected widths follow from the radii by similar triangles, to first order in the cone angle."""
     inner = np.arcsin((SUN_RADIUS - EARTH_RADIUS) / ASTRONOMICAL_UNIT)
     outer = np.arcsin((SUN_RADIUS + EARTH_RADIUS) / ASTRONOMICAL_UNIT)
     umbra = EARTH_RADIUS / np.cos(inner) - depth * np.tan(inner)

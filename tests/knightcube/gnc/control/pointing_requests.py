@@ -55,7 +55,7 @@ BEGIN = SlewStart(
 
 
 def planned(sizes: FloatArray) -> PointingTable:
-    """Plan with torques of these sizes (9,) N m."""
+    """Plan with torque coefficients `sizes` (9,), N m."""
     begin = replace(BEGIN, sizes=sizes)
     path = slew(begin, WISH, NADIR, AXES, ORBIT, np.inf)
     assert path is not None

@@ -28,7 +28,7 @@ def test_of_a_torque_along_the_field_nothing_is_made() -> None:
     found = allocate(1e-2 * FIELD, FIELD, COILS, AMPLE)
     assert found.torque == pytest.approx(np.zeros(3), abs=1e-18)
     assert found.share == pytest.approx(0.0, abs=1e-9)
-    # The fraction of the torque's square that is normal to the field is the square of the cosine.
+    # The torque's component normal to the field has the squared cosine as its fraction of the squared torque.
     across = np.cross(FIELD, [0.0, 0.0, 1.0])
     mixed = FIELD / np.linalg.norm(FIELD) + across / np.linalg.norm(across)
     assert allocate(1e-6 * mixed, FIELD, COILS, AMPLE).share == pytest.approx(0.5)
@@ -92,6 +92,6 @@ def test_redundant_coils_make_a_torque_with_the_least_heat() -> None:
     assert found.currents[2] == pytest.approx(3.0 * found.currents[3])
     rng = np.random.default_rng(2)
     effect = np.cross(dipoles.T, FIELD).T
-    idle = np.eye(4) - np.linalg.pinv(effect) @ effect  # currents without torque
+    idle = np.eye(4) - np.linalg.pinv(effect) @ effect  # projects onto currents that cause no torque
     for change in rng.normal(scale=1e-3, size=(20, 4)) @ idle:
         assert ohms @ (found.currents + change) ** 2 > ohms @ found.currents**2

@@ -1,4 +1,4 @@
-"""Tests of the map from dipole moments to currents for coils with any axes and strengths."""
+"""Tests of the map from dipole moments to currents, for coils with any axes and dipole per current."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_no
     corners = np.array(list(itertools.product([-1.0, 1.0], repeat=3))) * coils.limits
     used = np.array([np.abs(coils.currents(corner)) / limits for corner in corners])
     assert used.max() == pytest.approx(1.0)
-    # No box that is longer along one axis, and shorter along another by the same factor, is possible.
+    # A box that is longer along one axis, and shorter along another by the same factor, must not be feasible.
     for grow, shrink in itertools.permutations(range(3), 2):
         factor = np.ones(3)
         factor[grow], factor[shrink] = 1.05, 1.0 / 1.05
@@ -112,7 +112,7 @@ def test_the_coils_that_work_have_their_own_limits_and_heat() -> None:
     np.testing.assert_allclose(left.heat, expected.heat)
     np.testing.assert_allclose(left.limits, expected.limits)
     assert np.linalg.eigvalsh(left.heat - coils.heat).min() > -1e-12, "the same dipoles heat more"
-    # With two coils, the dipole normal to both is assumed to be half as strong.
+    # With two coils, the dipole normal to both is assumed to have half the limit.
     pair = CoilMap.equal(0.6, 0.1, 20.0).working(np.array([True, False, True]))
     np.testing.assert_allclose(pair.limits, [0.06, 0.03, 0.06])
     np.testing.assert_allclose(np.diag(pair.heat), 20.0 / np.array([0.6, 0.3, 0.6]) ** 2)

@@ -23,9 +23,9 @@ THREAD = replace(BELIEVED, stiffness=2e-5, damping=2e-6)
 
 @pytest.mark.parametrize("true", [PUSHED, THREAD], ids=["constant torque", "thread"])
 def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: SingleAxisPlant) -> None:
-    """The thesis's offset is the torque over its stiffness: d / K_e = 4e-3 / 4.47 rad is 0.051 deg.
+    """The thesis's tracker has an offset of torque / stiffness: d / K_e = 4e-3 / 4.47 rad, or 0.051 deg.
 
-    The attitude is held within 0.03 deg with noise, which excludes an offset.
+    With noise the attitude must be held within 0.03 deg, which excludes such an offset.
     """
     target = 0.5 if true is THREAD else 0.3
     errors = {}
@@ -72,7 +72,7 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
 
 
 def test_the_thesis_tracker_overshoots_there() -> None:
-    """The controller therefore needs a path: without one it brakes when the coil is already too weak."""
+    """The controller needs a path, because without one it brakes only when the coil is already too weak."""
     rows = fly(LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
     assert rows[:, 1].max() > 0.7 * 1.3
 

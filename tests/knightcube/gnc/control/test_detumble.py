@@ -27,9 +27,9 @@ TURN = np.array([0.05, 0.0, 0.0])
 IN_TURNING_FIELD = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, share_in_rotating_field(0.05, SCHEDULE))
 CYCLE = 0.025
 NOISE = 1.0e-7
-"""Noise (T) of a VN-100 magnetometer at 40 Hz, from 140 microgauss per sqrt(Hz) (data sheet), rounded up."""
+"""Noise (T) of a VN-100 magnetometer at 40 Hz, rounded up from 140 microgauss per sqrt(Hz) (data sheet)."""
 OWN_FIELD = 1e-3
-"""Field of the coils at the magnetometer (T/A), which exceeds the Earth's field at full current."""
+"""Field (T/A) that the coils cause at the magnetometer; at full current it exceeds the Earth's field."""
 
 
 class FreeBody:
@@ -119,11 +119,14 @@ def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> No
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 2.0, 5.0, 10.0])
 def test_a_fast_body_is_braked_not_pushed(speed: float) -> None:
-    """The field is extrapolated between windows: at 10 rad/s it rotates by 2.5 rad in between."""
+    """The field is extrapolated between windows.
+
+    For a body at 10 rad/s it rotates by 2.5 rad between them.
+    """
     body = FreeBody(np.array([0.0, speed, 0.0]), 4.5e-4, np.zeros(3), 1.05e-3 * np.eye(3), 4)
     rates, _ = fly(body, 15.0, Detumbler(SCHEDULE, BRAKING))
-    # 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time gives 0.37 rad/s, as long as the field is known
-    # accurately.
+    # A torque of 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time changes the rate by 0.37 rad/s, as long as
+    # the field is known accurately.
     assert rates[-1] < rates[0] - min(0.9 * speed, 0.33)
 
 
@@ -192,12 +195,12 @@ def test_a_window_without_time_to_measure_is_refused() -> None:
 
 @pytest.mark.parametrize("length_ms", [20, 40, 100, 99, 300])
 def test_an_exposure_waits_until_no_step_of_the_coils_falls_within(length_ms: int) -> None:
-    """The coils are off for 100 of 250 ms, and a command may arrive 50 ms late."""
+    """The coils are off for 100 of every 250 ms, and a command may arrive 50 ms late."""
     steps = np.arange(0, 2_000, 250)[:, None] + np.array([0, 100])
     for begin_ms in range(0, 500, 10):
         found = SCHEDULE.calm(begin_ms * 1_000_000, length_ms * 1_000_000) // 1_000_000
         if length_ms > 100:
-            assert found == begin_ms  # it cannot be kept clear
+            assert found == begin_ms  # an exposure of this length cannot avoid all steps
             continue
         assert begin_ms <= found < begin_ms + 400
         assert not ((steps + 50 > found) & (steps < found + length_ms)).any()
