@@ -29,8 +29,7 @@ from hal.interfaces.guardian import CoilReach
 from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
-"""Driver classes of serial lines, video devices and I2C buses that may be plugged in after the start of the
-service."""
+"""Driver classes of pluggable serial lines, of pluggable video devices, and of I2C buses (none)."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 """Driver classes by the kind of a device."""
 

@@ -35,7 +35,7 @@ _NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info"
 
 
 class Build:
-    """A build of a release from the folder of this software; a dry run only prints the steps."""
+    """Build of a release from this source folder; a dry run only prints the steps."""
 
     def __init__(self, prefix: Path, options: argparse.Namespace) -> None:
         self.releases = prefix / "releases"
@@ -151,7 +151,7 @@ class Build:
                 _remove(release)
 
     def _name(self) -> str:
-        """Return a new release name: the version, and one more than the highest number of a release."""
+        """Return a new release name: the version, and a number above those of the existing releases."""
         text = (self._source / "pyproject.toml").read_text(encoding="utf-8")
         version = next(line.split('"')[1] for line in text.splitlines() if line.startswith("version = "))
         numbers = [int(path.name.rpartition("+")[2]) for path in self.releases.glob("*+*")]

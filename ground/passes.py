@@ -36,7 +36,7 @@ _SPEED = 7.6e3
 LEAD_S = 120.0
 """Default time (s) for the slew, from the command to point to the station until the rise."""
 _RISE, _CULMINATION, _SET = range(3)
-"""Codes of the events of `EarthSatellite.find_events`."""
+"""Codes of the events rise, culmination and set in the results of `EarthSatellite.find_events`."""
 
 
 class Station(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

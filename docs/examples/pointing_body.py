@@ -161,7 +161,7 @@ class Direct:
         return None
 
     def aim(self, target: Target, now_ns: int) -> None:
-        """Go to another attitude."""
+        """Make the attitude of a target the reference."""
         self.hold(target.law.quaternion(now_ns), now_ns)
 
     def request(self, now_ns: int) -> None:

@@ -332,7 +332,7 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
                 for worker in crew:
                     if worker.case is None and waiting:
                         worker.case = waiting.popleft()
-                        # If the process has died, reading from its pipe shows this below.
+                        # If the process has died, reading from its pipe below raises an error.
                         with suppress(OSError):
                             worker.pipe.send(worker.case)
                 busy = {worker.pipe: (worker, worker.case) for worker in crew if worker.case is not None}

@@ -55,7 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly the campaign, and print its summary."""
+    """Run the campaign, and print its summary."""
     from ground.campaigns import CampaignError  # noqa: PLC0415
     from ground.campaigns.picture import draw_campaign  # noqa: PLC0415
     from ground.campaigns.runner import fly, results_in  # noqa: PLC0415 - no other command needs devices

@@ -69,7 +69,7 @@ def configure_day(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_orbit(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that select satellite, span and stations."""
+    """Add the arguments that select satellite, time span and stations."""
     parser.add_argument(
         "config",
         type=config_path,
@@ -80,7 +80,7 @@ def _add_orbit(parser: argparse.ArgumentParser) -> None:
 
 
 def add_stations(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that select the satellite in a file of elements, the stations, and the span."""
+    """Add the arguments that select the satellite in a file of elements, the stations, and the time span."""
     parser.add_argument(
         "--satellite", type=int, metavar="NUMBER", help="satellite number, if the file has several satellites"
     )

@@ -42,7 +42,7 @@ _TIME_AT = HEADER_BYTES + 1
 _MAX_UNSENT = 1 << 22
 """Number of unsent bytes above which a connection is closed."""
 _SPI, _BLOCK = 1, 64
-"""Number of frame counters reserved at once, because each reservation takes two disk writes."""
+"""Key (SPI) of the gateway's commands, and number of frame counters that are reserved at once."""
 _READ_BYTES = 1 << 16
 _PING_PERIOD_S = 20.0
 """Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""

@@ -21,7 +21,7 @@ from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 
 Object = dict[str, Any]
 LOST, COARSE, FINE = 0, 1, 2
-"""Levels of attitude knowledge in the navigation packet."""
+"""Levels of attitude knowledge in the navigation packet: 0 is lost, 1 is coarse, 2 is fine."""
 WITH_STARS_S = 10.0
 """Time (s) after an accepted star attitude during which the estimate counts as based on stars."""
 SUNLIT = 0.99

@@ -72,7 +72,7 @@ class LinuxWires:
         patient: bool = False,
         exclusive: bool = False,
     ) -> None:
-        """Open nothing yet. The bus `coil_bus` is locked for this process if `exclusive` is true.
+        """Open no device yet. The bus `coil_bus` is locked for this process if `exclusive` is true.
 
         If `patient` is true, a missing port or bus is opened later instead of raising an error.
         """

@@ -533,8 +533,8 @@ def reading_of(
         pvt: content of the message.
         arrival_ns: host time at which the last byte of the message was received, ns.
         baud_rate: baud rate of the serial line.
-        earliest_ns: earliest possible UTC, ns since 1970; a date of at most 1024 weeks earlier is moved by
-            1024 weeks, and any other date outside the following 1024 weeks is impossible.
+        earliest_ns: earliest possible UTC, ns since 1970; a date up to 1024 weeks earlier is moved forward by
+            1024 weeks, and any other date outside the 1024 weeks that follow counts as impossible.
         length: length of the payload, bytes.
     """
     limits = (
