@@ -6,21 +6,22 @@ In camera axes, all stars rotate about the same axis by the same angle. Three in
 not that of a star: the perpendicular bisector of its chord misses the common centre of rotation, the streak
 subtends a different angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is
 large (Sease, eq. (4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight,
-the centre of rotation is almost at infinity in the image, and slope and length of the chord are used instead
-of centre and angle. In a wide field, the pinhole projection changes slopes and lengths by far more than their
-errors. Each indicator is therefore compared with the indicator of a star at the same position, in units of
-the expected error of an endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the
-image (Sease, text at Table 4.4), and also a minimum threshold, which was measured in images without objects.
+the centre of rotation is almost at infinity in the image. In this case, the slope and the length of the chord
+are used instead of the centre and the angle. In a wide field, the pinhole projection changes slopes and
+lengths by far more than their errors. Each indicator is therefore compared with the indicator of a star at
+the same position, in units of the expected error of an endpoint. An indicator must exceed 2.5 standard
+deviations over the streaks of the image (Sease, text at Table 4.4), and also a minimum threshold, which was
+measured in images without objects.
 
 A streak with a large indicator may also be the overlapping streaks of two stars, or a segment of a faint
-star's streak ("overlapping streak" in Sease, Table 4.4). The class `Judge` therefore tests whether stars
-alone explain the pixels (`star_light`). Regions with more than two corners (peaks of the corner detector),
-which Sease discards, may be stars or an object that crosses a star. Bright points in an image whose stars are
-streaks are objects that the camera tracks (Sease, Figure 4.5). Saturated regions, regions with large
-indicators, and regions in which objects and stars may merge are searched again after the stars are
-subtracted. The search for objects needs only the rotation of the camera during the exposure. The
-maximum-likelihood estimate of the rotation from the streaks is more accurate than an estimate from the streak
-ends, and succeeds in more images.
+star's streak ("overlapping streak" in Sease, Table 4.4). For these streaks and regions, the class `Judge`
+tests whether stars alone explain the pixels (`star_light`). Sease discards regions with more than two corners
+(peaks of the corner detector). Such a region may consist of several stars, or of an object that crosses a
+star. Bright points in an image whose stars are streaks are objects that the camera tracks (Sease, Figure
+4.5). Saturated regions, regions with large indicators, and regions in which objects and stars may merge are
+searched again after the stars are subtracted. The only input besides the image is the rotation of the camera
+during the exposure. The maximum-likelihood estimate of the rotation from all pixels of the streaks is more
+accurate than an estimate from the streak ends, and succeeds in more images.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ from knightcube.vision.objects.streak_ends import (
 from knightcube.vision.objects.streak_images import at_mid_exposure, star_path, star_paths
 
 INDICATORS = ("centre", "displacement", "residual")
-"""Names of the three indicators that show that a streak is not a star."""
+"""Names of the three indicators of a streak that is not that of a star."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class Indicators:
     """The three indicators of n streaks, in the order of `INDICATORS`.
 
     Attributes:
-        endpoints: ends of the streaks (n, 2, 2), px, in the order in which a star would have passed them.
+        endpoints: ends of the streaks (n, 2, 2), px, in the order in time that is valid for a star.
         deviations: differences of the three indicators from those of a star at the same position (n, 3), in
             standard deviations.
         fired: which of the three indicators of each streak exceed their thresholds (n, 3).
@@ -92,7 +93,7 @@ class Indicators:
 
 
 def centre_residuals(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return distances (n,), px, of a rotation centre (2,) from the bisectors of chords (n, 2, 2), px.
+    """Return distances (n,), px, of a rotation centre (2,) from the perpendicular bisectors of chords.
 
     Source: Sease, eq. (4.11) to (4.13).
     """
@@ -111,7 +112,7 @@ def angular_displacements(endpoints: FloatArray, centre: FloatArray) -> FloatArr
     """Return angles (n,), rad, that streaks (n, 2, 2) subtend at a centre (2,) (Sease, eq. (4.14))."""
     first, second = endpoints[:, 0] - centre, endpoints[:, 1] - centre
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    # The arc tangent is used, because the arc cosine is inaccurate for small angles.
+    # The angles are computed by the arc tangent, because the arc cosine is inaccurate for small angles.
     return np.asarray(np.arctan2(np.abs(cross), np.sum(first * second, axis=-1)))
 
 
@@ -123,8 +124,8 @@ def lengths(endpoints: FloatArray) -> FloatArray:
 def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return the norms (n,) of the OLAE residuals of streaks (Sease, eq. (4.7)).
 
-    The arguments are the unit vectors to the first and last end of each streak (n, 2, 3), and the camera's
-    rotation vector `rotation` (3,), rad.
+    The first argument is the unit vectors to the first and the last end of each streak (n, 2, 3). The second
+    argument `rotation` (3,), rad, is the rotation vector of the camera.
     """
     angle = float(np.linalg.norm(rotation))
     scale = np.tan(0.5 * angle) / angle if angle > 0.0 else 0.5
@@ -150,7 +151,8 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 # Distance of the rotation centre from the boresight, in focal lengths, above which slopes are used instead.
-# The centre's distance is computed from the rotation axis, because errors move a fitted centre nearer.
+# This distance is computed from the rotation axis, because the errors of a fitted centre make its distance
+# too small.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -162,7 +164,7 @@ def evaluate(
     bounds: tuple[float, float, float],
     strict: float = 2.5,
 ) -> Indicators:
-    """Return how streaks differ from streaks of stars, for a given rotation of the camera.
+    """Return the indicators of streaks for a given rotation of the camera.
 
     Args:
         endpoints: ends of the streaks (n, 2, 2), px, corrected for bias, in any order.
@@ -186,7 +188,8 @@ def evaluate(
     normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > _FARTHEST_CENTRE * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
     length = lengths(endpoints)
-    # Each difference from a star is expressed as a displacement (px) of one end across or along the streak.
+    # Each difference from the streak of a star is expressed as a displacement (px) of one end across or along
+    # the streak.
     if degenerate:
         across = np.sin(slopes(endpoints) - slopes(expected)) * length
         along = length - lengths(expected)
@@ -236,7 +239,8 @@ def short_regions(
     for (top, bottom, left, right), label in zip(short.boxes, short.label, strict=True):
         row, column = positions(short.labels[top:bottom, left:right] == label)
         weight = segmented.signal[row + top, column + left].astype(float)
-        # Pixels below half the maximum are excluded, because a faint star's streak would lengthen a point.
+        # Pixels below half the maximum are excluded, because the streak of a faint star in the same region
+        # would lengthen a point.
         bright = weight >= 0.5 * weight.max()
         points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
         weight = weight[bright] / weight[bright].sum()
@@ -247,7 +251,7 @@ def short_regions(
     ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
-    # Near the axis of rotation, stars are also points, so that regions near the axis are excluded.
+    # Regions near the axis of rotation are excluded, because stars near the axis are also points.
     streaked: BoolArray = np.linalg.norm(expected[:, 1] - expected[:, 0], axis=-1) >= settings.least_length
     return ends[streaked], sigma[streaked], short.label[streaked]
 
@@ -255,8 +259,8 @@ def short_regions(
 class Verdict(Enum):
     """Classification of a streak or region.
 
-    STAR means that the indicators agree with a star, STARS that stars explain the pixels, OBJECT that an
-    object is present, and UNCLEAR that neither stars nor an object explains the pixels.
+    STAR: the indicators agree with a star. STARS: stars explain the pixels. OBJECT: an object is present.
+        UNCLEAR: neither stars nor an object explains the pixels.
     """
 
     STAR = "star"
@@ -267,11 +271,11 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SpaceObject:
-    """A streak or point that does not move as the stars do.
+    """A streak or point with a motion that differs from that of the stars.
 
     Attributes:
-        endpoints: ends of the object's streak (2, 2), px, in the order in time for which the motion relative
-            to the stars is slower.
+        endpoints: ends of the object's streak (2, 2), px, in the order in time that gives the slower motion
+            relative to the stars.
         sigma: standard deviation of each end (2,), px, along the axis of the larger error.
         fired: names of the indicators that exceed their thresholds; empty if the object was found by its
             pixels only.
@@ -279,8 +283,8 @@ class SpaceObject:
         improvement: decrease of chi-square when the object is added to a model of stars.
         relative_rate: angular rate of the object relative to the stars, rad/s.
         direction: direction of the motion relative to the stars, a unit vector (x, y) in the image.
-        other_relative_rate: angular rate of the object relative to the stars if the ends were passed in
-            reverse order, rad/s; one image does not show the order.
+        other_relative_rate: angular rate of the object relative to the stars for the reverse order of the
+            ends, rad/s. One image does not show the order.
     """
 
     endpoints: FloatArray
@@ -300,7 +304,7 @@ class SpaceObject:
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """The examined streaks of an image and the objects among them.
+    """The result of a search: the examined streaks of an image, and the objects among them.
 
     Attributes:
         indicators: indicators of the streaks with two ends, followed by the indicators of the short regions.
@@ -319,32 +323,37 @@ class ObjectReport:
 
 # Distance (px) between two corners of a region below which they count as the same corner.
 _LEAST_CROSSING_PX = 10.0
-# Distance (px) of the second end of a line from the path of a star through its first end below which the
-# line lies on the path.
+# Largest distance (px) of the second end of a line from the path of a star through the first end for which
+# the line is regarded as part of the path.
 _ON_PATH_PX = 1.5
-# Distance (px) of a streak's ends from the predicted ends of a star below which the streak is a star's.
+# Distance (px) of the ends of a streak from the predicted ends of a star below which the streak is that of a
+# star.
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
-# Chi-square per pixel along an object's streak below which its ends and its stars are not located again.
+# Chi-square per pixel along an object's streak below which the fit is not repeated with stars fitted to the
+# region.
 _GOOD_FIT = 1.4
-# Chi-square per pixel along a streak of uniform brightness, for 1000 pixels and three standard deviations.
+# Upper limit of chi-square per pixel along a streak of uniform brightness (three standard deviations for 1000
+# pixels).
 _UNIFORM = 1.15
-# Brightness of a star's path relative to a line on this path above which the line may be part of the star.
+# Ratio of the brightness along a star's path to that of a line on this path above which the line may be part
+# of the star.
 _HIDDEN_STAR = 0.6
-# Number of parts of a star's path whose brightness is compared.
+# Number of parts into which a star's path is divided to compare their brightness.
 _PARTS = 12
-# Largest excess of chi-square over its expected value beside an object, relative to the decrease of
-# chi-square by the object: for any object, and for an object whose streak resembles a star's.
+# Limits of the excess of chi-square (over its expected value) that remains with an object, relative to the
+# decrease of chi-square by the object. The first limit applies to every object. The second, lower limit is
+# required of a uniform streak that resembles that of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
-# Share of the required decrease of chi-square above which light may be a part of an object's streak.
+# Fraction of the required decrease of chi-square above which the light may be a part of an object's streak.
 _PART = 0.6
-# The limit of any object, for an object whose ends are not yet located.
+# Largest relative excess of chi-square beside an object before its ends are located.
 _HOPELESS = 4.0
-# Distance from a star's path at which its light falls below the noise beyond that of its Gaussian profile,
-# in standard deviations of the PSF.
+# Additional distance from a star's path, beyond its Gaussian profile, within which its light may exceed the
+# noise, in standard deviations of the PSF.
 _DIM_SIGMAS = 2.0
-# Minimum distance (px) from the image border at which the ends of a region count as inside the image.
+# Minimum distance (px) of the ends of a region from the image border for the region to be inside the image.
 _BORDER_PX = 2
 
 
@@ -353,8 +362,8 @@ class Judgement:
     """Classification of one streak or region.
 
     Attributes:
-        verdict: what the streak or region is.
-        candidate: the detected object, or None for any other verdict than OBJECT.
+        verdict: classification of the streak or region.
+        candidate: the detected object, or None unless the verdict is OBJECT.
         light: the stars that explain the pixels, or None for an object and for an untested streak.
     """
 
@@ -366,9 +375,9 @@ class Judgement:
 def _light_beside_numpy(
     region: IntArray, light: FloatArray, ends: FloatArray, half: FloatArray, reach: float
 ) -> tuple[int, float]:
-    """Return the number of pixels of a region beside the path of a star, and their light, counts.
+    """Return the number of a region's pixels that are not on the path of a star, and the sum of their counts.
 
-    The path of a star is nearly a parabola over its chord.
+    The path of a star is approximated by a parabola over its chord.
 
     Args:
         region: pixels of the region (m, 2).
@@ -471,7 +480,7 @@ class Judge:
         return self._stars_or_unclear(light)
 
     def explained(self, judged: Judgement, label: int) -> bool:
-        """Return whether stars explain all light of a region, so that no object can be merged with stars."""
+        """Return whether stars explain all light of a region, so that it cannot contain an object as well."""
         if judged.light is None:
             return False
         return judged.light.excess(self._pixels_of(label)) < self.objects.crossing_improvement
@@ -513,9 +522,9 @@ class Judge:
         """Return the objects in regions in which objects and stars may be merged.
 
         If few stars do not explain all light of a region, its stars are fitted. If the fitted stars do not
-        explain it either, the brightest light of the region without its stars is tested. Regions
-        whose label is in `settled` are not examined. Regions whose label is in `strange` are examined first.
-        Regions whose label is in `explained` contain only stars, and count as examined.
+        explain all light either, they are subtracted, and the brightest remaining light of the region is
+        tested. Regions whose label is in `settled` are not examined. Regions whose label is in `strange` are
+        examined first. Regions whose label is in `explained` contain only stars, and count as examined.
         """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
@@ -544,7 +553,7 @@ class Judge:
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
         """Return the object between `ends` (2, 2), px, or None if stars explain the pixels.
 
-        The argument `stars` holds the paths (m, 2), px, of known stars nearby.
+        The argument `stars` contains the paths (m, 2), px, of known stars nearby.
         """
         if ends is None or self._moves_like_a_star(ends, _FITTED_PX):
             return None
@@ -565,10 +574,10 @@ class Judge:
             return None
 
     def _only_stars(self, few: StarLight, enough: float) -> bool:
-        """Return whether few trial stars explain the pixels, as more trial stars then do as well.
+        """Return whether few trial stars explain the pixels; then more trial stars need not be tested.
 
         Few stars explain the pixels if no object can decrease chi-square by `enough`. A good fit of stars and
-        an object has a chi-square of about one per pixel, which limits the decrease.
+        an object has a chi-square of about one per pixel, so that the possible decrease is limited.
         """
         calm = few.chi_square <= self.objects.worst_fit * few.pixels
         return few.chi_square - few.pixels < enough and calm
@@ -593,11 +602,12 @@ class Judge:
         return light.chi_square - found.chi_square
 
     def _is_object(self, light: StarLight, found: Explanation, improvement: float, uniform: bool) -> bool:
-        """Return whether an object improves chi-square enough and explains the pixels along its streak.
+        """Return whether an object decreases chi-square enough and explains the pixels along its streak.
 
-        A streak that differs from a star's only near its ends fits nearly as well as a star along its length.
-        If the streak is `uniform`, it suffices that the object explains nearly all light that stars do not
-        explain. A line that explains only a small part of this light is rejected.
+        If a streak differs from the streak of a star only near its ends, stars without an object fit most of
+        its length nearly as well. For a `uniform` streak, it is therefore sufficient that the object explains
+        nearly all light that stars do not explain. A line that explains only a small part of this light is
+        rejected.
         """
         gained = self._gained(light, found)
         remains = found.chi_square - light.expected
@@ -625,10 +635,10 @@ class Judge:
         stars: Sequence[FloatArray],
         improvement: float,
     ) -> SpaceObject | None:
-        """Return the object between `ends`, ordered such that the motion relative to the stars is slower.
+        """Return the object between `ends`; its ends are in the order of the slower motion among the stars.
 
         The ends are located by all light of the streak. If the known `stars` leave light along the streak,
-        the stars of the region are fitted. Returns None if the located streak is a star's, or if stars
+        the stars of the region are fitted. Returns None if the located streak is that of a star, or if stars
         explain its pixels.
         """
         rough = light.explain(ends)
@@ -680,9 +690,9 @@ class Judge:
     def begins_a_star(self, ends: FloatArray, flux: float) -> bool:
         """Return whether a line between `ends` (2, 2), px, may be the part of a star beside other stars.
 
-        The line then lies on the path of a star that begins or ends at one end of the line, and the whole
-        path is about as bright as the line of `flux` counts or brighter, because other stars cover the rest
-        of the path.
+        In this case, the line lies on the path of a star that begins or ends at one end of the line. The
+        whole path is at least about as bright as the line of `flux` counts, because other stars cover the
+        rest of the path.
         """
         length = max(float(np.linalg.norm(ends[1] - ends[0])), 1.0)
         directions = self.pinhole.unit_vectors(ends[[0, 0, 1, 1]])
@@ -697,7 +707,7 @@ class Judge:
         return False
 
     def _stars_along(self, ends: FloatArray) -> list[FloatArray]:
-        """Return the paths (m, 2), px, of the stars in the region along a line between `ends` (2, 2), px."""
+        """Return the paths (m, 2), px, of the stars in the region that contains the line between `ends`."""
         regions = self.segmented.regions
         index = np.flatnonzero(regions.label == region_along(self.segmented, ends))
         return fit_stars(self._patch(int(index[0])), self.rotation, self.pinhole)[0] if len(index) else []
@@ -712,8 +722,8 @@ class Judge:
         """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
 
         The object moves from the first of the `ends` (2, 2), px, to the second. Both ends of a streak are
-        rotated to mid-exposure as if they belonged to stars; the remaining difference is the motion relative
-        to the stars.
+        rotated to mid-exposure like the directions of stars. The difference that remains is the motion
+        relative to the stars.
         """
         middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
         angle = np.arctan2(np.linalg.norm(np.cross(middle[0], middle[1])), middle[0] @ middle[1])
@@ -736,7 +746,7 @@ def detect(
     """Search an image (rows, columns) for objects and return a report, or None if it has too few streaks.
 
     The camera rotates by `rotation` (3,), rad, during the `exposure`, s. If the sign of the rotation is
-    unknown, the directions of motion of all objects may be reversed together.
+    unknown, the directions of motion of all objects may have the wrong sign.
     """
     segmented = segment_frame(pixels, replace(settings, most_streaks=objects.most_streaks))
     streaks = measure_streaks(segmented, settings)
@@ -822,8 +832,8 @@ def detect_objects(
         camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`. The
             search neglects the distortion of a lens.
         rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
-            from the streaks of the image. If the sign of the rate is unknown, the motions of all objects may
-            be reversed together.
+            from the streaks of the image. If the sign of the rate is unknown, the directions of motion of all
+            objects may have the wrong sign.
         exposure: exposure time, s.
         settings: thresholds, gain and saturation, or None for the defaults.
 
@@ -841,7 +851,7 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # The angle that a pixel subtends on the boresight, the largest angle, is used for all directions.
+    # The angle that a pixel subtends is largest on the boresight. This value is used for all directions.
     sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

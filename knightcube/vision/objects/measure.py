@@ -3,13 +3,13 @@
 If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
 object is also a point or a short streak. If the stars are points, a possible object is an area of light
 significantly above the noise that is not at a catalogue star, or light beside a star that the star's image
-does not explain. Only tracks over several images show which possible objects move relative to the stars.
+does not explain. A tracker over several images determines which possible objects move relative to the stars.
 
 The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
 trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration
 fits the position, extent and brightness of the object, the sky level and the brightness of each star,
-weighted by the noise of the modelled light. Saturated pixels, which would displace a centroid by 0.03 px, are
-excluded. The covariance of a fit is increased if the residuals exceed the noise.
+weighted by the noise of the modelled light. Saturated pixels are excluded, because they would displace a
+centroid by 0.03 px. The covariance of a fit is increased if the residuals exceed the noise.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _STEP_PX = 0.7
 _ROUNDS, _CONVERGED = 12, 1e-4
 """Maximum number of Gauss-Newton steps of the fit, and step (px) below which the iteration ends."""
 _EXTENT = 2.0
-"""Prior standard deviation (px) of the difference between an object's half extent and its initial guess."""
+"""Prior standard deviation (px) of an object's half extent around its initial guess."""
 STAR_SIGMA = 0.3
 """Relative error of a star's catalogue brightness, due to the different passband of the camera."""
 
@@ -130,7 +130,7 @@ def _fit_object(
     """
     images = [patch.image(star, extent) for star, extent in zip(stars.middle, stars.half, strict=True)]
     given = np.maximum(stars.flux, 1e-9)
-    # Each prior is a tuple: index of an unknown of the fit, prior value and standard deviation.
+    # Each prior is a tuple of the index of an unknown, its prior value and its standard deviation.
     prior = [(2 + k, float(half[k]), _EXTENT) for k in range(2)]
     prior += [(6 + k, float(light), STAR_SIGMA * float(light)) for k, light in enumerate(given)]
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])
@@ -161,7 +161,7 @@ def _fit_object(
         misfit = float(np.sum(weight * off**2)) / spare
         if np.abs(step[:2]).max() < _CONVERGED:
             break
-    # The covariance of an object's fit is increased only if chi-square exceeds its mean by three sigma.
+    # The covariance of the fit is increased only if chi-square exceeds its mean by three standard deviations.
     excess = misfit if misfit > 1.0 + 3.0 * (2.0 / spare) ** 0.5 else 1.0
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64) * excess
     away = np.abs(unknowns[:2] - middle).max()
@@ -174,9 +174,15 @@ def _fit_object(
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
 """Largest ratio of the fitted flux of a star to the flux predicted from the catalogue."""
 _LEAST_SHARE = 0.15
-"""Minimum flux of an object relative to adjacent stars, whose modelled images have errors of about 10 %."""
+"""Minimum flux of an object relative to adjacent stars.
+
+The modelled images of stars have errors of about 10 %.
+"""
 _APART = 1.0
-"""Minimum distance (px) of an object from the nearest star; a closer object may be a pair of stars."""
+"""Minimum distance (px) of an object from the nearest star.
+
+A closer object may be the second star of a pair.
+"""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
 """Ratio of the noise of a pixel to the median absolute difference between neighbouring pixels."""
 _MISFIT = 3.0
@@ -231,7 +237,8 @@ class FramePatches:
 
     def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # Differences between neighbouring pixels give the noise without the light of faint stars.
+        # The noise is computed from differences between neighbouring pixels, which contain little light of
+        # faint stars.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
@@ -280,7 +287,7 @@ class FramePatches:
         return found if distinct else None
 
     def _near(self, point: FloatArray, patch: ObjectPatch) -> Trails:
-        """Return the stars in or near a patch of pixels whose flux exceeds three sigma of the noise."""
+        """Return the stars in or near a patch of pixels with a flux above three sigma of the noise."""
         trails, reach = self._trails, 0.5 * max(patch.light.shape) + 3.0 * self._psf
         near = np.all(np.abs(trails.middle - point) - np.abs(trails.half) < reach, axis=1)
         near &= trails.flux > 3.0 * patch.noise
@@ -339,7 +346,7 @@ def measure_objects(
         fits = _among_streaks(seen, stars, solution, motion, rotation, exposure, settings)
     else:
         fits = _among_points(seen, stars, settings)
-    # The fits of two areas may converge to the same object; only the first fit is kept.
+    # The fits of two areas may converge to the same object. In this case, only the first fit is kept.
     middles = np.array([fit.middle for fit, _ in fits]).reshape(-1, 2)
     away = np.linalg.norm(middles[:, None] - middles, axis=2)
     again = np.any(np.tril(away < _SAME, -1), axis=1)
@@ -380,7 +387,8 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of one count is computed from the identified streaks, and is NaN if there are none.
+    # The magnitude of one count is computed from the identified streaks. It is NaN if no streak is
+    # identified.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
     if known is not None and np.any(known):
@@ -411,7 +419,8 @@ def _among_points(
     nearest = away.argmin(axis=1)
     distance = away[np.arange(len(strong)), nearest]
     is_star = distance < settings.clearance + 0.5 * areas.length[strong]
-    # The median over stars is used, because the brightest stars are saturated and the faintest may be pairs.
+    # The median over the stars is used, because the brightest stars are saturated and the faintest stars may
+    # be pairs.
     own = is_star & (distance < 1.0)
     if not np.any(own):
         return []
@@ -438,23 +447,23 @@ def _among_points(
 
 
 def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSettings) -> FittedObject:
-    """Return an object at the centroid of an area of light, for an area whose fit failed."""
+    """Return an object at the centroid of an area of light, which is used if the fit fails."""
     sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(ratio, 1.0)
     error = np.hypot(settings.centre_sigma, sigma)
     return FittedObject(areas.centre[area], error**2 * np.eye(2), float(areas.flux[area]), 0.0, 1.0)
 
 
 def _faintness(flux: FloatArray) -> FloatArray:
-    """Return 2.5 log10 of counts (n,): the magnitudes by which stars are brighter than one count."""
+    """Return 2.5 log10 of counts (n,), the magnitude difference between a star of one count and each star."""
     return np.asarray(2.5 * np.log10(np.maximum(flux, 1e-9)))
 
 
 MOST_POINTS = 80
-"""Maximum number of points of light that are measured in a frame, brightest first."""
+"""Maximum number of measured points of light in a frame; the brightest are measured."""
 _FIELD_SIGMAS = 12.0
 """Minimum flux (standard deviations) of a point of light in a frame without identified stars."""
 STREAK_PX = 20.0
-"""Median length of the streaks (px) from which `detect` searches a single frame."""
+"""Minimum median length of the streaks (px) for which `detect` searches a single frame."""
 
 
 def measure_points(
@@ -465,7 +474,7 @@ def measure_points(
     settings: ObjectMeasurementSettings,
     detection: DetectionSettings,
 ) -> FieldPoints:
-    """Return the points of light in a frame (rows, columns), of which objects may be marked as moving.
+    """Return the points of light in a frame (rows, columns); objects may be marked as moving.
 
     Args:
         pixels: counts of the frame.

@@ -17,8 +17,8 @@ class EndpointSettings:
     Attributes:
         threshold_sigmas: threshold for the sum of 3 x 3 pixels, in standard deviations of this sum; with 0
             the threshold is the image mean, as in Sease.
-        least_area: minimum number of pixels in a region; a noise peak fills nine pixels of the 3 x 3 sum.
-        most_streaks: maximum number of bright regions that are measured, strongest first.
+        least_area: minimum number of pixels in a region. A noise peak fills nine pixels of the 3 x 3 sum.
+        most_streaks: maximum number of bright regions that are measured; the strongest are measured.
         saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         gain: electrons per count.
         smoothing_sigma: standard deviation of the Gaussian that smooths the image before the corner detector,
@@ -79,13 +79,13 @@ class ObjectSettings:
         most_points: maximum number of short regions that are examined as points.
         most_merged: maximum number of regions that are searched again after their stars are removed.
         least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region.
-            The default is the fraction that remains at the end of a bright star's streak if the rotation has
+            The default is the fraction of a bright star's streak that remains at its end if the rotation has
             an error of 2 %.
         most_corners: number of corners (peaks of the Harris response) above which a region is not examined.
         point_significance: minimum flux of a short region, in standard deviations.
         improvement: minimum decrease of chi-square when an object is added to a model of stars.
-        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars; larger
-            than `improvement`, because many lines are tested.
+        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars. It is
+            larger than `improvement`, because many lines are tested.
         worst_fit: largest chi-square per pixel along the streak of an accepted object.
         streak_sigma: standard deviation, per axis, of the midpoint of a streak that is too short to locate
             its ends, px.
@@ -119,8 +119,8 @@ class ObjectMeasurementSettings:
         faintest: V magnitude of the faintest object that is reported; the star catalogue must be complete to
             fainter magnitudes.
         significance: minimum flux of an area of light, in standard deviations.
-        clearance: minimum distance of an object from the nearest catalogue star, px, to which half the length
-            of the area of light is added.
+        clearance: minimum distance between an object and the nearest catalogue star, px. Half the length of
+            the object's area of light is added to this distance.
         floor: minimum standard deviation per axis of a position, px (from the campaign `object-passes`).
         centre_sigma: minimum standard deviation per axis, px, of the centroid that is used if the fit of an
             object fails.
@@ -145,7 +145,8 @@ class MeasuredObjects:
         directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration.
         covariance: covariances of the directions due to the errors of the positions (n, 3, 3), rad^2, ICRS.
         magnitudes: V magnitudes of the objects relative to the stars of the image (n,), or NaN if unknown.
-        attitude: covariance of the attitude error (3, 3), rad^2, ICRS axes, which all objects share.
+        attitude: covariance of the attitude error (3, 3), rad^2, ICRS axes. The attitude error is common to
+            all objects.
     """
 
     points: FloatArray
@@ -156,7 +157,7 @@ class MeasuredObjects:
 
 
 FLOOR_PX = 0.1
-"""Smallest standard deviation (px) per axis of a point of light, of which saturation is the largest part."""
+"""Smallest standard deviation (px) per axis of a point of light; its main cause is saturation."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,7 +169,7 @@ class FieldPoints:
         directions: unit vectors at mid-exposure (n, 3), camera axes.
         sigma: standard deviation of each direction per axis (n,), rad.
         flux: flux of each point (n,), counts.
-        moving: whether the single frame shows that the point is not a star (n,).
+        moving: mask of the points that move relative to the stars within the single frame (n,).
     """
 
     points: FloatArray

@@ -1,14 +1,15 @@
 """Detection of moving objects without a star catalogue, by the common motion of the stars over frames.
 
 The worker measures the points of light in a frame (`measure.measure_points`). If the stars are long streaks,
-`detect` finds objects in the single frame, and the fitted streaks give the directions of the stars. Otherwise
-the centroids of all bright areas are measured, and a single frame does not tell an object from a star.
+`detect` finds objects in the single frame, and the directions of the stars are computed from the fitted
+streaks. Otherwise the centroids of all bright areas are measured, and a single frame does not distinguish an
+object from a star.
 
 The class `StarField` keeps the directions of the stars of earlier frames. The predicted rotation of the
 camera assigns the points of a new frame to these stars, and the assigned stars correct the rotation. A point
-that is assigned to no star is new in the field, noise or an object. Only a tracker over several frames shows
-which of these points move. An object that moves less than the matching tolerance from frame to frame is
-mistaken for a star.
+that is not assigned to a star is noise, an object, or a star that has entered the field of view. A tracker
+over several frames determines which of these points move. An object that moves less than the matching
+tolerance from frame to frame is mistaken for a star.
 """
 
 from __future__ import annotations
@@ -24,28 +25,28 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.vision.objects.settings import FieldPoints
 
 GATE = 5.0
-"""Largest distance of a point from a star, in standard deviations, at which the point is the star."""
+"""Largest distance (standard deviations) of a point from the star to which it is assigned."""
 LEAST_STARS = 3
 """Minimum number of assigned stars that determine the rotation of the camera."""
 MOST_FAILURES = 3
-"""Number of successive frames without enough stars after which the field begins again."""
+"""Number of successive frames with too few assigned stars after which the field is cleared."""
 KNOWN = 2
-"""Number of frames with a direction from which the direction is a star."""
+"""Minimum number of frames in which a direction appears for the direction to be that of a star."""
 FORGOTTEN = 20
-"""Number of frames without a direction after which the direction is forgotten, unless it is a star."""
+"""Number of frames after which a direction that does not appear again is removed, unless it is a star."""
 MOST_STARS = 600
-"""Maximum number of stars that are kept, newest first."""
+"""Maximum number of stars that are kept; the most recent are kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFrame:
-    """A frame among the stars of earlier frames.
+    """The attitude of a frame relative to the stars of earlier frames, and which of its points are stars.
 
     Attributes:
         quaternion: attitude (4,) of the camera relative to the field.
         covariance: covariance (3, 3) of the attitude relative to the field, camera axes, rad^2.
         is_star: whether each point of the frame is a star of earlier frames (n,).
-        begun: whether the field begins with this frame.
+        begun: whether this frame is the first frame of the field.
     """
 
     quaternion: FloatArray
@@ -65,10 +66,11 @@ class StarField:
         self._frame = self._failures = 0
 
     def locate(self, found: FieldPoints, predicted: FloatArray, sigma: float) -> LocatedFrame:
-        """Return the attitude of a frame among the stars, and which of its points are stars.
+        """Return the attitude of a frame relative to the field, and which of its points are stars.
 
-        If fewer than three points are stars of the field, the field is not updated, and the points count as
-        stars. After three such frames in a row, the field begins again.
+        If fewer than three points are stars of the field, the field is not updated, and all points are
+        treated as stars. After three such successive frames, the field is cleared and begins with a new
+        frame.
 
         Args:
             found: points of light in the frame.
@@ -127,7 +129,7 @@ class StarField:
         return fix, pairs
 
     def _add(self, found: FieldPoints, chosen: IntArray, quaternion: FloatArray) -> None:
-        """Add the points with the indices `chosen` to the field, and forget old directions."""
+        """Add the points with the indices `chosen` to the field, and remove old directions."""
         added = found.directions[chosen] @ attitude_matrix(quaternion)
         self._directions = np.vstack([self._directions, added])
         self._sigma = np.concatenate([self._sigma, found.sigma[chosen]])
@@ -155,7 +157,8 @@ def _common_rotation(there: FloatArray, stars: FloatArray, quaternion: FloatArra
     turn = proposals[best]
     if np.count_nonzero(near) >= 2:
         first, second = there[near], stars[near]
-        # The least-squares rotation vector e of stars = there + e x there.
+        # The variable `turn` is the least-squares solution of stars = there + e x there for the rotation
+        # vector e.
         normal = len(first) * np.eye(3) - first.T @ first
         turn = np.linalg.lstsq(normal, np.cross(first, second).sum(axis=0), rcond=1e-9)[0]
     return multiply(quaternion, from_rotation_vector(turn))

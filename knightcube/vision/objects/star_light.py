@@ -2,20 +2,20 @@
 
 The test compares two hypotheses by chi-square: that the light of the region comes from stars only, or from
 stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
-spread function (PSF). Stars follow the paths that are determined by the camera's rotation. The object moves
+spread function (PSF). The rotation of the camera determines the paths of the stars. The object moves
 uniformly from one end of its streak to the other, on a line that is straight either in the image or relative
 to the stars. The straight line in the image and that relative to the stars differ if the camera rotates about
-the boresight. The brightnesses of stars and object are fitted by non-negative least squares. Two stars whose
-streaks overlap or touch, and a segment of a faint star's streak, are explained by stars. Light that is not on
-the path of any star, or that ends where a star would continue, is not explained by stars.
+the boresight. The brightnesses of stars and object are fitted by non-negative least squares. The first
+hypothesis also explains two stars whose streaks overlap or touch, and a segment of a faint star's streak.
+Stars do not explain light that is not on the path of a star, or light that ends within such a path.
 
 A star's streak has the same brightness from end to end. The brightness of a star is therefore at most the
 minimum brightness of the image along the star's path. An erosion of the image, with the path as structuring
 element, gives the minimum brightness along the path for every position of the star. Objects that cross the
 streaks of stars, and points on these streaks, nearly vanish in the eroded image. The stars of a region are
 subtracted one by one, the brightest first. The positions and brightnesses of all stars found are fitted
-together, without pixels that are brighter than these stars. The brightest light that remains after the
-subtraction of the stars is then fitted as a point or a line.
+together. The fit excludes pixels that are brighter than the model of these stars. The brightest light that
+remains after the subtraction of the stars is then fitted as a point or a line.
 """
 
 from __future__ import annotations
@@ -48,32 +48,34 @@ from knightcube.vision.objects.streak_images import (
 )
 
 PATHS_PER_LENGTH = 8
-"""Number of trial star paths along a bright region, per length of a star path."""
+"""Number of trial star paths per length of a star path, along a bright region."""
 # Maximum length of a chain of successive star streaks in a bright region, in path lengths.
 _LONGEST_CHAIN = 5.0
 # Largest distance (px) between two paths that count as the same path.
 _SAME_PATH = 0.15
-# Maximum number of rounds that follow the light of an object's streak and fit its ends.
+# Maximum number of rounds in which the light of an object's streak is followed and its ends are fitted.
 _ROUNDS = 5
-# Smallest length (px) beyond both ends of a streak at which its light is looked for: first, and later.
+# Minimum length (px) beyond each end of a streak over which its light is followed: in the first rounds, and
+# in later rounds.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
-# Displacement (px) of an end by the followed light above which the end is moved before the fit.
+# Distance (px) between an end and the end of the followed light above which the end is moved before the fit.
 _FOLLOWED = 1.5
 # Maximum number of Gauss-Newton steps of the ends in a round, and the step (px) that ends the fit.
 _END_FITS, _END_CONVERGED = 3, 0.05
-# Change (px) of the ends in a round below which the ends are located.
+# Change (px) of the ends in a round below which the rounds end.
 _LOCATED = 0.3
-# Brightness of light relative to the streak above which the light is that of another source.
+# Ratio of the brightness on the path to that of the streak above which the light belongs to another source.
 _BRIGHTER = 2.0
-# Error of a subtracted star, relative to the brightness of the streak, above which the streak is hidden.
+# Error of the subtracted light of stars, relative to the brightness of the streak, above which the light is
+# ignored.
 _HIDDEN = 0.25
 # Minimum length (px) of a streak whose ends are located.
 _LEAST_LOCATED = 12.0
 # Distance from all star and object paths beyond which pixels are ignored, in standard deviations of the PSF.
 _REACH = 3.0
-# Relative ridge of the normal equations of brightnesses.
+# Relative ridge (regularisation) of the normal equations of the brightnesses.
 _RIDGE = 1e-10
-# Relative error of the modelled image of a bright streak, due to errors of its ends, PSF and uniformity.
+# Relative error of the modelled image of a bright streak, due to its ends, its PSF and its uniformity.
 SHAPE_ERROR = 0.1
 
 
@@ -82,7 +84,7 @@ class Explanation:
     """Quality of the hypothesis that the pixels of a region show stars and one object.
 
     Attributes:
-        chi_square: chi-square of the best sum of star streaks and the object's streak.
+        chi_square: chi-square of the best-fitting sum of star streaks and the object's streak.
         misfit, misfit_of_stars: chi-square per pixel along the object's streak, for stars with the object and
             for stars only.
         flux: flux of the object, counts.
@@ -96,7 +98,7 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedEnds:
-    """Ends of an object's streak, located by all light of the streak.
+    """Ends of an object's streak, located by means of the light along the whole streak.
 
     Attributes:
         ends: the two ends (2, 2), px.
@@ -128,7 +130,7 @@ class StarLight:
         per_length: number of trial star paths along the region, per length of a star path.
 
     Attributes:
-        chi_square: chi-square of the best sum of star streaks.
+        chi_square: chi-square of the best-fitting sum of star streaks.
         pixels: number of pixels near the trial star paths and the lines between corners.
         expected: expected chi-square of a correct model, which is below `pixels` where light is bright.
 
@@ -172,7 +174,7 @@ class StarLight:
         self.expected = float(np.sum(_noise_share(signal, self._weight, segmented.background, gain)))
 
     def explain(self, ends: FloatArray) -> Explanation:
-        """Return how well stars and an object between `ends` (2, 2), px, explain the pixels.
+        """Return the quality of the hypothesis of stars and one object between `ends` (2, 2), px.
 
         The object's path is straight in the image or relative to the stars, whichever gives the smaller
         chi-square.
@@ -193,12 +195,11 @@ class StarLight:
         return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
 
     def located(self, ends: FloatArray, among_stars: bool) -> LocatedEnds | None:
-        """Return the ends of an object's streak that most likely bound its light, or None without a streak.
+        """Return the most likely ends of the light of an object's streak, or None if no streak is found.
 
-        The light is followed along the path of the streak beyond both ends. The part of the path with the
-        largest likelihood that its brightness is uniform, and zero outside, gives the ends, which are then
-        fitted with the brightness to the pixels. Light is not followed into other regions. Known stars are
-        subtracted.
+        The light is followed along the path of the streak beyond both ends. The initial ends are those of the
+        most likely part of the path with uniform brightness and no light outside. Ends and brightness are
+        then fitted to the pixels. Light is not followed into other regions. Known stars are subtracted.
 
         Args:
             ends: initial guess of the two ends (2, 2), px.
@@ -247,7 +248,7 @@ class StarLight:
     def _lit(
         self, curve: FloatArray, parts: FloatArray, ends: FloatArray, among_stars: bool, label: int
     ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, FloatArray] | None:
-        """Return the lit part of a curve and the pixels near the curve, or None if the curve is dark.
+        """Return the bright part of a curve and the pixels near the curve, or None if the curve is dark.
 
         The results are the fractions of the path at which its light begins and ends (2,), their standard
         deviations (2,), px, the pixels (p, 2), their counts without known stars (p,), and their weights (p,).
@@ -278,7 +279,7 @@ class StarLight:
         usual = float(np.median(light[inner])) if inner.any() else 0.0
         if usual <= 0.0:
             return None
-        # Doubled logarithm of the likelihood ratio of the usual brightness and darkness.
+        # Twice the logarithm of the likelihood ratio of the usual brightness to darkness.
         gain = share * usual * (2.0 * light - usual)
         gain[light > _BRIGHTER * usual + 3.0 / np.sqrt(np.maximum(share, 1e-300))] = 0.0
         if len(self._known):
@@ -300,7 +301,7 @@ class StarLight:
         ends: FloatArray,
         among_stars: bool,
     ) -> LocatedEnds | None:
-        """Return the ends that Gauss-Newton fits to the counts `target` (p,) of pixels (p, 2), or None."""
+        """Return the ends fitted to the counts `target` (p,) of pixels (p, 2), or None if the fit fails."""
         size = 0.0
         for _ in range(_END_FITS):
             chord = ends[1] - ends[0]
@@ -339,7 +340,7 @@ class StarLight:
         return LocatedEnds(ends, sigma, misfit)
 
     def excess(self, region: IntArray) -> float:
-        """Return by how much chi-square of pixels and region exceeds its expected value, without an object.
+        """Return the excess of chi-square of pixels and region over its expected value, without an object.
 
         The light of pixels of the `region` (m, 2), px, in ascending rows and columns, that are not near any
         trial path is not explained by stars.
@@ -392,7 +393,7 @@ def light_on_path(segmented: Segmented, path: FloatArray, psf_sigma: float) -> F
 
 
 def _around(inside: BoolArray, middle: int) -> IntArray:
-    """Return the indices of the uninterrupted true values around the index `middle`, or none."""
+    """Return the indices of the contiguous true values around the index `middle`, or an empty array."""
     outside = np.flatnonzero(~inside)
     place = int(np.searchsorted(outside, middle))
     first = int(outside[place - 1]) + 1 if place > 0 else 0
@@ -401,9 +402,9 @@ def _around(inside: BoolArray, middle: int) -> IntArray:
 
 
 def _end_of_light(gain: FloatArray) -> tuple[float, float]:
-    """Return the expected last index of light, and its standard deviation.
+    """Return the expected value of the last index with light, and its standard deviation.
 
-    The array `gain` (n,) holds the doubled logarithm of the likelihood ratio of light and darkness at each
+    The array `gain` (n,) contains twice the logarithm of the likelihood ratio of light to darkness at each
     index.
     """
     total = np.cumsum(gain)
@@ -429,7 +430,7 @@ def _light_along(
     tangent = np.gradient(curve, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
     near = np.rint(place).astype(np.int64)
-    # The nearest point of a bent curve is found in a second step.
+    # The nearest point of a curve that is not straight is found in a second step.
     ahead = np.sum((pixels - curve[near]) * tangent[near], axis=1)
     near = np.clip(near + np.rint(ahead).astype(np.int64), 0, len(curve) - 1)
     away = pixels - curve[near]
@@ -445,7 +446,7 @@ def _pixel_weights(signal: FloatArray, background: Background, gain: float, satu
     """Return the reciprocal standard deviations of pixels with `signal` counts above `background`.
 
     The standard deviation includes the noise of the background, photon noise (`gain` in electrons per count)
-    and the uncertain shape of bright streaks. Pixels above 95 % of the `saturation` counts have the weight 0.
+    and the model error of bright streaks. Pixels above 95 % of the `saturation` counts have the weight 0.
     """
     light = np.maximum(signal, 0.0)
     clipped = signal + background.typical_level >= 0.95 * saturation
@@ -471,11 +472,12 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
     """
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal / scale / scale[:, None]
-    # The ridge permits images that are equal or empty.
+    # The ridge keeps the equations regular if images are equal or empty.
     scaled.reshape(-1)[:: len(scale) + 1] += _RIDGE
-    # The routines of LAPACK are called directly, because the checks of numpy take longer than they do.
+    # The LAPACK routines are called directly, because the argument checks of numpy take longer than the
+    # routines.
     factor, _ = lapack.dpotrf(scaled, lower=1)
-    # A triangular system of k rows has the same solutions as the system of all pixels.
+    # The triangular system of k rows has the same least-squares solution as the system of all pixels.
     reduced, _ = lapack.dtrtrs(factor, right / scale, lower=1)
     try:
         brightness, residual = nnls(factor.T, reduced, maxiter=30 * len(scale))
@@ -485,7 +487,7 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
 
 
 def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole, per_length: int) -> FloatArray:
-    """Return trial star paths (n, m, 2), px, that begin or end at a corner, or cover the whole region."""
+    """Return trial star paths (n, m, 2), px, that begin or end at a corner or are spread over the region."""
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     extent = float(np.hypot(*(corners.max(axis=0) - corners.min(axis=0))))
     directions = pinhole.unit_vectors(np.concatenate([corners, middle[None]]))
@@ -503,15 +505,15 @@ def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole, per
 # Margin (px) of a patch of pixels around a region, which is wider than the PSF.
 _ROOM = 8
 _MOST_STARS = 12
-# Detection thresholds of a star and of the remaining light, in standard deviations of the smoothed image.
+# Detection thresholds of a star and of the light without stars, in standard deviations of the smoothed image.
 _STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
-# Excess of a pixel over the modelled stars (standard deviations) above which the fit ignores the pixel.
+# Excess of a pixel over the modelled stars (standard deviations) above which the fit excludes the pixel.
 _NOT_THEIRS = 4.0
 # Distance from the path of a star beyond which its light is neglected, in standard deviations of the PSF.
 _WIDE_REACH = 5.0
-# Largest step (px) of a fit, step (px) at which the fit has converged, and maximum number of steps.
+# Largest step (px) of a fit, step (px) below which the fit has converged, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
-# Minimum length (px) of an object's line of light; a shorter remainder of light counts as a point.
+# Minimum length (px) of an object's line of light. A shorter line is treated as a point.
 _LEAST_LINE_PX = 4.0
 # Distance at which the Gaussian that smooths an image is truncated, in standard deviations.
 _FARTHEST = 4.0
@@ -526,7 +528,7 @@ class Patch:
         weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts; 0 if saturated.
         noise: standard deviation of a background pixel, counts.
         corner: position (x, y) in the frame of the first pixel of the rectangle (2,), px.
-        mask: which pixels belong to the region (rows, columns).
+        mask: mask of the pixels that belong to the region (rows, columns).
         beyond: counts assumed beyond the rectangle, as ((above, below), (left, right)); infinite outside the
             frame, because streaks may continue there.
         psf_sigma: standard deviation of the PSF, px.
@@ -545,14 +547,14 @@ class Patch:
     seen: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        """Smooth the signal, which the search for stars and the search for objects use."""
+        """Compute the smoothed signal, which the search for stars and the search for objects use."""
         object.__setattr__(self, "seen", _smoothed(self.signal, self.psf_sigma))
 
     def excess(self, left: FloatArray) -> float:
-        """Return by how much chi-square of the counts `left` in the region exceeds its expected value.
+        """Return the excess of chi-square of the counts `left` in the region over its expected value.
 
-        The array `left` (rows, columns) is the signal without the light of a model. No model of the light
-        decreases chi-square by more than about the returned value.
+        The array `left` (rows, columns) is the signal without the light of a model. The returned value is
+        approximately the largest decrease of chi-square by any further model.
         """
         weight = self.weight[self.mask]
         variance = self.noise**2 + np.maximum(self.signal[self.mask], 0.0) / self.gain
@@ -605,7 +607,7 @@ def _convolved_numpy(light: FloatArray, profile: FloatArray) -> FloatArray:
 
 @compiled_form_of(_convolved_numpy)
 def _convolved(light: FloatArray, profile: FloatArray) -> FloatArray:
-    """Return an image (rows, columns) convolved along both axes with a symmetric profile; zero beyond.
+    """Return an image convolved along both axes with a symmetric profile, with zeros beyond its border.
 
     The array `profile` (k,) begins with the middle of the profile.
     """
@@ -652,7 +654,7 @@ def _path_of(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> Floa
     return star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
 
 
-# Number of points of a star's path at which pixels of a patch are first tested for a star.
+# Number of points of a star's path that are tested first, for each pixel that may be the middle of the path.
 _FIRST_OFFSETS = 9
 
 
@@ -666,7 +668,7 @@ def _brightest_star(patch: Patch, left: FloatArray, offsets: FloatArray) -> Floa
     # At the end of a streak, the smoothed brightness is half the brightness along the streak.
     factor = np.ones(len(steps))
     factor[[0, -1]] = 2.0
-    # The middle of the path, then points all along the path, exclude most pixels.
+    # Most pixels are excluded by the tests at the middle of the path and at a few points along the path.
     first = np.unique(np.linspace(0, len(steps) - 1, _FIRST_OFFSETS).astype(int))
     order = np.concatenate([first[len(first) // 2 :], first[: len(first) // 2]])
     order = np.concatenate([order, np.setdiff1d(np.arange(len(steps)), order)])
@@ -707,9 +709,9 @@ def _brightest_path_numpy(
 def _brightest_path(
     seen: FloatArray, steps: IntArray, factor: FloatArray, beyond: FloatArray, threshold: float
 ) -> tuple[float, int, int]:
-    """Return the largest minimum of an image along a path, and column and row of the middle of the path.
+    """Return the largest minimum of an image along a path, and the column and row of the path's middle.
 
-    Returns minus infinity, -1 and -1 if the minimum is below the threshold wherever the path is.
+    Returns minus infinity, -1 and -1 if the minimum is below the threshold for each position of the path.
 
     Args:
         seen: image (rows, columns).
@@ -774,7 +776,7 @@ def _fit_together(
 
 
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of the brightest significant light left in a region, or None.
+    """Return the ends (2, 2), px, of the brightest significant light in a region without its stars, or None.
 
     For a point, the two ends are equal. Residuals below the model error of a bright star are not significant.
 

@@ -1,4 +1,4 @@
-"""Bright regions of a frame, and the two ends of each region that is a streak (Sease 2013, chapter 3).
+"""Segmentation of a frame into bright regions, and the two ends of each streak (Sease 2013, chapter 3).
 
 A pixel is bright if the sum of the 3 x 3 pixels around it, without background, exceeds a given number of
 standard deviations of the sum. The sum of 3 x 3 pixels is nearly the matched filter of a star image one pixel
@@ -36,11 +36,11 @@ from knightcube.vision.frame import (
 )
 from knightcube.vision.objects.settings import EndpointSettings
 
-# Margin (px) around a region's bounding box, wide enough for the tensor window and the derivative kernel.
+# Margin (px) around a region's bounding box that covers the tensor window and the derivative kernel.
 _PADDING = 8
 # Minimum length of a region that may be a streak, as a fraction of `EndpointSettings.least_length`.
 _LENGTH_MARGIN = 0.75
-# Fraction of a streak's counts in the pixel row along its centre line, for a PSF of 1 px.
+# Fraction of a streak's counts in the single row of pixels along its centre line, for a PSF of 1 px.
 _PEAK_FRACTION = 0.28
 
 
@@ -65,7 +65,7 @@ class Regions:
     length: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> Regions:
-        """Return some of the regions, selected by a mask (n,) or by indices (`chosen`)."""
+        """Return the regions `chosen` by a mask (n,) or by indices."""
         return select(self, chosen, "labels")
 
     def __len__(self) -> int:
@@ -80,7 +80,7 @@ class Segmented:
         signal: counts above the background with hot pixels repaired (rows, columns), float32.
         background: background level and noise of the frame.
         regions: all regions above the threshold.
-        candidates: those regions that may be streaks, strongest first.
+        candidates: those regions that may be streaks, in descending order of strength.
         hot_pixels: number of repaired pixels.
     """
 
@@ -93,7 +93,7 @@ class Segmented:
 
 @dataclass(frozen=True, slots=True)
 class Streaks:
-    """Streaks of one frame, strongest first.
+    """Streaks of one frame, in descending order of strength.
 
     Attributes:
         endpoints: the two ends (x, y) of each streak in arbitrary order (n, 2, 2), px, not yet corrected by
@@ -147,7 +147,8 @@ def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
     """Return the pixels at which the 3 x 3 sum of `signal` exceeds `sigmas` times the noise of this sum.
 
     The argument `signal` is the frame (rows, columns) without background, and the argument `noise` is the
-    standard deviation of each pixel (rows, columns), counts. No border pixel is returned.
+    standard deviation of each pixel (rows, columns), counts. The result does not include pixels at the border
+    of the frame.
     """
     rows, columns = signal.shape
     limit, down = np.float32(3.0 * sigmas), np.empty_like(signal[0])
@@ -241,7 +242,7 @@ def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolAr
 
 
 def expected_sigma(regions: Regions, background: Background, settings: EndpointSettings) -> FloatArray:
-    """Return the expected standard deviation of the endpoints of each region (n,), px."""
+    """Return the expected standard deviation of the position of the endpoints of each region (n,), px."""
     density = regions.flux / (regions.length + 3.0)
     variance = background.typical_noise**2 + _PEAK_FRACTION * density / settings.gain
     return np.asarray(
@@ -254,7 +255,7 @@ def measure_streaks(
     settings: EndpointSettings,
     cornerness: Callable[[FloatArray, EndpointSettings], FloatArray] | None = None,
 ) -> Streaks:
-    """Return the streaks, which are the candidate regions whose cornerness has exactly two peaks.
+    """Return the streaks: the candidate regions whose cornerness has exactly two peaks.
 
     The argument `cornerness` is a function of an image and the settings that returns the response at each
     pixel, used instead of the Harris corner detector.
@@ -406,8 +407,8 @@ def _corners_of_regions(
             response = _response(light, around, own, wanted, smooth, slope, window, k, scratch)
             found = _peaks(response, around, own, spans, relative, half_width, corners[total:])
         else:
-            # The response of an upright streak is computed from its transpose, because long rows take less
-            # time than many short ones.
+            # The response of a streak along the columns is computed from the transposed image, because the
+            # computation of few long rows is faster than that of many short rows.
             wanted = _widened(_spans_across(around, own, spans), margin, bottom - top)
             response = _response(light.T, around.T, own, wanted, smooth, slope, window, k, scratch)
             found = _peaks(response.T, around, own, spans, relative, half_width, corners[total:])
@@ -447,7 +448,7 @@ def _spans_across(labels: Image, label: int, spans: IntArray) -> IntArray:
 
 @loop_helper
 def _widened(spans: IntArray, margin: int, columns: int) -> IntArray:
-    """Return the spans (rows, 2) of a region that is wider by `margin` px in all directions."""
+    """Return the spans (rows, 2) of a region after it is enlarged by `margin` px in all directions."""
     rows = len(spans)
     wide = np.empty((rows, 2), dtype=np.int64)
     for row in range(rows):
@@ -473,7 +474,8 @@ def _response(
 ) -> FloatArray:
     """Return the Harris response of a region in a cut-out, within the spans `wanted` (rows, 2) only.
 
-    The light of other regions is omitted. The arrays `scratch` (5, m) keep the images of the cut-out.
+    The pixels of other regions are set to zero. The arrays `scratch` (5, m) are used as memory for the images
+    of the cut-out.
     """
     rows, columns = light.shape
     size, shape = rows * columns, (rows, columns)
@@ -512,7 +514,7 @@ def _correlate(
 ) -> None:
     """Set `out` to the correlation of an image with an outer product, within spans of columns (rows, 2).
 
-    The border pixels are repeated beyond the border. The array `out` may be the image.
+    The image is extended by repeating its border pixels. The array `out` may be the image.
     """
     rows, columns = image.shape
     high, wide = len(down) // 2, len(across) // 2
@@ -532,7 +534,7 @@ def _correlate(
         line[:] = 0.0
         for tap in range(2 * wide + 1):
             step, factor = tap - wide, across[tap]
-            # Columns from `low` up to `end` need no pixels beyond the border.
+            # The columns from `low` to `end` do not need pixels beyond the border.
             low, end = min(max(first, -step), stop), max(min(stop, columns - step), first)
             for column in range(first, low):
                 out[row, column] += factor * scratch[row, 0]
@@ -638,7 +640,7 @@ def harris_response(tensor: StructureTensor, k: float = 0.15) -> FloatArray:
 def gradient(image: Image, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return the Gaussian derivatives of an image along x and y, counts per px.
 
-    Beyond the border, the border pixels are repeated.
+    The image is extended by repeating its border pixels.
     """
     radius = kernel_radius(sigma)
     smooth, slope = gaussian_kernel(sigma, radius), gaussian_derivative_kernel(sigma, radius)
@@ -724,8 +726,8 @@ def find_corners(
 
     The position of a corner is the centre of intensity of the image `intensity` around the peak, where
     `intensity` is the cornerness or, as in Sease, the frame. If the frame is used, the corners lie up to 2 px
-    inside the streak. A streak has two corners; other numbers of corners indicate noise, crossing streaks or
-    another object.
+    inside the streak. A streak has two corners. A different number of corners indicates noise, crossing
+    streaks or another source.
     """
     peaks = local_maxima(response, mask, relative)
     return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)

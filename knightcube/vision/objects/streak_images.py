@@ -32,7 +32,7 @@ _BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole: Pinhole) -> FloatArray:
     """Return points (m, 2), px, along the path of a star during the exposure.
 
-    The star is at `direction` (3,), camera axes, when it has covered the fraction `start` of the path.
+    The star is in the direction `direction` (3,), camera axes, after the fraction `start` of its path.
     """
     return np.asarray(star_paths(direction[None], rotation, np.array([start]), pinhole)[0])
 
@@ -42,8 +42,8 @@ def star_paths(
 ) -> FloatArray:
     """Return points (n, m, 2), px, along the paths of n stars during the exposure.
 
-    Each star is at its direction `directions` (n, 3), camera axes, when it has covered the fraction `starts`
-    (n,) of its path. All paths have as many points as the longest path needs.
+    Each star is in its direction of `directions` (n, 3), camera axes, after the fraction of `starts` (n,) of
+    its path. All paths have the number of points that the longest path requires.
     """
     return _paths_on_circles(directions, rotation, starts, pinhole.focal_length, *pinhole.centre)
 
@@ -102,7 +102,7 @@ def _paths_on_circles(
 def _set_circle(
     star: FloatArray, rotation: FloatArray, first: float, step: float, focal: float, points: FloatArray
 ) -> None:
-    """Set `points` (m, 2) to the image points, px from the centre, of a star that is rotated step by step."""
+    """Set `points` (m, 2) to the image points, px from the centre, of a star after equal rotation steps."""
     angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
     scale = 1.0 / angle if angle > 0.0 else 1.0
     a, b, c = rotation[0] * scale, rotation[1] * scale, rotation[2] * scale
@@ -118,7 +118,7 @@ def _set_circle(
             points[k, 1] = focal * (cosine * (y - v) + sine * (z * a - x * c) + v) / ahead
         else:
             points[k, 0] = points[k, 1] = math.nan
-        # The addition theorem replaces sine and cosine of each step.
+        # Sines and cosines of successive steps are computed by the addition theorem.
         before = cosine
         cosine, sine = before * next_cosine - sine * next_sine, sine * next_cosine + before * next_sine
 
@@ -139,8 +139,8 @@ def path_among_stars(
 ) -> FloatArray:
     """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
 
-    The ends are passed in the order in time that gives the slower motion relative to the stars. The points
-    are those after the given fractions `parts` (m,) of the motion from the first end to the second, or evenly
+    The assumed order of the ends in time is that of the slower motion relative to the stars. The points are
+    those after the given fractions `parts` (m,) of the motion from the first end to the second, or evenly
     spaced points from the first end to the second.
     """
     if parts is None:
@@ -330,7 +330,7 @@ def _mark_discs(
     return total
 
 
-# Number of points of a path between which the path is straight enough for the image of a streak.
+# Number of points of a path between two nodes, over which the path is approximately straight.
 _NODES = 33
 # Minimum cosine between a nearly straight path and its chord.
 _LEAST_AHEAD = 0.85
@@ -431,8 +431,8 @@ def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: boo
 
     The count is distributed evenly over the points of the path. The image is the product of the profiles
     across and along the path, which are blurred by a Gaussian with the standard deviation `sigma`, px, and by
-    the pixel. The error is at most 2 % of the largest value. The image of a strongly bent path is the sum of
-    the images of its points.
+    the pixel. The error is at most 2 % of the largest value. The image of a strongly curved path is the sum
+    of the images of its points.
 
     Args:
         pixels: pixels (p, 2), row by row, on which the images are computed.
@@ -497,7 +497,7 @@ def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: 
 
 @loop_helper
 def _interval(x: float, grid: FloatArray, guess: int) -> int:
-    """Return the interval of an ascending grid that contains `x`, or the first or last one, from a guess."""
+    """Return the interval of an ascending grid that contains `x`, or the nearest interval, from a guess."""
     last = len(grid) - 2
     k = min(max(guess, 0), last)
     while k > 0 and x < grid[k]:
@@ -620,7 +620,7 @@ class LineImage:
 
 
 def line_image(ends: FloatArray, columns: int, rows: int, sigma: float) -> LineImage:
-    """Return the image of a straight streak between two different `ends` (2, 2), px, near the streak."""
+    """Return the image of a straight streak between two different `ends` (2, 2), px, on the pixels nearby."""
     width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
     length = float(np.linalg.norm(ends[1] - ends[0]))
     tangent = (ends[1] - ends[0]) / length
@@ -637,7 +637,8 @@ def line_image(ends: FloatArray, columns: int, rows: int, sigma: float) -> LineI
     profile = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * length)
     covered = ndtr(a) - ndtr(b)
     whole = profile * covered
-    # The moment of the image by the relative position along the streak is the share of the second end.
+    # The first moment of the image, with the relative position along the streak, is the contribution of the
+    # second end.
     second = profile * (s * covered + width * (bell_a - bell_b)) / length
     aside = n / width**2
     images = np.stack(
@@ -652,9 +653,9 @@ def line_image(ends: FloatArray, columns: int, rows: int, sigma: float) -> LineI
     return LineImage((y[row]) * columns + x[column], images, axes)
 
 
-# Largest step (px) of the fit of a line, step (px) that ends the fit, and maximum number of steps.
+# Largest step (px) in the fit of a line, step (px) below which the fit ends, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
-# Distance (standard deviations) from the end of a line beyond which the end does not change the light.
+# Distance (standard deviations) from the end of a line beyond which the light does not depend on the end.
 _COVERED = 8.5
 # Relative ridge of the normal equations of a fit to pixels.
 _RIDGE = 1e-6
@@ -829,7 +830,8 @@ class _Profiles:
 
     Attributes:
         count: number of pixels along the axis.
-        first: index of the first of the w pixels of each point (m,), which may lie beside the axis.
+        first: index of the first of the w pixels of each point (m,), which may be outside the range of the
+            axis.
         values: integrals of the point spread over the pixels (m, w).
     """
 
@@ -855,8 +857,8 @@ def _slopes_within_pixels(profiles: _Profiles, centres: FloatArray, sigma: float
 def _added(x: _Profiles, y: _Profiles, across: FloatArray, down: FloatArray) -> FloatArray:
     """Return the image (rows, columns) of points that are each the product of two profiles.
 
-    The values `across` (m, w) and `down` (m, w) belong to the pixels of the profiles `x` and `y`. Only the
-    pixels near the points are computed, which matters for long streaks in large images.
+    The values `across` (m, w) and `down` (m, w) are those at the pixels of the profiles `x` and `y`. Only the
+    pixels near the points are computed, which saves time for long streaks in large images.
     """
     width = across.shape[1]
     columns = x.count + 2 * width

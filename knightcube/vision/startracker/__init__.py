@@ -3,6 +3,6 @@
 `detection` finds and measures stars. `lost_in_space` identifies the stars without a prior attitude, and
 `verification` with a prior attitude, by comparison with the guide stars of `index`. `attitude_fit` fits the
 attitude to the directions of identified stars, and `image_fit` fits it to their positions in the image.
-`solve` combines detection, identification and attitude fit. `catalogue_refit` fits the streaks of an
-identified frame again with all stars of the catalogue. `sky_map` converts between pixels and directions.
+`solve` combines detection, identification and attitude fit. `catalogue_refit` repeats the fit of the streaks
+of an identified frame with all stars of the catalogue. `sky_map` converts between pixels and directions.
 """

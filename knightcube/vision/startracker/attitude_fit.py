@@ -8,12 +8,12 @@ about the camera axes and a small change dlnk of ln k change the residual e by -
 if sigma, rad, is the standard deviation of a direction along each of the two axes normal to it.
 
 `fit_with_distortion` also fits the radial distortion of an uncalibrated lens. An uncalibrated lens displaces
-stars by some per cent of their distance from the axis. If the fit includes no distortion, it agrees only with
-a group of neighbouring stars, and its attitude error is larger than the residuals suggest. A star whose true
-direction has the tangent t appears at the tangent t (1 + c (t / R)^2), where R is the tangent of the image
-corner (first radial term of Brown 1966). The distortion coefficient c has the prior standard deviation
-`PRIOR`. The match starts with the stars that match without distortion, and is extended outwards as the
-distortion c is determined. The covariance of the attitude includes the uncertainty of the distortion c.
+stars by some per cent of their distance from the axis. A fit without distortion agrees only with a group of
+neighbouring stars, and its attitude error is larger than the residuals indicate. A star with the true
+field-angle tangent t appears at the tangent t (1 + c (t / R)^2), where R is the tangent of the image corner
+(first radial term of Brown 1966). The distortion coefficient c has the prior standard deviation `PRIOR`. The
+match starts with the stars that match without distortion, and is extended outwards as the distortion c is
+determined. The covariance of the attitude includes the uncertainty of the distortion c.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class StarField:
         )
 
     def mirrored(self) -> StarField:
-        """Return the field with left and right exchanged about the boresight."""
+        """Return the mirrored field, with left and right swapped about the boresight."""
         return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
 
     def subset(self, chosen: IntArray) -> StarField:
-        """Return the field reduced to the points with the indices `chosen` (k,), in this order."""
+        """Return the field with only the points `chosen` by indices (k,), in the order of the indices."""
         magnitude = None if self.magnitude is None else self.magnitude[chosen]
         return replace(self, direction=self.direction[chosen], sigma=self.sigma[chosen], magnitude=magnitude)
 
@@ -115,11 +115,11 @@ class StarMatch:
     mirrored: bool = False
 
 
-# Rotation step (rad) below which the iteration ends; a step d leaves an error of about d^2, or 0.002 arcsec.
+# Rotation step (rad) below which the iteration ends. After a step d, the error is about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition number of the normal equations.
-# The reciprocal condition number reaches its minimum if all stars lie within 1e-6 rad of one direction.
+# Minimum reciprocal condition number of the normal equations. The value is reached if all stars lie within
+# 1e-6 rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -146,7 +146,7 @@ class Refinement:
         return math.sqrt(self.covariance[3, 3]) if len(self.covariance) == 4 else 0.0
 
     def fix(self) -> AttitudeFix:
-        """Return the attitude and its covariance in the form that solvers of Wahba's problem return."""
+        """Return the attitude and its covariance as the result type of the solvers of Wahba's problem."""
         turn = np.ascontiguousarray(self.covariance[:3, :3])
         return AttitudeFix(from_matrix(self.matrix), turn, 0.5 * float(self.squares.sum()))
 
@@ -237,7 +237,8 @@ def _refined_numpy(
     """Return whether the fit converged, matrix, scale, covariance and squares of the `Refinement`."""
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
-    # Weighted predictions, residuals and scale slopes; their 9 x 9 Gram matrix holds all normal equations.
+    # The rows contain weighted predictions, residuals and derivatives by the scale. Their 9 x 9 Gram matrix
+    # contains all terms of the normal equations.
     rows = np.zeros((len(observed), 9))
     normal = np.zeros((parameters, parameters))
     failed = False, matrix, scale, np.zeros((parameters, parameters)), np.zeros(len(observed))
@@ -264,7 +265,7 @@ def _refined_numpy(
             scale *= math.exp(float(step[3]))
         if longest < _SETTLED:
             break
-    # The residuals after the last step follow from the linearised equations.
+    # The residuals after the last step are computed from the linearised equations.
     left = rows[:, 3:6] + rows[:, :3] @ _cross_matrix(step[:3]).T
     if free_scale:
         left += step[3] * rows[:, 6:]
@@ -345,7 +346,7 @@ def _fill_rows(
     scale: float,
     rows: FloatArray,
 ) -> None:
-    """Write weighted predictions, residuals and slopes by ln scale to `rows` (n, 9)."""
+    """Write weighted predictions, residuals and derivatives by ln scale to `rows` (n, 9)."""
     squared = scale * scale
     for k in range(len(observed)):
         z, w = observed[k, 2], weight[k]
@@ -465,7 +466,7 @@ _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
 _DISTORTION_SETTLED = 1e-6
-# Half-width of the gate within which a star matches a guide star, in standard deviations of the star.
+# Half-width of the gate within which a star matches a guide star, in standard deviations of its position.
 _GATE_SIGMAS = 8.0
 # Minimum half-width of the gate within which a star matches a guide star, relative to the corner's tangent.
 _GATE_SHARE = 0.004
@@ -505,7 +506,7 @@ def fit_with_distortion(
     star: IntArray,
     start: Refinement,
 ) -> DistortedFit | None:
-    """Return a match that is extended to stars that match only with a distorted lens.
+    """Return a match extended to the stars that match only if the distortion of the lens is fitted.
 
     Returns None if the matched stars do not determine the distortion.
 
@@ -549,7 +550,8 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Residuals above expectation increase the covariance from the stars, but not that from the prior.
+    # If the residuals are larger than expected, the covariance from the stars is increased, but not that from
+    # the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2
@@ -592,7 +594,7 @@ def _squared_tangent(direction: FloatArray) -> FloatArray:
 def _distorted_fit(
     field: StarField, sky: SkyIndex, observed: IntArray, star: IntArray, pose: _DistortedPose, corner: float
 ) -> tuple[_DistortedPose, FloatArray, FloatArray] | None:
-    """Return a fit of attitude, scale and distortion to stars, its normal matrix (5, 5) and chi-squares (k,).
+    """Return a fit of attitude, scale and distortion, its normal matrix (5, 5) and chi-squares (k,).
 
     The normal matrix includes the prior of the distortion. Each chi-square is that of one matched star.
     """

@@ -1,12 +1,12 @@
 """Second fit of the streaks of an identified frame, with all stars of the catalogue, including faint stars.
 
 In a frame of long streaks, most stars are fainter than the noise of a pixel. The light of these faint stars
-overlaps the bright streaks and displaces the measured positions, and a close pair of stars is measured as one
-star. After a frame is identified, the catalogue gives the positions of all stars. The catalogue also gives
-the magnitudes of all stars, which are converted to counts with the measured stars. Stars that are too faint
-to be fitted, or too near to a brighter star, are subtracted from the frame, and the uncertainty of their
-brightness is added to the noise. All stars that are fitted start at their catalogue positions. Light sources
-that are not in the catalogue are fitted but do not affect the motion.
+overlaps the bright streaks and displaces their measured positions. A close pair of stars is measured as one
+star. After a frame is identified, the positions of all stars are known from the catalogue. The magnitudes of
+all stars are also known from the catalogue. They are converted to counts by means of the measured stars.
+Stars that are too faint to be fitted, or too near to a brighter star, are subtracted from the frame, and the
+uncertainty of their brightness is added to the noise. The initial positions of the fitted stars are their
+catalogue positions. Light sources that are not in the catalogue are fitted but do not affect the motion.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
-# Distance below which streaks overlap, relative to the half-width of a bright streak's fitted pixels.
+# Ratio of the distance below which streaks overlap to the half-width of the strip of a bright streak.
 _NEAR = 1.4
 # Distance (px) below which two stars are too close to be fitted separately.
 _TWIN = 2.0
-# Largest distance (px) between a measured star and its catalogue star, and minimum ratio of the fluxes.
+# Largest distance (px) between a measured star and its catalogue star, and minimum ratio of their fluxes.
 _SAME, _ALIKE = 5.0, 0.3
 # Distance (px) from a catalogue star's streak within which a measured star is a segment of this streak.
 _BESIDE = 2.5
@@ -57,13 +57,13 @@ _BESIDE = 2.5
 _LIGHT_ERROR = 0.15
 # Number of stars that are subtracted from the frame in one batch.
 _AT_ONCE = 25
-# Number of instants during the exposure at which a star is tested for being in the frame.
+# Number of instants of the exposure at which the position of a star is tested to be in the frame.
 _INSTANTS = 9
-# Factor on the maximum number of pixels in the second fit, which includes more stars than the first.
+# Factor by which the maximum number of pixels is larger in the second fit, which includes more stars.
 _ROOM = 1.7
-# Largest chi-square of the rate difference of first and second fit (false alarm in 1 of 100,000 frames).
+# Largest chi-square of the difference between the rates of both fits (1 false alarm in 100,000 frames).
 _ONE_MOTION = 25.9
-# Additional standard deviation (px) of the fitted attitude when the stars are identified again.
+# Standard deviation (px) added to that of the fitted attitude when the stars are identified again.
 _PRIOR_PX = 1.0
 
 
@@ -106,12 +106,14 @@ def refit_motion(
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
     """Return `motion` fitted again with all catalogue stars, or None if the fit fails or changes the rate."""
-    # With a rolling shutter, an ambiguous rate lies between two possible rates and is not a valid start.
+    # Under a rolling shutter, an ambiguous rate is the mean of two possible rates and not a valid initial
+    # value.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = streak_pinhole(solution.camera, likelihood.knowledge), motion.exposure
-    # The rotation during the exposure follows from the mean rate, the acceleration and the higher terms.
+    # The rotation during the exposure is computed from the mean rate, the acceleration and the higher-order
+    # terms.
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
     course = CameraMotion.between(motion.rate * exposure, growth, shape)
@@ -132,7 +134,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # A value of None for the hidden stars prevents a second fit with fewer streaks.
+    # If the attribute `hidden` is None, no further fit with fewer streaks is made.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
@@ -206,8 +208,8 @@ def _known_stars(
 ) -> _Known | None:
     """Return the catalogue stars in the frame, or None if no fitted star is identified.
 
-    The camera model of the streak fit and the maximum number of stars are `seen_by`.
-    The counts of a star of magnitude zero are determined from the identified stars.
+    The argument `seen_by` contains the camera model of the streak fit and the maximum number of stars. The
+    counts of a star of magnitude zero are determined from the identified stars.
     """
     matched = solution.matched
     apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
@@ -230,7 +232,7 @@ def _known_stars(
 def _scenes(
     camera: FitProblem, course: CameraMotion, known: _Known, motion: MotionResult
 ) -> tuple[StreakScene, StreakScene]:
-    """Return the stars to fit, the brightest of which determine the motion, and the stars to subtract."""
+    """Return the stars to fit and the stars to subtract; the brightest fitted stars determine the motion."""
     settings = camera.settings
     width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
     leading = np.arange(len(known.light)) < settings.most_stars
@@ -253,7 +255,7 @@ def _scenes(
 
 
 def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known: _Known) -> IntArray:
-    """Return the indices of measured stars that are near no catalogue star and no catalogue star's streak.
+    """Return the indices of measured stars that are not near a catalogue star or its streak.
 
     The streak of a catalogue star is also examined because the first fit may divide it into two stars.
     """
@@ -267,7 +269,7 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
 
 
 def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
-    """Return the frame after `hidden` stars are subtracted and their uncertainty is added to the noise."""
+    """Return the frame with the `hidden` stars subtracted and their uncertainty added to the noise."""
     frame = camera.frame
     if not len(hidden.light):
         return frame

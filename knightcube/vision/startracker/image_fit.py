@@ -4,19 +4,19 @@ The position of a streaked star is accurate across its path and inaccurate along
 star, which is the difference between observed and predicted unit vector, is resolved in two directions normal
 to the star and scaled to unit variance with the covariance of the position. The minimum of the sum of
 squares, found by a Gauss-Newton iteration, is the maximum likelihood estimate for Gaussian errors. A streak
-that overlaps another star has a wrong position. Streaks with wrong positions are found with Huber's weights,
-which bound the influence of any star, and are excluded.
+that overlaps another star has a wrong position. Streaks with wrong positions are found by means of Huber's
+weights, which limit the influence of each star, and are excluded.
 
-Tilt, decentring and distortion of an inexact lens (together called the bend, see `sky_map`) are also fitted,
-with a prior from the calibration or from typical lenses. The covariance of the attitude includes the
-remaining uncertainty of the lens. An error of the line time of a rolling shutter, which displaces each star
-along its motion in proportion to its row, is also fitted.
+Tilt, decentring and distortion of the lens are also fitted, with a prior from the calibration or from typical
+lenses. These lens errors are named `bend` in the code (see `sky_map`). The covariance of the attitude
+includes the remaining uncertainty of the lens. An error of the line time of a rolling shutter, which
+displaces each star along its motion in proportion to its row, is also fitted.
 
-The positions of stars that do not fit the model of their images, such as bent streaks or the rings of a
-defocused lens, have errors of some pixels, regardless of their brightness. If the residuals show such errors,
-a common variance is added to the noise, so that the sum of squares equals the degrees of freedom (Mandel &
-Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the brightest stars would dominate the
-fit, and the covariance would be too small.
+Some stars do not agree with the model of their images, for example curved streaks or the rings of a defocused
+lens. Their positions have errors of some pixels, regardless of their brightness. If the residuals show such
+errors, a variance common to all stars is added to the noise, so that the sum of squares equals the number of
+degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the
+brightest stars would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ _MOST_STEPS = 8
 _SETTLED = 1e-11
 # Step (px) for the numerical derivative of a star's direction by its image position.
 _STEP_PX = 0.5
-# Value of chi-square (2 degrees of freedom) that is exceeded with a probability of 0.1 %, and its median.
+# Value of chi-square (2 degrees of freedom) that is exceeded with a probability of 0.1 %, and the median of
+# chi-square.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
 # Residual (standard deviations) above which Huber's weights limit the influence of a star.
@@ -54,7 +55,7 @@ _LEAST_AGREEING = 4
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
 # Number of parameters of attitude and scale.
 _POSE = 4
-# Maximum number of times that the stars which agree are selected again, with larger variances.
+# Maximum number of repeated selections of the stars that agree, each with larger variances.
 _AGREEMENT_ROUNDS = 3
 
 
@@ -69,8 +70,8 @@ class Unknowns:
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
         scatter: whether a variance common to all stars is added to the variances of the positions for any
-            excess of the residuals. Otherwise it is added only for a significant excess that it explains
-            better than a factor common to all variances.
+            excess of the residuals. Otherwise the common variance is added only if the excess is significant
+            and a factor common to all variances explains it less well.
     """
 
     scale: bool = False
@@ -95,8 +96,9 @@ class ImageFit:
         bend: fitted lens errors (8,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
         excess: chi-square per degree of freedom of the stars that agree with each other, for the measured
-            variances of their positions; 1 unless it is significantly larger. Only attitude and scale count
-            as parameters, so that a fitted lens does not make few stars contradict each other.
+            variances of their positions; 1 unless it is significantly larger. Only attitude and scale are
+            counted as parameters, so that few stars are not regarded as contradictory because lens errors are
+            fitted.
         agree: mask of the stars that were used for the attitude (n,).
     """
 
@@ -117,7 +119,7 @@ def fit_in_image(
     start: FloatArray,
     unknowns: Unknowns = _NONE,
 ) -> ImageFit:
-    """Return the attitude for which stars in the directions `reference` appear at the positions `points`.
+    """Return the attitude that maps the star directions `reference` to the image positions `points`.
 
     Args:
         points: measured positions of the stars (n, 2), px.
@@ -145,7 +147,7 @@ def fit_in_image(
     factor = inflation(squares[agree], seen.parameters(pose))
     if unknowns.scatter or factor > 1.0:
         other, shifted, more = _with_scatter(seen, pose, agree)
-        # The residuals of points show whether their noise has a common factor, or a common variance.
+        # For points, the residuals decide between a factor and an added variance common to all stars.
         if unknowns.scatter or _surprise(other, shifted, more, 1.0) < _surprise(seen, pose, more, factor):
             seen, pose, agree = other, shifted, more
             squares = seen.squares(pose)
@@ -473,14 +475,14 @@ def _turn(matrix: FloatArray, turn: FloatArray) -> None:
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:
     """Return the fit to the stars that agree with each other, and a mask of these stars (n,).
 
-    An outlier affects the residuals of all stars in the fit. The influence of outliers is bounded before the
+    An outlier affects the residuals of all stars in a fit. The influence of outliers is bounded before the
     scatter of the residuals is computed.
     """
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
         squares = seen.squares(pose)
-    # A star agrees if its residual is within the scatter of the majority.
-    # If too few stars agree with the majority, all stars are used.
+    # A star agrees if its residual is within the scatter of the majority. If too few stars agree, all stars
+    # are used.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
@@ -496,8 +498,8 @@ def _surprise(seen: _Seen, pose: _FittedPose, agree: BoolArray, factor: float) -
 def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose, BoolArray]:
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
-    Bright points that disagree with their measured variances may agree with the larger variances. The common
-    variance is then estimated again, with these points. Streaks are not added again.
+    Bright points that disagree with the fit for their measured variances may agree for the larger variances.
+    The common variance is then estimated again, with these points. Excluded streaks are not included again.
     """
     own = seen
     for _ in range(_AGREEMENT_ROUNDS):
@@ -562,9 +564,10 @@ def attitude_by(
         points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
-    # At an angle a from the boresight, a pixel is smaller by cos^2 a along the radius and by cos a across it.
+    # At an angle a from the boresight, a pixel subtends an angle that is smaller by the factor cos^2 a along
+    # the radius and by cos a across the radius.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
     fix = solver(seen, reference[fit.agree], sigma)
-    # The loss of a solver is half of the sum of the stars' chi-squares.
+    # The loss function of a solver is half of the sum of the stars' chi-squares.
     squares = np.full(len(seen), 2.0 * fix.loss / len(seen))
     return replace(fix, covariance=fix.covariance * inflation(squares, 3))

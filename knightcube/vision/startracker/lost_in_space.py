@@ -2,12 +2,12 @@
 
 Triangles of the brightest observed stars are looked up by shape, orientation and size among the triangles of
 guide stars. Each match of an observed triangle with a triangle of the index votes for three pairs of an
-observed star and a guide star. Correct pairs occur in many triangles, and chance pairs in only one. The
-matches with the most votes are verified against the whole field until one match is accepted. If no match is
-accepted, triangles of all observed stars, and not only of the brightest, are looked up. Even if most observed
-points are not stars, some of the thousand triangles that are looked up consist of true stars only. If no
-match is accepted, the mirrored field is tried. Finally, image scales outside the given range are tried if the
-range is narrow, because a narrow range may be wrong.
+observed star and a guide star. A correct pair occurs in many triangles, whereas a chance pair occurs in only
+one. The matches with the most votes are verified against the whole field until one match is accepted. If no
+match is accepted, triangles of all observed stars are looked up instead of triangles of the brightest stars.
+About a thousand triangles are looked up. Even if most observed points are not stars, some of these triangles
+consist of true stars only. If no match is accepted, the mirrored field is tried. Finally, if the given range
+of image scales is narrow, scales outside it are tried, because the range may be wrong.
 
 The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of image scales
 is divided into steps that are so narrow that the side ratios stay within the tolerance.
@@ -51,14 +51,14 @@ _BRIGHTEST = 12
 _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
-# Limits of the longest side of a triangle, relative to the width of the field.
-# Larger triangles in the index consist of bright stars only, and smaller triangles are less accurate.
+# Limits of the longest side of a triangle, relative to the width of the field. The index contains larger
+# triangles only of bright stars, and the side ratios of smaller triangles are less accurate.
 _MIDDLE_SIZES = 0.3, 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class BatchSizes:
-    """Numbers of triangles in successive batches of triangles that are looked up in the index.
+    """Sizes of the successive batches of triangles that are looked up in the index.
 
     Attributes:
         bright: numbers of triangles of the brightest stars in each batch, for each step of scale; these
@@ -151,10 +151,10 @@ _LARGEST_SIZE = (1 << SIZE_BITS) - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleSteps:
-    """Steps that divide the range of possible scales, so that triangle shapes are constant within a step.
+    """Steps of the range of possible scales within which the side ratios of triangles are nearly constant.
 
     Attributes:
-        middle: scale in each step with which the triangle shapes are computed (s,).
+        middle: scale in each step for which the side ratios of triangles are computed (s,).
         lowest, highest: limits of the scale of each step (s,).
     """
 
@@ -170,8 +170,9 @@ class ScaleSteps:
         """Return steps of a field's range of scales, within each of which side ratios vary by `tolerance`.
 
         At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
-        / 2 across the radius. The ratio of two sides of a triangle at the field angle of tangent t therefore
-        varies by t^2 / 2. The steps are computed for the field angle half-way to the corner of the field.
+        / 2 across the radius. The ratio of two sides of a triangle at the field-angle tangent t therefore
+        depends on their directions by up to t^2 / 2. The steps are computed for the field angle half-way to
+        the corner of the field.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -301,7 +302,7 @@ def _look_up_numpy(
     size = np.maximum(sides[:, 2], SIZE_UNIT)
     spread = np.sqrt(np.mean(sigma[corners] ** 2, axis=1))
     step = np.tile(np.arange(len(scales)), len(triangles))
-    # The error of a side ratio follows from the errors of two directions and of the longest side.
+    # The error of a side ratio is computed from the errors of two directions and of the longest side.
     slack = (1.6 * tolerance) * spread * scales[step] / size + distortion
     ratio = sides[:, :2] / size[:, None]
     usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= least_ratio))
@@ -315,14 +316,15 @@ def _look_up_numpy(
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
     begin, count = begin[:kept], count[:kept]
     query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
-    # Arrays of int32 instead of int64 halve the time, most of which is spent on index entries.
+    # Arrays of int32 instead of int64 halve the computing time, of which most is spent on index entries.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
     near = np.ones(len(entry), dtype=np.bool_)
     place = places[entry].view(np.uint8).reshape(-1, 2)
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
-        # Differences of unsigned bytes wrap around, so that positions below the lowest one fail the test.
+        # Differences of unsigned bytes wrap around, so that positions below the lowest position do not pass
+        # the test.
         near &= place[:, column] - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
@@ -356,7 +358,7 @@ def _look_up(
     cells, unit = layout[0], 1.0 / (1 << layout[2])
     lowest = steps[1, 0] * (1.0 - 1.0 / cells)
     seen = _at_scales(direction, steps[0])
-    # At most three cells of each of the two side ratios agree with a triangle of sufficient accuracy.
+    # If a triangle is sufficiently accurate, at most three cells agree with each of its two side ratios.
     runs = np.empty((9 * len(triangles) * len(seen), 7), dtype=np.int64)
     limits = np.empty((len(triangles) * len(seen), 3))
     corners = np.empty((len(triangles) * len(seen), 3), dtype=np.int64)
@@ -556,7 +558,7 @@ def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) 
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position within a cell that agrees with each ratio, and how many higher ones agree.
+    """Return the lowest position in a cell that agrees with each ratio, and the number of higher ones.
 
     A position agrees with a side ratio if they differ by at most `slack`.
     """
@@ -605,9 +607,9 @@ def _runs(
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
     """Return the ranges of sorted triangle keys that may contain triangles similar to observed triangles.
 
-    For each range, the result holds the index of the observed triangle (query), the cells of its two side
-    ratios, and the first and last + 1 index in the sorted keys. Each side ratio of an observed triangle may
-    lie in up to three cells.
+    For each range, the result contains the index of the observed triangle (query), the cells of its two side
+    ratios, the first index in the sorted keys, and the index after the last. Each side ratio of an observed
+    triangle may lie in up to three cells.
     """
     low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
     high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
@@ -636,8 +638,8 @@ class IdentificationSettings:
         work: maximum number of index entries to read.
         verified: maximum number of candidate attitudes to verify after each batch of triangles.
         mirror: whether the mirrored field is searched for as well.
-        hint_error: factor by which the true scale may lie outside a narrow range of scales; 1 if the range is
-            certain. A calibrated scale, (1, 1), is always considered certain.
+        hint_error: factor by which the true scale may be below or above a narrow range of scales; 1 if the
+            range is certain. A calibrated scale, (1, 1), is always regarded as certain.
         verification: settings of the verification of candidates.
     """
 
@@ -651,18 +653,18 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor on the tolerance and on the number of verified candidates, for batches of triangles of many stars.
+# Factor by which the tolerance and the number of verified candidates are smaller for triangles of many stars.
 # The factor is below 1, because many true triangles vote for the same stars.
 _OF_SPREAD = 0.6
 # Number of matches with the most votes that are considered for each candidate to be verified.
 _RANKED = 8
-# Factor by which chance matches must be less likely in the mirrored field or outside the range of scales.
+# Factor by which chance matches must be less likely to accept a mirrored field or a scale outside the range.
 _RARE = 10.0
 DEFAULT = IdentificationSettings()
 
 
 def identify(observed: StarField, sky: SkyIndex, settings: IdentificationSettings = DEFAULT) -> StarMatch:
-    """Return the identified stars and the attitude of a frame, or a status that states why there are none."""
+    """Return the identified stars and the attitude of a frame, or a status that states the failure."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, MatchStatus.TOO_FEW_STARS)
     spread = cache(lambda: spread_batches(observed, settings.batches))
@@ -722,8 +724,8 @@ def _candidates(
 ) -> _Chosen:
     """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
 
-    Matches that share two pairs of an observed star and a guide star with the pairs `tried` (k, 2) are
-    omitted. The third returned value is `tried` with the pairs of the new candidates.
+    A match is omitted if two of its pairs of an observed star and a guide star are among the pairs `tried`
+    (k, 2). The third returned value is `tried` with the pairs of the new candidates.
     """
     return _choose(
         np.ascontiguousarray(observed.direction),
@@ -827,7 +829,7 @@ def _choose(
 
 @loop_helper
 def _shared_pairs(pairs: IntArray, observed: npt.NDArray[np.uint16], star: npt.NDArray[np.uint16]) -> int:
-    """Return how many corners of a match, (3,) and (3,), are among the pairs (k, 2)."""
+    """Return how many of the three pairs of a match, (3,) and (3,), are among the pairs (k, 2)."""
     shared = 0
     for c in range(3):
         for k in range(len(pairs)):

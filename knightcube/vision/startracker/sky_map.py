@@ -6,9 +6,10 @@ up to 20.8". Aberration is computed by the exact formula of special relativity (
 
 The conversion also includes lens errors: tilt and decentring, which displace the optical axis from the image
 centre, and distortion. The lens errors displace a point with the tangents u by (u . a) u + |u|^2 b + k |u|^2
-u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). Pixels that are not square, as in a
-picture that was scaled differently along its axes, displace the point by p (u_x, -u_y) + q (u_y, u_x), with
-aspect p and shear q. The vector (a, b, k, l, p, q) of the eight lens errors is called the bend of the lens.
+u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). Pixels that are not square displace
+the point by p (u_x, -u_y) + q (u_y, u_x), with the aspect p and the shear q. An example is a picture that was
+scaled differently along its two axes. The eight lens errors form the vector (a, b, k, l, p, q), which is
+named `bend` in the code.
 
 `Pointing` gives the right ascension, declination and roll of an attitude.
 """
@@ -49,9 +50,10 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 BENDS, ASPECT = 8, 6
-"""Number of lens errors in the bend of a lens, and index of the aspect."""
-# Standard deviation of the tilt of a typical lens, relative to the corner's tangent (20 px of 1024 px).
-# Standard deviations of a typical lens's two distortion terms at the image corner (3 % and 1 %).
+"""Number of lens errors in the vector `bend`, and index of the aspect."""
+# The first value is the standard deviation of the tilt of a typical lens, relative to the corner's tangent
+# (20 px of 1024 px). The other two values are the standard deviations of the two distortion terms of a
+# typical lens at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 _DECENTRING = 0.004
 """Prior standard deviation of a corner's displacement by decentring, relative to the corner's distance."""
@@ -73,9 +75,9 @@ def usual_bend(camera: CameraModel) -> FloatArray:
 def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
     """Return the reciprocal prior variances (6,) of lens errors for a known accuracy and square pixels.
 
-    For an exact lens, an empty array (0,) is returned. An error of the optical axis in the image acts as a
-    tilt of the lens. The common rotation of all stars by an error of the optical axis counts as an error of
-    the camera's mounting, not of the lens.
+    For an exact lens, an empty array (0,) is returned. An error of the optical axis's position in the image
+    has the effect of a tilt of the lens. An error of the optical axis also rotates all stars by the same
+    angle. This rotation is attributed to the camera's mounting, not to the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)
@@ -104,7 +106,7 @@ def _bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
         tx, ty = x / z, y / z
         square = tx * tx + ty * ty
         along = bend[0] * tx + bend[1] * ty + (bend[4] + bend[5] * square) * square
-        # Displacement of the tangents by decentring and by pixels that are not square, times z.
+        # Displacement of the tangents by decentring and by pixels that are not square, multiplied by z.
         dx = z * (square * bend[2] + tx * bend[6] + ty * bend[7])
         dy = z * (square * bend[3] - ty * bend[6] + tx * bend[7])
         inward = x * dx + y * dy
@@ -178,7 +180,7 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Number of iterations that invert the lens errors; each reduces the remaining error to a few per cent.
+# Number of iterations that invert the lens errors. Each iteration reduces the error to a few per cent.
 _BEND_STEPS = 8
 
 
@@ -192,8 +194,8 @@ class SkyMap:
         bend: lens errors that the camera model does not include (8,); zeros if the lens is exact.
         velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration, or None
             for no correction.
-        mirrored: whether the image shows the mirrored sky; the attitude is then that of the image with left
-            and right exchanged about the optical axis.
+        mirrored: whether the image shows the mirrored sky; the attitude then refers to the image after left
+            and right are swapped about the optical axis.
     """
 
     camera: CameraModel
@@ -206,7 +208,8 @@ class SkyMap:
         """Return the ICRS directions of pixels (n, 2), as unit vectors (n, 3)."""
         rays = self.camera.unit_vectors(self._exchanged(points))
         seen = bent(rays, self.bend) @ attitude_matrix(self.quaternion)
-        # The aberration for the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
+        # The inverse of the aberration is the aberration for the opposite velocity, accurate to (v/c)^2 or
+        # 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:
@@ -220,7 +223,7 @@ class SkyMap:
         return self._exchanged(points)
 
     def _exchanged(self, points: FloatArray) -> FloatArray:
-        """Return pixels (n, 2) with left and right exchanged if the image shows the mirrored sky."""
+        """Return pixels (n, 2) with left and right swapped if the image shows the mirrored sky."""
         if not self.mirrored:
             return points
         return np.asarray(np.array([2.0 * self.camera.centre[0], 0.0]) + points * np.array([-1.0, 1.0]))
@@ -228,7 +231,7 @@ class SkyMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShortTrails:
-    """The motion of stars by a few pixels during an exposure.
+    """The rotation of the camera during an exposure in which stars move by a few pixels.
 
     Attributes:
         turn: rotation vector of the camera over the exposure (3,), rad, camera axes.

@@ -6,10 +6,10 @@ there is one, and then in the whole sky. The resulting attitude is that at mid-e
 
 During an exposure at a constant rate, the middle of a streak is the position of the star at mid-exposure.
 During an exposure of length T, an angular acceleration a displaces the centroid of a point by a T^2 / 24, and
-the midpoint between the two ends of a streak by a T^2 / 8. A fit of a streak that includes the acceleration
-is displaced only by terms of higher order in time. White angular acceleration of density q adds a variance of
-q T^3 / 320 to the position of a point, of q T^3 / 48 to the midpoint of a streak's ends, and of q T^3 / 4743
-to a fit that includes the acceleration.
+the midpoint between the two ends of a streak by a T^2 / 8. If the fit of a streak includes the acceleration,
+only terms of higher order in time displace the position. White angular acceleration of density q adds a
+variance of q T^3 / 320 to the position of a point, of q T^3 / 48 to the midpoint of a streak's ends, and of q
+T^3 / 4743 to a fit that includes the acceleration.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class FrameSolution:
     """The attitude of one frame at mid-exposure, and the rate if the stars are streaks.
 
     Attributes:
-        status: outcome of the frame; the attributes from `star` on are valid for SOLVED only.
+        status: outcome of the frame. The attributes from `star` on are valid only for the status SOLVED.
         reason: why the frame was not solved, in one sentence; empty if it was solved.
         kind: whether the frame shows points or streaks.
         camera: camera model, with the fitted focal length if the focal length was free.
@@ -70,11 +70,11 @@ class FrameSolution:
         fix: attitude from ICRS to camera axes and its covariance; the quaternion's scalar is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 if the focal length was given.
         bend: fitted lens errors (8,), see `sky_map`; zeros if the lens is exact.
-        log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
+        log10_false_alarm: log10 of the probability that a frame of random points would be solved as well.
         tracked: whether the stars were identified by a search near the prior attitude.
         motion: motion of the camera from the streaks, camera frame, or None for points.
         mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
-            image with left and right exchanged about the optical axis, but the points are those of the
+            image after left and right are swapped about the optical axis. The points are those of the
             original image.
         psf_sigma: measured standard deviation of the point spread, px; NaN if unknown.
     """
@@ -103,7 +103,7 @@ class FrameSolution:
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution with `by` (3, 3), rad^2, added to the attitude covariance if there is one."""
+        """Return the solution with `by` (3, 3), rad^2, added to the covariance of any attitude."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
@@ -125,7 +125,7 @@ MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """Weights with which the attitude measured in a frame averages the attitudes during the exposure.
+    """Weights by which the attitude measured in a frame is a mean of the attitudes during the exposure.
 
     Attributes:
         weights: weights of the rotations since mid-exposure at the times `NODES`; the weight of mid-exposure
@@ -139,11 +139,11 @@ class Weighting:
 
 
 MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
-"""Weighting for points, which show the mean attitude over the exposure, from Simpson's rule."""
+"""Weighting for points, which show the mean attitude over the exposure, by Simpson's rule."""
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
 """Weighting for streaks that are fitted with a constant rate, or of which only the ends are measured."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
-"""Weighting for streaks fitted with an acceleration, from the vertex of the best-fitting parabola."""
+"""Weighting for streaks fitted with an acceleration, from the best-fitting parabola at mid-exposure."""
 
 
 def weighting_of(motion: FrameMotion) -> Weighting:
@@ -170,12 +170,12 @@ def middle_covariance(
 
 
 def timing_covariance(motion: MotionResult) -> FloatArray:
-    """Return the covariance (3, 3), rad^2, of the rotation error that all streaks of a frame share.
+    """Return the covariance (3, 3), rad^2, of the rotation error common to all streaks of a frame.
 
     If the rate changes, only the brightness along a streak determines the star's position at mid-exposure. An
     error of the acceleration shifts all stars along their paths by the same time interval, which does not
-    average out over the stars. The error that all streaks share is at most the uncertainty of the most
-    accurate star along its path.
+    average out over the stars. The common error is at most the uncertainty along its path of the most
+    accurate star.
     """
     if motion.acceleration is None or motion.rate is None:
         return np.zeros((3, 3))
@@ -192,9 +192,11 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
 _LEAST_SIGMA_PX = 0.005
 # Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
 _COLOUR_PX = 0.002
-# Centroid error that all stars share, as a fraction of the excess PSF width (from campaign `resting`).
+# Ratio of the centroid error common to all stars to the excess width of the PSF (from the campaign
+# `resting`).
 _SHAPE_DOUBT = 0.05
-# Chi-square per degree of freedom above which the positions contradict their uncertainties, if significant.
+# Chi-square per degree of freedom above which the star positions contradict their uncertainties, if it is
+# significant.
 _CONTRADICTED = 1.5
 # Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
 # The first attempt to identify the stars assumes smaller errors, so that fewer stars agree by chance.
@@ -209,12 +211,13 @@ _LEAST_SIGNIFICANCE = 5.0
 _PLACELESS_PX = 5.0
 # Distance (px) below which a point may be a part of the same star as a matched point.
 _SPLIT_PX = 10.0
-# Excess of such points over chance above which stars are seen as several points each, in standard deviations
-# of their number by chance plus a share of the matched points.
+# Thresholds for the number of such points from which stars are imaged as several points each. The number must
+# exceed the expected number by chance by the first value times its standard deviation plus the second value
+# times the number of matched points.
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
-# Largest chi-square of the difference from the prior attitude (false rejection of one in 100,000 frames).
+# Largest chi-square of the difference from the prior attitude (1 false rejection in 100,000 frames).
 _NEAR = 25.9
-# Number of guide stars that are searched near their predicted positions in tracking.
+# Number of guide stars that the tracking mode searches near their predicted positions.
 _LOOKED_FOR = 30
 # Minimum and maximum search radius (px) around a predicted position.
 # If a larger search radius is needed, a search of the whole frame is faster.
@@ -229,14 +232,14 @@ class SolveSettings:
         detection: settings of the detection of points.
         likelihood: settings of the streak estimator for images from files; flight uses other settings.
         identification: settings of the default identification method.
-        method: function used instead of the default identification method, or None for the default.
+        method: identification function, or None for the default method.
         attitude: solver of Wahba's problem that determines the attitude, or None for the fit of the image
             positions.
         velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
             of aberration, or None for no correction.
         lens: standard deviations of a lens of known focal length, or None if the lens is exact.
-        uncalibrated_lens: whether a lens of uncertain focal length may also have a displaced optical axis and
-            distortion.
+        uncalibrated_lens: whether a displaced optical axis and distortion are also fitted for a lens of
+            uncertain focal length.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -411,8 +414,8 @@ def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
 def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
     """Return the solution with its covariance increased if the stars are wider than the given PSF.
 
-    If star images have a tail, due to the lens or to stray light, the centroids depend on the pixel weights,
-    and all positions have a common error.
+    If star images have a tail, due to the lens or to stray light, the centroids depend on the weights of the
+    pixels. All positions then have a common error.
     """
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):
@@ -432,7 +435,7 @@ def _identify(
     settings: SolveSettings,
     prior: AttitudePrior | None,
 ) -> FrameSolution:
-    """Return the solution after identification of the stars, first near the prior, then in the whole sky."""
+    """Return the solution with identified stars; the search near the prior precedes that of the whole sky."""
     stars = star_field(seen, flux, scale)
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)
@@ -456,7 +459,7 @@ def _identify(
 
 
 def _mirrored(seen: FrameSolution) -> FrameSolution:
-    """Return the solution `seen` with its star positions mirrored left to right about the optical axis."""
+    """Return the solution `seen` with its star positions mirrored about the optical axis (left to right)."""
     axis = np.array([2.0 * seen.camera.centre[0], 0.0])
     turned = np.array([-1.0, 1.0])
     return replace(
@@ -471,11 +474,12 @@ def _mirrored(seen: FrameSolution) -> FrameSolution:
 def star_field(
     seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float], least: float = _LEAST_SIGMA_PX
 ) -> StarField:
-    """Return the points of a frame as a `StarField`, with standard deviations of at least `least` px."""
+    """Return the points of a frame as a `StarField`; their standard deviations are at least `least` px."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
-    # At an angle a from the boresight, a pixel is smaller by cos^2 a along the radius and by cos a across it.
+    # At an angle a from the boresight, a pixel subtends an angle that is smaller by the factor cos^2 a along
+    # the radius and by cos a across the radius.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     magnitude = None if flux is None else -2.5 * np.log10(flux)
@@ -542,11 +546,11 @@ def _with_attitude(
 
 
 def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
-    """Return why the points contradict their own uncertainties too much for an attitude, or an empty text.
+    """Return why the points contradict their uncertainties too much for an attitude, or an empty string.
 
-    If the positions are wrong, as on the rings of a defocused lens, only those points match that happen to be
-    within the gate. If they are the smaller part of all points, they were selected by the candidate attitude,
-    and their scatter about it does not show its error.
+    If the positions are wrong, for example because a defocused lens images stars as rings, only points that
+    are within the gate by chance match. If fewer than half of the points match, the candidate attitude
+    selected them, and their scatter does not show the error of the attitude.
     """
     count, agreeing = len(seen.points), int(np.count_nonzero(fit.agree))
     if seen.kind is not FrameKind.POINTS or 2 * agreeing >= count or fit.excess < _CONTRADICTED:
@@ -558,11 +562,12 @@ def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
 
 
 def _split_doubt(seen: FrameSolution, chosen: IntArray) -> FloatArray:
-    """Return the attitude covariance (3, 3), rad^2, that is due to stars seen as several points each.
+    """Return the attitude covariance (3, 3), rad^2, due to star images that consist of several points.
 
-    A defocused or shaken star appears as several points, of which one matches the star. If the same part of
-    each image matches, all positions have a common error, which the residuals do not show. The error is about
-    half of the distance to the other points. The stars `chosen` are the indices of the matched points.
+    A star in a defocused or shaken image appears as several points, of which one matches the star. If the
+    same part of each star's image matches, all positions have a common error, which the residuals do not
+    show. The common error is about half of the distance to the other points of the same star. The array
+    `chosen` contains the indices of the matched points.
     """
     doubt = np.zeros((3, 3))
     if seen.kind is not FrameKind.POINTS:

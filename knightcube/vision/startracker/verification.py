@@ -1,7 +1,7 @@
 """Verification of a candidate attitude against the whole field, and tracking with a prior attitude.
 
 The guide stars predicted in the field are compared with the observed stars. Attitude and scale are refined
-with the matched stars, and the comparison is repeated until the set of matched stars no longer changes. The
+with the matched stars, and the comparison is repeated until the set of matched stars is constant. The
 significance of a match is an upper bound of the expected number of attitudes, among the searched attitudes,
 at which random stars would match at least as well. If the expected number of chance matches is far below one,
 it is also an upper bound of the probability of a false match. The bound of chance matches does not depend on
@@ -53,7 +53,7 @@ class Chance:
         spread: variance of a star's direction along one axis, divided by the solid angle of the field.
         fields: solid angle of the searched part of the sky, divided by the solid angle of the field.
         scales: natural logarithm of the ratio of the highest to the lowest image scale.
-        choices: number of gate widths among which the matching selects.
+        choices: number of gate widths from which the most significant is selected.
         least: minimum number of matched stars for an identification.
         enough: log10 of the number of chance matches below which an exact bound is not needed.
     """
@@ -67,10 +67,10 @@ class Chance:
     enough: float
 
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
-        """Return log10 of an upper bound of the number of chance matches that are as good as a given match.
+        """Return log10 of an upper bound of the expected number of chance matches as good as a given match.
 
-        The matching also selects the faintest expected star that is compared. Because of this selection of
-        the faintest star, the bound is multiplied by j^2 pi^2/6, where j - 1 is the number of brighter
+        The faintest expected star that is compared is also selected for the most significant match. Because
+        of this selection, the bound is multiplied by j^2 pi^2/6, where j - 1 is the number of brighter
         expected stars without a match.
 
         Args:
@@ -98,8 +98,8 @@ class Chance:
         first star. The radius of the ring is the distance of the first two matched stars, and its width
         follows from the range of the scale and from the gate. Every further matched star lies within the gate
         of an expected star. The probability is multiplied by the number of ways to choose the matched stars
-        among the observed stars. Because the fit reduces the distances of the matched stars, the distance of
-        each star is increased by the factor 1/(1 - leverage).
+        among the observed stars. The fit reduces the distances of the matched stars. The gate is therefore
+        increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
@@ -116,7 +116,7 @@ class Chance:
 
 
 def order_probability(sequence: Sequence[int]) -> float:
-    """Return the probability that a random order has no more inversions than `sequence` (Kendall's tau)."""
+    """Return the probability that a random order has at most the inversions of `sequence` (Kendall's tau)."""
     inversions = sum(a > b for place, a in enumerate(sequence) for b in sequence[place + 1 :])
     counts = _inversion_counts(len(sequence))
     return sum(counts[: inversions + 1]) / math.factorial(len(sequence))
@@ -124,7 +124,7 @@ def order_probability(sequence: Sequence[int]) -> float:
 
 @lru_cache(maxsize=_MOST_ORDERED + 1)
 def _inversion_counts(length: int) -> tuple[int, ...]:
-    """Return the numbers of permutations of `length` items with 0, 1, 2, ... inversions (Mahonian)."""
+    """Return the numbers of permutations of `length` items with 0, 1, ... inversions (Mahonian numbers)."""
     counts = [1]
     for more in range(1, length):
         counts = [sum(counts[max(0, total - more) : total + 1]) for total in range(len(counts) + more)]
@@ -136,14 +136,15 @@ class VerificationSettings:
     """Settings of the verification of a candidate attitude.
 
     Attributes:
-        log10_false_alarm: log10 of the largest accepted expected number of chance matches.
+        log10_false_alarm: log10 of the largest expected number of chance matches with which a match is
+            accepted.
         gates: trial half-widths within which a star matches, in standard deviations; the gate with the most
-            significant match is used. The wide gates are for a lens with distortion, or for standard
-            deviations that are too small.
+            significant match is used. The wide gates are for a lens with distortion, and for stars with
+            underestimated standard deviations.
         least_matches: minimum number of matched stars.
         rounds: maximum number of rounds of matching and refinement.
-        most: number of observed stars, the brightest first, from which it is decided whether a candidate is
-            accepted. After a candidate is accepted, all stars are matched.
+        most: number of the brightest observed stars that decide whether a candidate is accepted. After a
+            candidate is accepted, all stars are matched.
     """
 
     log10_false_alarm: float = -4.5
@@ -155,7 +156,7 @@ class VerificationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matching:
-    """Stars that match at the first candidate attitude with few enough chance matches.
+    """The matched stars of the first candidate attitude with sufficiently few expected chance matches.
 
     Attributes:
         candidate: index of the candidate attitude.
@@ -171,13 +172,15 @@ class _Matching:
     expected: IntArray
 
 
-# Fraction of bright expected stars that match, below which the distortion of the lens is also fitted.
+# Fraction of bright expected stars with a match below which the distortion of the lens is also fitted.
 _FEW_MISSED = 0.8
-# Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
-# The second value is the radius of the search for nearby stars, relative to the image corner's tangent.
-# A larger fraction of displaced stars indicates a wrong lens fit, because a foreground only hides stars.
+# Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match. The second
+# value is the radius of the search for nearby stars, relative to the image corner's tangent. A larger
+# fraction of displaced stars indicates a wrong fit of the lens, because a foreground hides stars but does not
+# displace them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Log10 of the factor on the limit of chance matches above which a candidate is rejected at once.
+# Log10 of the ratio of the expected number of chance matches to its limit above which a candidate is rejected
+# without refinement.
 _HOPELESS = 7.0
 
 
@@ -196,8 +199,7 @@ def verify(
         sky: index of the guide stars.
         matrix: attitude matrix of the candidate (3, 3), ICRS to camera, accurate enough for stars to match.
         scale: image scale of the candidate attitude.
-        searched: fraction of all attitudes covered by the search that found the candidate; 1 for lost in
-            space.
+        searched: fraction of all attitudes that the search for the candidate covered; 1 for lost in space.
         settings: settings of the verification.
     """
     return verify_first(field, sky, matrix[None], np.array([scale]), searched, settings)
@@ -218,7 +220,7 @@ def verify_first(
         sky: index of the guide stars.
         matrices: attitude matrices of the candidates (c, 3, 3).
         scales: image scales of the candidates (c,).
-        searched: fraction of all attitudes covered by the search that found the candidates.
+        searched: fraction of all attitudes that the search for the candidates covered.
         settings: settings of the verification.
     """
     deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
@@ -258,7 +260,8 @@ def _verified(field: StarField, matching: _Matcher, first: _Matching, start: Ref
             return nothing(field)
     found, refined = decided
     expected = found.expected
-    # Distortion of an uncalibrated lens is fitted if bright stars do not match or residuals are too large.
+    # The distortion of an uncalibrated lens is fitted if bright stars do not match or if residuals are too
+    # large.
     bright = _bright_matched(expected, found.star)
     missed = not bright or sum(bright) < _FEW_MISSED * len(bright)
     widened = refined.widened()
@@ -279,7 +282,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 
 
 def _bright_matched(expected: npt.NDArray[np.integer[Any]], star: npt.NDArray[np.integer[Any]]) -> list[bool]:
-    """Return whether each expected star matches, for those brighter than the median matched star."""
+    """Return a mask of the matches of the expected stars that are brighter than the median matched star."""
     known = set(star.tolist())
     matched = [number in known for number in expected.tolist()]
     places = [place for place, found in enumerate(matched) if found]
@@ -289,7 +292,7 @@ def _bright_matched(expected: npt.NDArray[np.integer[Any]], star: npt.NDArray[np
 def _share_displaced(
     field: StarField, sky: SkyIndex, expected: npt.NDArray[np.intp], found: DistortedFit
 ) -> float:
-    """Return the fraction of bright expected stars that have an unmatched star nearby instead of a match.
+    """Return the fraction of bright expected stars with an unmatched star nearby instead of a match.
 
     The fraction that is expected by chance is subtracted from the result.
     """
@@ -373,7 +376,7 @@ def _settle(matcher: _Matcher, first: _Matching, start: Refinement) -> tuple[_Ma
         )
         if found is None:
             return None
-        # The fitted scale must lie within five standard deviations of the range of possible scales.
+        # The fitted scale must be within five standard deviations of the range of possible scales.
         lowest, highest = field.scale
         slack = math.exp(5.0 * found.scale_sigma)
         if lowest != highest and not lowest / slack <= found.scale <= highest * slack:
@@ -448,9 +451,9 @@ def _first_match_numpy(
     placed: FloatArray,
     begin_of_box: npt.NDArray[np.int32],
 ) -> _Found:
-    """Return the parts of the `_Matching`, with the candidate -1 if no candidate matches well enough.
+    """Return the attributes of a `_Matching`; the candidate is -1 if no candidate matches sufficiently well.
 
-    The guide stars at the first candidate are computed for each candidate if `expected` is empty.
+    If `expected` is empty, the expected guide stars are computed for each candidate.
     """
     given = len(expected) > 0
     for number in range(len(scales)):
@@ -493,7 +496,7 @@ def _pair_numpy(
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Return the nearest guide star (n,) of each of `seen` (n, 3), and the squared distance in variances.
 
-    The distance is infinite for an observed star that is not the nearest one of its nearest guide star.
+    The distance is infinite if the nearest guide star of an observed star has a nearer observed star.
     """
     cosines = seen @ (matrix @ guide.T)
     nearest = cosines.argmax(axis=1)
@@ -688,7 +691,7 @@ def _pair(
 
 @loop_helper
 def _widest_difference(seen: FloatArray, reach: float) -> float:
-    """Return a bound of the difference of tangents of two stars, one of `seen` (n, 3), a chord `reach` apart.
+    """Return a bound of the difference between the tangents of two stars, one of `seen`, at most `reach` apart.
 
     A gnomonic image is enlarged by at most 1 + t^2 between two stars, where t is the larger field angle's
     tangent.
@@ -712,7 +715,7 @@ def _best_gate(
     fields: float,
     scales: float,
 ) -> tuple[float, float]:
-    """Return the most significant gate and log10 of its chance matches; the gate is 0 if too few match."""
+    """Return the most significant gate and log10 of its chance matches; a gate of 0 if few stars match."""
     best, bound, matched = 0.0, math.inf, least - 1
     for gate in gates:
         within, rank = _within(squared, nearest, gate)
@@ -778,7 +781,8 @@ def _share_ordered(sequence: IntArray, length: int) -> float:
         for other in range(place + 1, length):
             if sequence[place] > sequence[other]:
                 inversions += 1
-    # Each further item multiplies the number of permutations, and adds 0 to `more` inversions.
+    # Each further item increases the number of inversions by 0 to `more`, and the number of permutations by a
+    # factor.
     share = np.zeros(length * (length - 1) // 2 + 1)
     share[0] = 1.0
     for more in range(1, length):
@@ -809,8 +813,8 @@ def _identified(field: StarField, matching: _Matching, refined: Refinement) -> S
 PRIOR_SIGMAS = 4.0
 """Largest error of a prior attitude that the search near it covers, in standard deviations."""
 _BRIGHTEST = 16
-# Maximum number of pairs of an observed and a predicted star.
-# With more pairs of stars, the comparison is ambiguous and takes longer than a search of the whole sky.
+# Maximum number of pairs of an observed and a predicted star. If the number of pairs is larger, the
+# comparison is ambiguous and takes longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 
@@ -854,8 +858,7 @@ def _same_shift(
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
     """Return the indices of observed stars (k,) and guide stars (k,) that have a common displacement.
 
-    The returned stars form the largest set of pairs for which one displacement explains the error of the
-    prior.
+    The returned stars are the largest set of pairs that one displacement explains.
     """
     reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)
@@ -864,7 +867,7 @@ def _same_shift(
     expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
     seen = stretched(field.direction[:_BRIGHTEST], scale)
     shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
-    # Errors of roll and scale displace stars at different edges of the image differently.
+    # The displacement of stars by errors of roll and scale differs between the edges of the image.
     radius = math.hypot(across, down)
     star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
     stretch = 0.5 * math.log(field.scale[1] / field.scale[0])
@@ -879,7 +882,7 @@ def _same_shift(
     apart = shifts[:, None, :] - shifts
     tolerance = 4.0 * star_sigma + (PRIOR_SIGMAS * sigma + stretch) * radius
     agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
-    # Two pairs of stars that share an observed star or a guide star do not support each other.
+    # Two pairs of stars with the same observed star or guide star do not count as agreeing.
     agree &= (one[:, None] != one) & (two[:, None] != two)
     best = int(agree.sum(axis=1).argmax())
     members = np.append(np.flatnonzero(agree[best]), best)

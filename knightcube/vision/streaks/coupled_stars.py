@@ -27,7 +27,7 @@ NO_CROWD: Crowd = (
     np.zeros(0, np.float32),
     np.zeros((1, 0), np.float32),
 )
-"""The arrays without a shared pixel."""
+"""The arrays of `Crowd` if stars share no pixels."""
 _Alone = tuple[IntArray, FloatArray, FloatArray, FloatArray]
 """The arrays `kept`, `own`, `gain` and `inner` of `normal_equations.EliminatedEquations`."""
 
@@ -42,7 +42,7 @@ def _solution_numpy(
     right: FloatArray,
     rounds: int,
 ) -> FloatArray:
-    """Return the vector of parameters as `solution` does."""
+    """Return the result of `solution`."""
     x = _without_coupling(eliminated, right, len(free))
     if rounds == 0:
         return x
@@ -129,7 +129,7 @@ def solution(
         eliminated: solution of the equations without coupling.
         free: mask (s,) of the fitted shared parameters.
         right: right-hand side (s + n a,).
-        rounds: maximum number of iterations. Without any, the coupling is neglected.
+        rounds: maximum number of iterations. If `rounds` is 0, the coupling is neglected.
     """
     x, image, z = np.empty_like(right), np.empty_like(right), np.empty_like(right)
     change, scratch = np.empty(common), np.empty((2, *information.shape[:2]))

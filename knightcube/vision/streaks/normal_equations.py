@@ -7,8 +7,8 @@ equations, which leaves the shared parameters (rate, acceleration, width). Stars
 coupled, and a few conjugate-gradient iterations account for the coupling.
 
 Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
-than a single star, and flux of a neighbouring star shifts the ends of a streak. Blended stars, whose
-estimates disagree with the majority, no longer affect the motion.
+than the image of a single star, and the flux of a neighbouring star shifts the ends of a streak. The
+estimates of blended stars disagree with the majority. These stars are excluded from the fit of the motion.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SHARED = 7
 ALONE = 4
 """Number of parameters of a single star: x, y, flux and sky level."""
 
-# Constants of `fit_windows.residuals`, which machine code of this module uses.
+# Constants of `fit_windows.residuals` that the compiled functions of this module use.
 _MARGIN = 3.0
 _UNRESOLVED = 0.1
 # Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.
@@ -133,7 +133,7 @@ def model_images(
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
     """Return the images whose combinations model long streaks, and the images of spots with derivatives.
 
-    The last image of each long streak is left uninitialised, as room for the residual.
+    The last image of each long streak is not initialised. It is memory for the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -209,11 +209,11 @@ def _sum_products_numpy(
 ) -> None:
     """Add weighted products of the images of b blocks of p pixels to the normal equations of their stars.
 
-    The weights (b, p) and the last of the `images` (b, i + 1, p), which holds the residuals, are computed
-    from the modelled counts `total` of all fitted pixels. Products of the residual with the other images give
-    the gradient, and the squared residual gives chi-square. Coefficients `matrix` (b, i, SHARED + ALONE)
-    combine the images into derivatives. The `levels` are signal, floor and ceiling of `BlockPixels`, and
-    the `limits` gain and clip of `fit_windows.residuals`.
+    The weights (b, p), and the residuals in the last of the `images` (b, i + 1, p), are computed from the
+    modelled counts `total` of all fitted pixels. Products of the residual with the other images give the
+    gradient, and the squared residual gives chi-square. Coefficients `matrix` (b, i, SHARED + ALONE) combine
+    the images into derivatives. The `levels` are signal, floor and ceiling of `BlockPixels`, and the `limits`
+    gain and clip of `fit_windows.residuals`.
     """
     weight[:], images[:, -1] = residuals(total, slot, inside, *levels, *limits)
     blocks, count = images.shape[:2]
@@ -294,7 +294,7 @@ def _scalar_product(a: Float32Array, b: Float32Array) -> np.floating[Any]:
 
 @loop_helper
 def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, matrix: FloatArray) -> None:
-    """Add the products `gram` of images to gradient and lower half of the information of one star."""
+    """Add the products `gram` of images to the gradient and to the lower half of one star's information."""
     images, count = matrix.shape
     along = np.empty(images)
     for q in range(count):
@@ -317,7 +317,7 @@ def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, 
 def _shared_pixels(
     star: IntArray, view: BlockPixels, weight: Float32Array, images: Float32Array, matrix: FloatArray
 ) -> SharedPixels:
-    """Return the derivatives of the modelled counts on pixels that several stars share."""
+    """Return the derivatives of the modelled counts on the pixels that belong to several stars."""
     block, drawn = _at_pixels(images, view.crowded)
     first = np.flatnonzero(np.diff(block, prepend=-1))
     held = block[first]
@@ -359,7 +359,7 @@ def _spot_images(
 ) -> Float32Array:
     """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spot images of p x p pixels by parameter.
 
-    The last element along the second axis is left uninitialised, as room for the residual.
+    The last element along the second axis is not initialised. It is memory for the residual.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
@@ -374,7 +374,7 @@ def _spot_images(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """One Gauss-Newton step of the fit, with the covariance of the parameters.
+    """One Gauss-Newton step of the fit, and the covariance of the parameters.
 
     Attributes:
         shared: step of the parameters that all stars share (SHARED,).
@@ -444,14 +444,15 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
 
 
 def _eliminated_numpy(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return `own` and `gain` of `EliminatedEquations`, and the information (k, k) on the fitted parameters.
+    """Return the attributes `own` and `gain` of `EliminatedEquations`, and the information matrix (k, k).
 
     The arguments are the information of `Evaluation` and the indices `kept` (k,) of the fitted parameters.
     """
     alone = information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # For a star outside the frame, a diagonal element of 1 for the flux keeps the star's block invertible.
+    # For a star without fitted pixels, the diagonal element of the flux is set to 1, so that the star's block
+    # is invertible.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
     root = np.sqrt(np.einsum("nii->ni", alone))
     outer = root[:, :, None] * root[:, None, :]
@@ -537,7 +538,8 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
         return None
     out = np.empty((3, 3))
     for k in range(3):
-        # The equations are scaled so that the solution is of order one and one tolerance suits all frames.
+        # The equations are scaled so that the solution is of order one. The same tolerance is then valid for
+        # all frames.
         unit = np.zeros(SHARED + ALONE * len(evaluation.chi2))
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         out[k] = _coupled(evaluation, eliminated, free, unit, rounds)[:3] / unit[k]
@@ -563,10 +565,10 @@ def _coupled(
 def stepped(
     scene: StreakScene, solution: Solution, pinhole: Pinhole, longest: float
 ) -> tuple[StreakScene, float]:
-    """Return the scene after a step of the fit that moves no streak end by more than `longest` px.
+    """Return the scene after a step of the fit that is limited to `longest` px at each streak end.
 
-    The second value is the largest displacement (px) of a streak end, or change of the point-spread width, by
-    the full step.
+    The second returned value is the largest displacement (px) of a streak end by the unlimited step, or the
+    change (px) of the point-spread width if that is larger.
     """
     n = len(scene.stars)
     growing = bool(solution.shared[3:6].any())
@@ -594,7 +596,7 @@ def stepped(
 
 # Fisher information of a star, relative to the most informative star, below which the star is ignored.
 _NOTHING = 1e-9
-# Smallest eigenvalue of a star's information matrix that is used, relative to the largest eigenvalue.
+# Smallest used eigenvalue of a star's information matrix, relative to its largest eigenvalue.
 _KNOWN = 1e-4
 # Minimum effective number of stars for an estimate of the scatter between stars.
 # The effective number of stars is smaller than the number of stars if the weights are unequal.
@@ -625,16 +627,16 @@ class StarEquations:
 
 
 def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) -> StarEstimates | None:
-    """Return each star's estimate of rate and point-spread width, or None if the equations are singular."""
+    """Return the estimates of the single stars, or None if the equations are singular."""
     alone = star_equations(evaluation, free)
     return None if alone is None else estimates_of(alone, scene)
 
 
 def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
-    """Return each star's estimate of three rate components and of the point-spread width.
+    """Return the estimate of three rate components and of the point-spread width by each star.
 
-    The rate components are along the rotation axis and two normals. All estimates are changes relative to the
-    scene, in rad per exposure for the rate and in px for the width.
+    The rate components are along the rotation axis and along two vectors normal to it. All estimates are
+    changes relative to the scene, in rad per exposure for the rate and in px for the width.
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
@@ -652,8 +654,8 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
 def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
     """Return the squared significance of a `step` of the shared parameters, and the number of stars.
 
-    If the estimates of the stars scatter more than their noise, the significance is computed from the
-    scatter. A single blended star can therefore not make a step significant.
+    If the scatter of the stars' estimates exceeds their noise, the significance is computed from the scatter.
+    Therefore, a single blended star cannot make a step significant.
     """
     alone = star_equations(evaluation, step != 0.0)
     if alone is None:
@@ -690,7 +692,8 @@ def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # A star more accurate than all others is not rejected, because the median's uncertainty is included.
+        # A star that is more accurate than all others is not rejected, because the uncertainty of the median
+        # is included.
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
@@ -703,10 +706,11 @@ def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
         return 1.0
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
-    # Squared weights keep many faint stars from hiding the scatter of a few bright stars.
+    # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # Without excess scatter, the largest of several reduced chi-squares still exceeds 1 by about its sigma.
+    # Even without excess scatter, the largest of several reduced chi-squares exceeds 1 by about one standard
+    # deviation.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
 
 

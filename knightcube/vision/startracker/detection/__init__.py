@@ -1,4 +1,4 @@
-"""Detection of stars in a frame: positions with covariances, from a camera of any kind.
+"""Detection of stars in a frame from any camera, with the covariances of their positions.
 
     found = detect(pixels, DetectionSettings()).stars()
     found.points, found.covariance, found.flux        # brightest first

@@ -1,8 +1,7 @@
 """Detection of the stars of a frame, in the whole frame or near predicted positions.
 
-`detect` searches a whole frame: the function measures the local maxima of the areas above the noise, and
-flags sources that are not stars. `measure_near` reads only small windows around predicted positions, for
-tracking.
+`detect` searches a whole frame. It measures the local maxima of the areas above the noise, and flags sources
+that are not stars. `measure_near` reads only small windows around predicted positions, for tracking.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from knightcube.vision.startracker.detection.survey import (
 
 
 class Quality(IntFlag):
-    """Quality flags of a source; a saturated, blended or clipped source may still be a star."""
+    """Quality flags of a source. A saturated, blended or clipped source may be a star."""
 
     POINT = 0
     SATURATED, BLENDED, CLIPPED = 1, 2, 4
@@ -83,7 +82,7 @@ class Detections:
 
     @classmethod
     def none(cls, psf_sigma: float = np.nan) -> Detections:
-        """Return an empty list of detections."""
+        """Return detections without any source."""
         empty, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
         return cls(
             np.zeros((0, 2)),
@@ -104,7 +103,7 @@ class Detections:
         return np.asarray((self.quality & REFUSED) == 0)
 
     def select(self, chosen: BoolArray | IntArray) -> Detections:
-        """Return the sources that `chosen` selects by a mask (n,), or by indices (k,) in the given order."""
+        """Return the sources `chosen` by a mask (n,), or by indices (k,) in the order of the indices."""
         return select(self, chosen, "psf_sigma")
 
     def in_order(self) -> Detections:
@@ -123,7 +122,7 @@ class Detections:
         return len(self.flux)
 
 
-# Limit of a star's wings at d px from the peak, relative to the peak: share (1 + (d / scale)^2)^-power.
+# Upper limit of a star's wings at a distance of d px, relative to the peak: share (1 + (d / scale)^2)^-power.
 _WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
 _WINGS_END = 60.0
 _CELLS = 4
@@ -147,7 +146,7 @@ class Peaks:
     core: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> Peaks:
-        """Return some of the peaks, selected by a mask (p,) or by indices (`chosen`)."""
+        """Return the peaks `chosen` by a mask (p,) or by indices."""
         return select(self, chosen)
 
     def __len__(self) -> int:
@@ -167,10 +166,10 @@ def find_peaks(areas: Areas) -> Peaks:
 def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
     """Return the indices (k,) of the peaks to measure, the highest first.
 
-    Local maxima on the wings of brighter stars are excluded. At most `most` peaks in the open sky are
-    selected, and at most a quarter of `most` in each sixteenth of the frame's area, so that a bright cloud
-    does not exclude the stars beside it. The same number of peaks outside the open sky is selected too, in
-    order to measure the shape of foreground sources.
+    Local maxima that may be part of the wings of a brighter star are excluded. At most `most` peaks in the
+    open sky are selected, and at most a quarter of `most` in each sixteenth of the frame's area, so that a
+    bright cloud does not exclude the stars beside it. The same number of peaks outside the open sky is
+    selected as well, so that the widths of foreground sources are measured.
 
     Args:
         peaks: local maxima of the frame, the highest first.
@@ -203,9 +202,10 @@ def on_wings(peaks: Peaks) -> BoolArray:
     """Return which peaks (p,) may be local maxima on the wings of a brighter star."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    # Only peaks closer than 60 px are compared, because at 60 px the wings are a millionth of the peak.
+    # Only peaks closer than 60 px are compared, because at this distance the wings are a millionth of the
+    # peak.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
-    # The wings of a saturated disc begin at the rim of the disc.
+    # The wings of a saturated star begin at the edge of its saturated disc.
     apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
     wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
     hidden = peaks.height[lower] < peaks.height[higher] * wing
@@ -233,17 +233,17 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
     )
 
 
-# Number of peaks that are measured per requested star; some peaks turn out not to be stars.
+# Number of measured peaks per requested star, above 1 because some peaks are not stars.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Noise of a block of pixels, relative to the frame's median, above which the block counts as foreground.
+# Ratio of the noise of a block of pixels to the median over the frame above which the block is foreground.
 _RESTLESS = 2.5
 # Radius (px) of a saturated disc above which it is a planet, the Moon or a lamp instead of a star.
 _WIDEST_CORE = 7.0
 _SHARPER, _BROADER = 0.55, 1.8
 _SURE = 3.0
 _LONGER_THAN_COMA = 12.0
-# Radius (px) around a source within which most sources must look like stars; otherwise the source is clutter.
+# Radius (px) around a source within which most sources must look like stars. Otherwise the source is clutter.
 _ABOUT = 48.0
 _ODD_PART, _LEAST_ODD = 0.5, 8
 _ODD_WIDTH, _ODD_LENGTH = 1.25, 2.5
@@ -289,7 +289,7 @@ def measure_areas(seen: Survey) -> Detections:
     real = confirmed(found, targets, settings) | ((quality & REFUSED) != 0)
     whole = assemble(found, shapes, quality, targets, spread, np.full(len(peaks), -1)).select(real)
     found_all = whole.in_order()
-    # The brightest stars are kept, and at most the same number of sources that are not stars.
+    # Up to `most_stars` stars and up to `most_stars` other sources are kept, the brightest of each kind.
     star = found_all.is_star
     kept = np.where(star, np.cumsum(star), np.cumsum(~star)) <= settings.most_stars
     return found_all.select(kept).scaled(seen.unit)
@@ -315,7 +315,7 @@ def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, target
 
 
 def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
-    """Return a mask of the usable stars `sound` (n,) that determine the PSF.
+    """Return the mask of the stars in the mask `sound` (n,) that determine the PSF.
 
     The PSF is determined by the stars that are not saturated, or by all stars if all are saturated.
     """
@@ -324,13 +324,13 @@ def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
 
 
 def looks_odd(quality: IntArray, shapes: Shapes, spread: FrameSpread) -> BoolArray:
-    """Return which sources (n,) are streaks, clutter or wider than the PSF, and so do not look like stars."""
+    """Return which sources (n,) do not look like stars: streaks, clutter, and sources wider than the PSF."""
     refused = (quality & REFUSED & ~int(Quality.HOT)) != 0
     return np.asarray(refused | (shapes.width - shapes.error > _ODD_WIDTH * spread.psf_sigma))
 
 
 def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
-    """Return which sources (n,) at `points` (n, 2), px, are mostly surrounded by `odd` sources (n,)."""
+    """Return which sources (n,) at `points` (n, 2), px, have mostly `odd` sources (n,) around them."""
     near = np.sum((points[:, None] - points) ** 2, axis=-1) < _ABOUT**2
     strange = near @ odd.astype(float)
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))
@@ -377,13 +377,14 @@ def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if frame_shape(areas).kind is not FrameKind.STREAKS:
-        # A long area may also be a row of stars, with several peaks, or a bright star with a tail from coma.
+        # A long area may also be a row of stars, with several peaks, or a bright star with a tail due to
+        # coma.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
 
 
-# Width (px) of the rim around the search area in which the sky is measured.
+# Width (px) of the border around the search area in which the sky is measured.
 _RIM = 5
 _ROUNDING = 12.0**-0.5
 _SAME_STAR = 1.5
@@ -473,14 +474,15 @@ def _peaks_near(
 def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return background (n,), noise of single and of smoothed pixels, each (n,), and noise correlation.
 
-    Background and noise are measured in the rims of the windows around the predicted positions. The noise of
-    smoothed pixels, from which the detection threshold is derived, includes faint stars. The noise
+    Background and noise are measured in the borders of the windows around the predicted positions. The noise
+    of smoothed pixels, from which the detection threshold is derived, includes faint stars. The noise
     correlation is the ratio of the noise of a sum of pixels to that of a sum of independent pixels.
     """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
     mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
-    # All windows use the median noise, because other stars or low counts falsify the noise of one window.
+    # The median noise of all windows is used for each window, because other stars or low counts can falsify
+    # the noise measured in one window.
     common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]

@@ -1,4 +1,4 @@
-"""Positions and fluxes of stars from a fit of the point spread function (PSF) or from a window's centroid.
+"""Positions and fluxes of stars, from a fit of the point spread function (PSF) or a centroid in a window.
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
 frame from these fits. `measure` then fits each star with the PSF of the frame, or computes a centroid in a
@@ -44,10 +44,11 @@ FIRST_WIDTH = 1.0
 _HALF_OF_FIRST = 4
 LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
-"""Half-width of a star's window, in PSF standard deviations, but from `LEAST_HALF` to `MOST_HALF` px."""
+"""Half-width of a star's window (PSF standard deviations), limited to `LEAST_HALF` to `MOST_HALF` px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts.
-# The mismatch is smaller than in the first fit, so that not only the wings of bright stars are used.
+# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the star's counts. The
+# mismatch is smaller than in the first fit, because a large mismatch would give weight only to the wings of
+# bright stars.
 _NEXT_MISMATCH = 0.02
 # Mismatch between PSF and Gaussian that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
@@ -103,7 +104,8 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # The errors of the widths include the deviations from a Gaussian that the first noise model allows for.
+    # The errors of the widths include the deviations from a Gaussian that the noise model of the first fit
+    # assumes.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
@@ -178,8 +180,8 @@ def crowded(middle: IntArray) -> BoolArray:
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
     """Return at most four of the `chosen` stars in each sixteenth of the frame area, and their weights.
 
-    Each sixteenth of the area has the same total weight, because stars are everywhere, but foreground
-    sources, such as the leaves of a tree, are in one part of the frame.
+    Each sixteenth of the area has the same total weight. Stars are in all parts of the frame, but foreground
+    sources, such as the leaves of a tree, are in one part.
     """
     place = middle[chosen] - middle.min(axis=0)
     column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
@@ -197,7 +199,7 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 Centroid = tuple[FloatArray, FloatArray]
-"""Centroids relative to the middle of the window (n, 2), px, and their derivatives (n, 2, m, m), px/count."""
+"""Type of centroids (n, 2), px, from the window's middle, and their derivatives (n, 2, m, m), px/count."""
 
 _ROUNDS = 12
 _STANDS_OUT = 3.0
@@ -221,14 +223,15 @@ def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Ce
 
 
 def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: float) -> Centroid:
-    """Return centroids with a Gaussian weight that follows the centroid, started at the centre of mass."""
+    """Return centroids with a Gaussian weight that moves with the centroid from the centre of mass."""
     steps = np.stack([np.broadcast_to(step, clean.shape[1:]) for step in _steps(clean)])
     place, reach = start[0].copy(), (clean.shape[1] - 1) / 2.0
     for _round in range(_ROUNDS + 1):
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # `gain` is the derivative of the weighted sum by the weight's position, about half of the sum.
+        # The variable `gain` is the derivative of the weighted sum by the position of the weight, about half
+        # of the sum.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -317,7 +320,8 @@ def centre_of_mass(
     variance = noise.variance(inner - sky[:, None, None], windows.noise)
     offset, slopes = _places(windows.light, variance, psf_sigma, method)
     both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
-    # The noise of the mean over the window's border changes the sky level, and therefore the centroid.
+    # The noise of the sky level, which is the mean over the border of the window, causes noise of the
+    # centroid.
     border = windows.noise**2 / (8.0 * half)
     area = float(inner[0].size) if len(inner) else 1.0
     both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
@@ -357,7 +361,7 @@ def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
-    """Return the rms systematic error (px) of a centroid method for noiseless stars anywhere in a pixel."""
+    """Return the rms systematic error (px) of a centroid method over all positions within a pixel."""
     place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
     stars = light(place, np.full(len(_PHASES), psf_sigma), half)
     places, _ = _places(stars, np.full_like(stars[:, 1:-1, 1:-1], _FAINTEST**2), psf_sigma, method)
@@ -366,7 +370,8 @@ def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
 
 _BLEND_ROUNDS = 5
 _STEPS, _STEPS_SATURATED = 3, 12
-# Minimum standard deviation (px) of a position, because pixels differ and the PSF is not exactly Gaussian.
+# Minimum standard deviation (px) of a position, for differences between pixels and a PSF that is not
+# Gaussian.
 _FLOOR = 0.002
 
 
@@ -427,7 +432,7 @@ def _fitted(
     windows = targets.windows(half)
     offset, flux = start(windows)
     if free_width:
-        # At the rim of the saturated disc, the star's profile equals the saturation level.
+        # At the edge of the saturated disc, the star's profile equals the saturation level.
         steep = np.minimum(0.5 * (targets.core / spread.psf_sigma) ** 2, 12.0)
         flux = 2.0 * np.pi * spread.psf_sigma**2 * (targets.ceiling - targets.level) * np.exp(steep)
     else:
@@ -445,7 +450,7 @@ def _fitted(
     freedom = np.maximum(found.used - found.covariance.shape[1], 1)
     excess = found.chi2 / freedom
     excess = np.where(excess > 1.0 + 3.0 * np.sqrt(2.0 / freedom), excess, 1.0) * targets.correlation**2
-    # Overlapping stars share the information of their pixels, so that overlap increases the covariance.
+    # The pixels of overlapping stars must determine several stars, so that overlap increases the covariance.
     excess = excess / (1.0 - pairs.overlap) ** 2
     covariance = found.covariance[:, :2, :2] * excess[:, None, None] + _FLOOR**2 * np.eye(2)
     flux_sigma = _flux_sigma(found, windows, spread.noise) * targets.correlation
@@ -463,7 +468,7 @@ def _shared(
     noise: NoiseModel,
     free_width: bool,
 ) -> PsfFit:
-    """Return the fits with blended stars fitted again, each after the light of its neighbours is subtracted.
+    """Return the fits after each blended star is fitted again with the light of its neighbours subtracted.
 
     The fits start from the offsets (n, 2), px, and fluxes (n,), counts, in `begin`, because the position from
     a fit of two stars as one is a poor initial value.

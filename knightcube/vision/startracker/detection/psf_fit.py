@@ -1,16 +1,16 @@
 """Fit of a Gaussian point spread function (PSF) to the pixels of all stars of a frame at once.
 
-In a square window around each star, position, flux, residual sky level and optionally the width are fitted. A
-star that moves during the exposure is modelled as a mean of Gaussians along its path (Gauss-Legendre
+The fit of a star in a square window determines its position, flux, residual sky level and optionally its
+width. A star that moves during the exposure is modelled as a mean of Gaussians along its path (Gauss-Legendre
 quadrature). The weights of the Gauss-Newton fit are computed from the fitted model, not from the counts.
-Weights computed from the counts would favour pixels that are low by chance, and the fitted flux would be too
-low. The normal equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
+Weights computed from the counts would be larger for pixels that are low by chance, so that the fitted flux
+would be too low. The normal equations of all stars, 4 x 4 or 5 x 5 each, are solved together.
 
 The variance of a pixel is noise^2 + light / gain + (mismatch x light)^2, where light is the star's counts in
 the pixel. The three terms of the variance of a pixel are the sky noise, the photon noise, and the difference
 between the PSF and a Gaussian. If the gain is unknown, gain and mismatch are measured from the residuals of
-the stars. Gain and mismatch can be distinguished because the variance of photon noise is proportional to the
-light, and that of the mismatch to the square of the light.
+the stars. Gain and mismatch can be distinguished, because the variance due to photon noise is proportional to
+the light, and the variance due to the mismatch is proportional to the square of the light.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class StarWindows:
     trail: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> StarWindows:
-        """Return the windows that a mask (n,) or indices (`chosen`) select."""
+        """Return the windows `chosen` by a mask (n,) or by indices."""
         return select(self, chosen, "half")
 
     def without(self, light: FloatArray) -> StarWindows:
@@ -124,16 +124,16 @@ class StarTargets:
         return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
     def select(self, chosen: BoolArray | IntArray) -> StarTargets:
-        """Return the targets that a mask (n,) or indices (`chosen`) select."""
+        """Return the targets `chosen` by a mask (n,) or by indices."""
         return select(self, chosen, "pixels", "ceiling", "correlation")
 
     def __len__(self) -> int:
         return len(self.middle)
 
 
-# Length (px) below which a star's path counts as a point; such a path widens a PSF of 1 px by 0.2 %.
+# Length (px) below which a star's path is treated as a point. Such a path widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
-# Number of quadrature nodes, which are accurate to 0.1 % of the flux for paths of four PSF widths.
+# Number of quadrature nodes. Their error is 0.1 % of the flux for paths of four PSF widths.
 _NODES = 4
 _BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 
@@ -185,7 +185,7 @@ def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | 
     return out
 
 
-# Residual that a wrong PSF may cause in a pixel, as a fraction of the star's counts in this pixel.
+# Tolerated residual of a pixel due to a wrong PSF, as a fraction of the star's counts in the pixel.
 _TOLERATED = 0.25
 _LEAST_PIXELS = 40
 _ROUNDS = 3
@@ -252,7 +252,8 @@ def _noise_terms_numpy(
     for _ in range(_ROUNDS):
         expected = floor + photon * m + square * m * m
         weight = 1.0 / expected**2
-        # Residuals beyond 5 standard deviations are ignored, because they are neighbours or hot pixels.
+        # Residuals beyond 5 standard deviations are ignored, because neighbouring stars or hot pixels cause
+        # them.
         weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
         of_square, of_both, of_light = (float(np.sum(weight * m**power)) for power in (4, 3, 2))
         along, across = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
@@ -297,10 +298,10 @@ def _shared_mismatch(
     used: BoolArray,
     photon: float,
 ) -> float:
-    """Return the mismatch between PSF and Gaussian, for known photon noise, as a weighted median over stars.
+    """Return the mismatch of PSF and Gaussian for known photon noise, as a weighted median over the stars.
 
-    The median over stars is used, because a wrong PSF affects all stars, but the light of neighbouring stars
-    only a few.
+    The median is used, because a wrong PSF affects all stars, but the light of neighbours affects only a few
+    stars.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
@@ -321,7 +322,7 @@ def _shared_mismatch(
 def _non_negative(
     of_light: float, of_both: float, of_square: float, along: float, across: float
 ) -> tuple[float, float]:
-    """Return the non-negative solution a, b of two normal equations of a fit of light and light^2.
+    """Return the non-negative coefficients a, b of a fit of light and light^2, from two normal equations.
 
     The equations are of_light a + of_both b = along and of_both a + of_square b = across.
     """
@@ -337,13 +338,13 @@ def _non_negative(
 
 X, Y, FLUX, SKY, WIDTH = range(5)
 NARROWEST, WIDEST = 0.25, 6.0
-# Maximum steps of position and width (px), which keep a fit from diverging if it starts 1 px off.
+# Maximum steps of position and width (px), by which a fit converges even from an initial error of 1 px.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
-# Residual (standard deviations) above which a pixel is excluded in the last steps, and number of these steps.
+# Residual (standard deviations) above which a pixel is excluded in the last steps, and number of last steps.
 _CLIP = 6.0
 _CLIP_FROM_END = 1
-# Regularisation of the scaled normal matrix, with which a star without information keeps its position.
+# Regularisation of the scaled normal matrix, by which a star without usable pixels keeps its position.
 _RIDGE = 1e-9
 
 
@@ -381,7 +382,7 @@ class PsfFit:
         return select(self, chosen)
 
     def replaced(self, chosen: IntArray, part: PsfFit) -> PsfFit:
-        """Return the fits, in which the fits of the stars `chosen` (k,) are replaced by `part`."""
+        """Return these fits with the fits of the stars `chosen` (k,) replaced by `part`."""
         out = {item.name: getattr(self, item.name).copy() for item in fields(self)}
         for name, values in out.items():
             values[chosen] = getattr(part, name)
@@ -425,7 +426,7 @@ def fit(
 
 
 _Solved = tuple[FloatArray, FloatArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""Covariance, chi2, used, residual, variance, leverage and model, as in `PsfFit`."""
+"""Type of the attributes covariance, chi2, used, residual, variance, leverage and model of `PsfFit`."""
 
 
 def _solve_numpy(
@@ -441,8 +442,8 @@ def _solve_numpy(
 ) -> _Solved:
     """Fit the parameters `values` (n, 5) in place, the first `count` of which are free, and return the fits.
 
-    The m nodes of the stars' paths have the displacements `shift` (m, n, 2), px, and the weights `share`
-    (m,). The noise `model` has the photon noise and the mismatch.
+    The quadrature has m nodes with the displacements `shift` (m, n, 2), px, and the weights `share` (m,). The
+    argument `model` is the noise model.
     """
     size = light.shape[1]
     # All steps share two arrays, because allocating large arrays takes more time than the arithmetic.
@@ -579,8 +580,8 @@ def _weights(
 ) -> None:
     """Write variance and weight of the pixels of one star.
 
-    A pixel that is not `usable`, or whose residual `off` has a square above `limit` times the tolerated
-    variance, has the weight zero.
+    The weight is zero for a pixel that is not `usable`. It is also zero if the square of the residual `off`
+    exceeds `limit` times the tolerated variance.
     """
     photon, mismatch = model
     for pixel in range(len(counts)):
@@ -700,7 +701,7 @@ _LEAST_OVERLAP = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Ordered pairs of stars of which the second contributes light to the window of the first.
+    """Ordered pairs of stars. The second star of a pair contributes light to the window of the first star.
 
     Attributes:
         first, second: indices of the first and of the second star of each pair (p,).

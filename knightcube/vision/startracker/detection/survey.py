@@ -1,12 +1,13 @@
-"""The survey of a frame: the sky background, the areas above the noise, and whether the areas are streaks.
+"""The survey of a frame: sky background, areas above the noise, and classification as points or streaks.
 
 `survey` smooths the frame, finds the pixels above the noise and joins them into connected areas. The shapes
 of the brightest areas distinguish a frame of points from a frame of streaks.
 
 The smoothing kernel is [1 2 1] along rows and columns, which is nearly the matched filter for a star of 0.7
 to 1.5 px standard deviation. The threshold is derived from the noise of the smoothed frame. Demosaicing and
-JPEG correlate pixels, so that a threshold derived from the noise of single pixels would pass thousands of
-peaks. The frame is processed in bands of rows that fit into the processor cache, without a copy of the frame.
+JPEG compression correlate the noise of neighbouring pixels. A threshold derived from the noise of single
+pixels would therefore be too low, and thousands of peaks would exceed it. The frame is processed in bands of
+rows that fit into the processor cache, without a copy of the frame.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from knightcube.vision.frame import (
 )
 
 KERNEL_NORM = 6.0
-"""Noise of the smoothed frame for a white noise of 1 count per pixel; root sum square of the kernel."""
+"""Noise of the smoothed frame for white noise of 1 count per pixel, the root sum square of the kernel."""
 LEAST_SIDE = 16
 # Noise (counts) to which a floating-point frame is scaled.
 _FLOATING_NOISE = 16.0
@@ -42,9 +43,11 @@ _BAND = 32
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 TAIL_PART = 0.97725
 """Fraction of a normal distribution that lies below the mean plus two standard deviations."""
-# Ratio of the noise of pixel sums to that for uncorrelated noise below which pixels count as uncorrelated.
+# Ratio of the noise of a sum of pixels to the value without correlation, below which correlation is
+# neglected.
 _CORRELATED = 1.05
-# Ratio of the noise's lower tail to two standard deviations below which the noise counts as clipped at zero.
+# Ratio of the lower tail of the noise to two standard deviations below which the noise is clipped at zero
+# counts.
 _CUT_OFF = 0.8
 # Noise (counts) below which quantisation prevents a measurement of the noise.
 _HIDDEN = 0.5
@@ -64,7 +67,7 @@ class Surface:
     shape: tuple[int, int]
 
     def at(self, column: npt.ArrayLike, row: npt.ArrayLike) -> FloatArray:
-        """Return the values of the surface (n,) at the pixels `column` (n,), `row` (n,)."""
+        """Return the values (n,) of the surface at n pixels, given by `column` (n,) and `row` (n,)."""
         return among_blocks(self.values, self.shape, column, row)
 
     def factors(self) -> tuple[Float32Array, Float32Array]:
@@ -149,8 +152,8 @@ def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackgroun
     tail, cut_off = _tails(lone, single.level, single.noise)
     smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
     noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
-    # Faint stars widen the upper tail of the noise, but do not add noise to the positions of stars.
-    # The upper tail of the noise is used only if the lower tail is clipped at zero counts.
+    # Faint stars widen the upper tail of the noise distribution, but do not increase the noise of star
+    # positions. The noise is increased by the upper tail only if the lower tail is clipped at zero counts.
     own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return SkyBackground(
         level,
@@ -163,7 +166,7 @@ def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackgroun
 
 
 def correlation_of(smooth: float, single: float) -> float:
-    """Return the ratio of the noise of a sum of pixels to that of a sum of independent pixels, 1 or more.
+    """Return the ratio (at least 1) of the noise of a sum of pixels to that of independent pixels.
 
     `smooth` is the noise of the smoothed frame, counts, and `single` is the noise of single pixels, counts.
     """
@@ -180,10 +183,10 @@ def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
 
 
 def without_hot_pixels(pixels: Image, most: int) -> tuple[Image, Background]:
-    """Return a frame with hot pixels replaced if it has more than `most`, and its background.
+    """Return a frame and its background; if more than `most` pixels are hot, the hot pixels are replaced.
 
-    A few hot pixels are kept, because they are measured as sources and flagged. Thousands of hot pixels of a
-    damaged sensor would replace all stars in the list of sources and increase the noise.
+    A few hot pixels are kept, because they are measured as sources and flagged. The thousands of hot pixels
+    of a damaged sensor would fill the list of sources instead of stars, and would increase the noise.
     """
     background = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE)
     row, column = hot_pixels_above(pixels, background, most)
@@ -232,7 +235,8 @@ def _smoothed_above_numpy(
         np.add(once[:-1], once[1:], out=twice)
         np.add(twice[:, :-1], twice[:, 1:], out=wide)
         np.add(wide[:, :-1], wide[:, 1:], out=smooth)
-        # A band of rows is between the centres of a few rows of blocks; all other weights are zero.
+        # A band of rows lies between the centres of a few rows of blocks, and the weights of all other blocks
+        # are zero.
         weight = down[first : first + count]
         near = np.flatnonzero(weight.any(axis=0))
         np.matmul(weight[:, near], across[near], out=bound)
@@ -302,13 +306,14 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
 
 
 def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return each block's upper noise tail relative to a normal distribution, and where noise is clipped.
+    """Return each block's relative upper noise tail, and a mask of the blocks with clipped noise.
 
     In a normal distribution, 2.3 % of the pixels of a block exceed the mean by more than two standard
     deviations, and 2.3 % are below the mean by more than two standard deviations. If a sky is clipped at zero
     counts, its moments underestimate the noise. For each block, the median over the 3 x 3 blocks around it is
-    used, because a textured foreground has a long tail while the sky beside it has not, and a few stars
-    hardly change the median. The returned relative noise tail is at least 1.
+    used, because a few stars hardly change the median. A textured foreground has a long tail, whereas the sky
+    beside it has no long tail. The upper noise tail is relative to that of a normal distribution, and is at
+    least 1.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -469,8 +474,9 @@ def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturati
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with many bright pixels.
 
-    A block has many bright pixels if their fraction exceeds `share`. Blocks that are displaced by half a
-    block along rows and columns are tested too, so that the result does not depend on where the blocks begin.
+    A block has many bright pixels if their fraction exceeds `share`. A second grid of blocks, displaced by
+    half a block along rows and columns, is also tested, so that the result does not depend on the position of
+    the grid.
     """
     down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
     found = np.zeros(len(place), dtype=bool)
@@ -484,7 +490,7 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
 
 
 def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
-    """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last pixel counts.
+    """Return which bright pixels (m,) are local maxima; of equal neighbours, only the last is a maximum.
 
     The array `index` (m,) contains the increasing indices of the bright pixels in the flattened frame. Pixels
     that are not in `index` are below the noise threshold and never exceed a bright pixel. The outermost
@@ -503,7 +509,7 @@ def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArra
     return best
 
 
-# Number of areas, the brightest first, from which a frame is classified as points or streaks.
+# Number of the brightest areas by which a frame is classified as points or streaks.
 _LOOKED_AT = 20
 _LEAST_PIXELS = 4
 _SHORTEST_STREAK = 5.0
@@ -512,7 +518,7 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Maximum median sine of the angle between streaks and image flow of one rotation; foreground lines exceed it.
+# Maximum median sine of the angle between streaks and image flow. Lines of a foreground exceed it.
 _CROOKED = 0.12
 
 
@@ -545,11 +551,12 @@ def frame_shape(areas: Areas) -> FrameShape:
 
 
 def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
-    """Return whether lines in the image follow one rotation, from `centre` (n, 2), px, and `direction` (n,).
+    """Return whether n lines in the image are parallel to the image flow of one rotation.
 
     Near the boresight, a rotation displaces the image at (x, y) by t + w (-y, x), with a vector t and a
-    number w. If a line in the image follows the flow of a rotation, the flow has no component along the
-    line's normal. The best t and w follow from a singular value decomposition of the normal components.
+    number w. If a line in the image is parallel to the flow of a rotation, the component of the flow along
+    the line's normal is zero. The best t and w follow from a singular value decomposition of the normal
+    components.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0

@@ -2,8 +2,7 @@
 
 The default index is built at its first use, which takes some seconds, and is stored in the cache folder
 $XDG_CACHE_HOME/knightcube or ~/.cache/knightcube. On board, the installer builds the index, and the
-configuration names its path. `knightcube index --camera CONFIG` builds the index for a mission's
-camera.
+configuration contains its path. `knightcube index --camera CONFIG` builds the index for a mission's camera.
 """
 
 from __future__ import annotations
@@ -41,9 +40,9 @@ class IndexSettings:
         epoch: Julian year of the directions; the method `SkyIndex.at` changes the epoch.
         resolution: angle below which two stars are merged, rad.
         smallest, largest: limits of the longest side of a triangle, rad.
-        density: number of stars that count as bright around a triangle whose longest side is 2.5 deg. For
-            larger triangles, more stars count as bright, so that every octave of size has about the same
-            number of triangles.
+        density: number of stars in the neighbourhood of a triangle with a longest side of 2.5 deg that count
+            as bright. For larger triangles, more stars count as bright, so that every octave of size has
+            about the same number of triangles.
         few: number of brightest stars per circle on the sky; the index always contains the triangles of these
             stars.
     """
@@ -109,7 +108,7 @@ def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
 
 
 def ensure_default_index() -> None:
-    """Build the default sky index if it is missing, so that a flight does not have to wait for it."""
+    """Build the default sky index if it is missing, so that its later use causes no delay."""
     if not PATH.exists():
         default_index()
 

@@ -3,7 +3,7 @@
 The file begins with a header, which contains 8 magic bytes that identify the kind of table, the version
 (uint32), the CRC-32 of everything after the header (uint32), and the length of the table of contents
 (uint32). The table of contents is in JSON format and is followed by the columns, which are little-endian and
-begin at multiples of 64 bytes. A file with the same columns always has the same bytes.
+begin at multiples of 64 bytes. The same columns always give a file with the same bytes.
 
 Guide stars are the catalogue stars as a given lens resolves them (Michalski, section 3.3). Proper motion is
 applied up to the epoch of observation. Stars that an image cannot resolve are merged into one star at their
@@ -14,11 +14,11 @@ The index contains only triangles of stars that are bright relative to the size 
 a star is its distance from the `rank`-th nearest of all stars that are brighter than the star itself. A star
 is among the `rank` brightest stars of every circle around the star whose radius is below its reach. The index
 contains a triangle if its longest side is at most the reach of each of its stars. The index does not depend
-on the field of view: in frames of any field of view, about the same number of triangles of their brightest
-stars are found. Every part of the sky has about the same number of stars with a given reach, so dense regions
-do not add triangles. Near a cluster of bright stars, no star has a long reach. To cover the neighbourhood of
-such clusters, the index also contains the triangles of the `few` brightest stars of circles of several radii
-that cover the sky.
+on the field of view. About the same number of triangles of the brightest stars is found in frames of any
+field of view. Every part of the sky has about the same number of stars with a given reach, so dense regions
+do not add triangles. Near a cluster of bright stars, all stars have a short reach. To cover the neighbourhood
+of such clusters, the index also contains the triangles of the `few` brightest stars of circles of several
+radii that cover the sky.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
 first part of a key is the orientation (left or right) of the triangle's corners, ordered by the lengths of
@@ -57,7 +57,7 @@ Facts = dict[str, float]
 _HEADER = struct.Struct("<8sIII")
 _ALIGNMENT = 64
 _UNFIT = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, SyntaxError)
-"""Exceptions that reading a file with invalid contents but a correct checksum may raise."""
+"""Exceptions that may be raised if a file with a correct checksum has invalid contents."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +66,9 @@ class TableKind:
 
     Attributes:
         magic: first 8 bytes of a file of this kind.
-        version: version of the columns.
+        version: version of the layout of the columns.
         name: name of this kind of table in messages.
-        cure: advice that is added to messages about a file that cannot be used.
+        cure: advice to the user that is added to messages about an unusable file.
     """
 
     magic: bytes
@@ -83,7 +83,7 @@ class TableKind:
 
 
 def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> None:
-    """Write a table of `columns` and of single numbers (`facts`) atomically to the file `path`."""
+    """Write a table of `columns` and single numbers (`facts`) to the file `path`, in one atomic operation."""
     little = {name: _little(column) for name, column in columns.items()}
     contents: dict[str, Any] = {"facts": facts, "columns": {}}
     offset = 0
@@ -95,7 +95,7 @@ def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> N
     body = bytearray(table)
     for column in little.values():
         body += column.tobytes() + b"\0" * (-column.nbytes % _ALIGNMENT)
-    # Two processes may write at once, so each process writes a file of its own and then renames it.
+    # Two processes may write at the same time. Each process therefore writes a separate file and renames it.
     temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
     temporary.write_bytes(_HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table)) + bytes(body))
     temporary.replace(path)
@@ -183,7 +183,8 @@ def choose_guide_stars(
     centre = np.stack(
         [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
     )
-    # A group has the number of its first member, the brightest star, because the catalogue is sorted.
+    # The number of a group is the index of its first member. This member is the brightest, because the
+    # catalogue is sorted by magnitude.
     first = np.flatnonzero(group == np.arange(len(catalogue)))
     magnitude = -2.5 * np.log10(joint[first])
     seen = np.flatnonzero(magnitude < faintest)
@@ -211,22 +212,23 @@ CELL = 1.0 / CELLS
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Resolution with which a triangle's key stores the longest side, a chord below 1."""
+"""Resolution of the longest side (a chord below 1) in the key of a triangle."""
 RUN_BITS = 12
-"""Binary logarithm of the interval of key values between two entries of `TriangleIndex.below`."""
-# Number of boxes along each axis of the cube in which guide stars are found by their direction.
+"""Binary logarithm of the interval between the key values of two entries of `TriangleIndex.below`."""
+# Number of boxes along each axis of the cube around the unit sphere, which is divided to find stars by
+# direction.
 _BOXES = 20
 TIE = 1e-9
-"""Relative tolerance in comparisons of a triangle's side with a limit, which the side may exactly equal."""
+"""Relative tolerance in comparisons of a triangle's side with a limit, because the two may be equal."""
 LEAST_RATIO = 0.1
-"""Minimum ratio of the shortest to the longest side of a triangle; flatter triangles are not distinctive."""
+"""Minimum ratio of the shortest to the longest side of a triangle. Flatter triangles are not distinctive."""
 
 
 # Distance between the centres of neighbouring circles that together cover the sky, relative to their radius.
 _CIRCLES_APART = 0.7
-# Mean number of stars per circle that are searched first, relative to the number of stars needed.
+# Mean number of stars per circle in the first search, relative to the number of stars needed.
 _ENOUGH = 4.0
-# Mean number of the brightest stars within the smallest useful reach of a star, relative to the rank.
+# Mean number of the brightest stars within the smallest useful reach, relative to the rank.
 _BRIGHTER = 2.0
 
 
@@ -251,7 +253,7 @@ class TriangleIndex:
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """The number of keys below each multiple of 2^RUN_BITS (f,), for finding keys without a search."""
+        """The number of keys below each multiple of 2^RUN_BITS (f,), by which keys are looked up."""
         run = self.key >> np.uint32(RUN_BITS)
         count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
@@ -276,15 +278,15 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
     """Return the reach of each star (n,): the chord to its `rank`-th nearest brighter star.
 
     The reach is at most `farthest`, which is also the reach of a star with fewer than `rank` brighter stars.
-    For many of the stars with a reach below `least`, the result is zero. The unit vectors `direction` (n, 3)
-    are in order of brightness, the brightest first.
+    The result may be zero for a star with a reach below `least`. The unit vectors `direction` (n, 3) are in
+    order of brightness, the brightest first.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     count = len(direction)
     result = np.full(count, farthest)
     wanted = np.arange(count)
-    # Most stars have a small reach, which the brightest stars of the sky show in little time.
+    # Most stars have a small reach. A fast comparison with the brightest stars of the sky shows which stars.
     brightest = math.ceil(4.0 * _BRIGHTER * rank / least**2) if least > 0.0 else count
     if brightest < count:
         near = cKDTree(direction[:brightest]).query_ball_point(
@@ -338,7 +340,7 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
-    # Most circles contain enough of the sky's brightest stars; for other circles all stars are searched.
+    # Most circles contain enough of the sky's brightest stars. For the other circles, all stars are searched.
     brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
     for count in sorted({brightest, len(direction)}):
@@ -357,7 +359,7 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
 
 
 def _distinct(corners: IntArray) -> IntArray:
-    """Return the distinct rows of triangles (m, 3) in ascending order; an index holds at most 2^16 stars."""
+    """Return the distinct rows of triangles (m, 3) in ascending order; there are at most 2^16 stars."""
     one, two, three = corners.T
     packed = np.sort((one << 32) + (two << 16) + three)
     packed = packed[np.diff(packed, prepend=-1) > 0]
@@ -463,7 +465,7 @@ class SkyIndex:
     Attributes:
         stars: guide stars at the epoch of the index.
         motion: proper motion of each guide star as the change of its unit vector (n, 3), rad/yr, float32.
-        triangles: triangles of guide stars, sorted by shape and size.
+        triangles: triangles of guide stars, sorted by their keys.
     """
 
     stars: GuideStars
@@ -477,10 +479,10 @@ class SkyIndex:
 
     @cached_property
     def boxes(self) -> tuple[npt.NDArray[np.int32], FloatArray, npt.NDArray[np.int32]]:
-        """The guide stars (n,) sorted by box, their directions (n, 3), and the number before each box.
+        """The guide stars (n,) sorted by box, their directions (n, 3), and the index of each box's first star.
 
-        The cube around the unit sphere is divided into boxes, as many along each axis. The stars of a box are
-        in order of brightness, the brightest first.
+        The cube around the unit sphere is divided into equally many boxes along each axis. The stars of a box
+        are in order of brightness, the brightest first.
         """
         x, y, z = np.minimum(((self.stars.direction + 1.0) * (0.5 * _BOXES)).astype(np.int64), _BOXES - 1).T
         box = (x * _BOXES + y) * _BOXES + z
