@@ -691,7 +691,7 @@ def _pair(
 
 @loop_helper
 def _widest_difference(seen: FloatArray, reach: float) -> float:
-    """Return a bound of the difference between the tangents of two stars, one of `seen`, at most `reach` apart.
+    """Return a bound of the difference between the tangents of two stars at most `reach` apart.
 
     A gnomonic image is enlarged by at most 1 + t^2 between two stars, where t is the larger field angle's
     tangent.
