@@ -366,15 +366,42 @@ def among_blocks(
 ) -> FloatArray:
     """Return block values (down, across) interpolated bilinearly at n pixels, (n,).
 
-    The blocks divide a frame of `shape`, and the pixels are at `column` (n,) and `row` (n,).
+    The blocks divide a frame of `shape`, and the pixels are at `column` (n,) and `row` (n,), of any shape.
     """
-    top, down = place_among_blocks(np.asarray(row, dtype=float), shape[0], values.shape[0])
-    left, across = place_among_blocks(np.asarray(column, dtype=float), shape[1], values.shape[1])
+    x, y = (np.ascontiguousarray(place, dtype=float) for place in (column, row))
+    return _among_blocks(np.ascontiguousarray(values), *shape, x.ravel(), y.ravel()).reshape(np.shape(column))
+
+
+def _among_blocks_numpy(
+    values: FloatArray, rows: int, columns: int, column: FloatArray, row: FloatArray
+) -> FloatArray:
+    """See `among_blocks`; the frame has `rows` and `columns`."""
+    top, down = place_among_blocks(row, rows, values.shape[0])
+    left, across = place_among_blocks(column, columns, values.shape[1])
     bottom = np.minimum(top + 1, values.shape[0] - 1)
     right = np.minimum(left + 1, values.shape[1] - 1)
     high = values[top, left] * (1.0 - across) + values[top, right] * across
     low = values[bottom, left] * (1.0 - across) + values[bottom, right] * across
     return np.asarray(high * (1.0 - down) + low * down)
+
+
+@compiled_form_of(_among_blocks_numpy)
+def _among_blocks(
+    values: FloatArray, rows: int, columns: int, column: FloatArray, row: FloatArray
+) -> FloatArray:
+    """See `_among_blocks_numpy`."""
+    down, across = values.shape
+    height, width, found = rows // down, columns // across, np.empty(len(row))
+    for k in range(len(row)):
+        y, x = (row[k] - 0.5 * (height - 1)) / height, (column[k] - 0.5 * (width - 1)) / width
+        y, x = min(y if y > 0.0 else 0.0, down - 1.0), min(x if x > 0.0 else 0.0, across - 1.0)
+        top, left = int(y), int(x)
+        bottom, right = min(top + 1, down - 1), min(left + 1, across - 1)
+        y, x = y - top, x - left
+        high = values[top, left] * (1.0 - x) + values[top, right] * x
+        low = values[bottom, left] * (1.0 - x) + values[bottom, right] * x
+        found[k] = high * (1.0 - y) + low * y
+    return found
 
 
 def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
@@ -622,7 +649,7 @@ _PAIR, _PAIR_NOISE = 20.0, 1.0
 The first value is the minimum brightness of the brightest pixel. The second value is the number of standard
 deviations by which noise may raise the third brightest pixel.
 """
-_REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
+_REPAIR_SIGMAS, HOT_SIGMAS = 10.0, 8.0
 """Minimum brightness (noise standard deviations) of replaced hot pixels, and of excluded hot pixels."""
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
@@ -650,11 +677,8 @@ def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]
 
 def _hot_places_numpy(signal: Image, variance: Image, least: float) -> tuple[IntArray, IntArray]:
     """See `find_hot_pixels`; `least` is the least variance."""
-    row, column = positions(signal > np.float32(_HOT_SIGMAS * np.sqrt(least)))
-    noise = np.sqrt(variance[row, column])
-    bright = signal[row, column] > _HOT_SIGMAS * noise
-    row, column, _ = _hot(signal, row[bright], column[bright], noise[bright])
-    return row, column
+    row, column = positions(signal > np.float32(HOT_SIGMAS * np.sqrt(least)))
+    return _hot_among_numpy(signal, row, column, np.sqrt(variance[row, column]), np.zeros(len(row)))
 
 
 @compiled_form_of(_hot_places_numpy)
@@ -662,26 +686,26 @@ def _hot_places(signal: Image, variance: Image, least: float) -> tuple[IntArray,
     """See `_hot_places_numpy`."""
     rows, columns = signal.shape
     found, count = np.empty((2, rows * columns), dtype=np.int64), 0
-    lowest = np.float32(_HOT_SIGMAS * math.sqrt(least))
+    lowest = np.float32(HOT_SIGMAS * math.sqrt(least))
     for row in range(1, rows - 1):
         for column in range(1, columns - 1):
             own = signal[row, column]
-            if own > lowest and _is_hot(signal, row, column, math.sqrt(variance[row, column])):
+            if own > lowest and _is_hot(signal, row, column, math.sqrt(variance[row, column]), 0.0):
                 found[0, count], found[1, count] = row, column
                 count += 1
     return found[0, :count].copy(), found[1, :count].copy()
 
 
 @loop_helper
-def _is_hot(signal: Image, row: int, column: int, noise: float) -> bool:
+def _is_hot(signal: Image, row: int, column: int, noise: float, level: float) -> bool:
     """Return whether one pixel, not at the border of the frame, is hot, by the criteria of `are_hot`."""
-    own = signal[row, column]
-    if own <= _HOT_SIGMAS * noise:
+    own = float(signal[row, column]) - level
+    if own <= HOT_SIGMAS * noise:
         return False
     brighter, highest, second, third = 0, -np.inf, -np.inf, -np.inf
     for r in range(row - 1, row + 2):
         for c in range(column - 1, column + 2):
-            value = float(signal[r, c])
+            value = float(signal[r, c]) - level
             brighter += value > own
             if value > highest:
                 highest, second, third = value, highest, second
@@ -692,67 +716,6 @@ def _is_hot(signal: Image, row: int, column: int, noise: float) -> bool:
     alone = second < min(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
     pair = highest > _PAIR * noise and third < _SHARPNESS * highest + _PAIR_NOISE * noise
     return brighter <= 1 and (alone or pair)
-
-
-def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the hot pixels of a frame (rows, columns), as `find_hot_pixels` does.
-
-    Only the pixels that exceed the lowest threshold of the surrounding blocks are tested, so that the
-    background is not interpolated at every pixel. The returned arrays are empty if at most `most` pixels
-    exceed this threshold.
-    """
-    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
-
-    columns = pixels.shape[1]
-    # Between block centres, level and noise are interpolated with those of the adjacent blocks.
-    limit = background.level + _HOT_SIGMAS * background.noise
-    lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
-    if np.issubdtype(pixels.dtype, np.integer):
-        # Integer pixels are compared with an integer threshold, which is four times as fast as in floating
-        # point.
-        lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
-    lowest = lowest.astype(pixels.dtype)
-    row, column = np.divmod(_bright_indices(np.ascontiguousarray(pixels), lowest), columns)
-    if len(row) <= most:
-        return row[:0], column[:0]
-    level, noise = (
-        among_blocks(grid, background.shape, column, row) for grid in (background.level, background.noise)
-    )
-    bright = pixels[row, column] - level > _HOT_SIGMAS * noise
-    row, column, level, noise = row[bright], column[bright], level[bright], noise[bright]
-    row, column, _ = _hot(pixels, row, column, noise, level)
-    return row, column
-
-
-def _bright_indices_numpy(pixels: Image, lowest: Image) -> IntArray:
-    """Return the flat indices (m,) of the pixels that reach the threshold `lowest` of their block.
-
-    Rows and columns beyond the last whole block belong to the last blocks.
-    """
-    (rows, columns), (down, across) = pixels.shape, lowest.shape
-    height, owner = rows // down, np.minimum(np.arange(columns) // (columns // across), across - 1)
-    found: list[IntArray] = []
-    for block in range(down):
-        first, last = block * height, rows if block == down - 1 else (block + 1) * height
-        found.append(np.flatnonzero(pixels[first:last] >= lowest[block, owner]) + first * columns)
-    return np.concatenate(found)
-
-
-@compiled_form_of(_bright_indices_numpy)
-def _bright_indices(pixels: Image, lowest: Image) -> IntArray:
-    """See `_bright_indices_numpy`."""
-    (rows, columns), (down, across) = pixels.shape, lowest.shape
-    found, count = np.empty(rows * columns, dtype=np.int64), 0
-    for row in range(rows):
-        of_row = lowest[min(row // (rows // down), down - 1)]
-        for block in range(across):
-            limit, first = of_row[block], block * (columns // across)
-            last = columns if block == across - 1 else first + columns // across
-            for column in range(first, last):
-                if pixels[row, column] >= limit:
-                    found[count] = row * columns + column
-                    count += 1
-    return found[:count].copy()
 
 
 def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
@@ -767,21 +730,35 @@ def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
     return np.asarray(alone | pair)
 
 
-def _hot(
-    signal: Image, row: IntArray, column: IntArray, noise: FloatArray, level: FloatArray | float = 0.0
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows and columns of the hot pixels among m pixels, and the eight neighbours (8, k) of each.
+def _hot_among_numpy(
+    signal: Image, row: IntArray, column: IntArray, noise: FloatArray, level: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the hot pixels among m pixels that are well above their `noise` (m,).
 
     The background `level` (m,) is subtracted from each of the m pixels and from its neighbours.
     """
     inside = (row > 0) & (row < signal.shape[0] - 1) & (column > 0) & (column < signal.shape[1] - 1)
-    level = np.broadcast_to(level, row.shape)[inside]
-    row, column, noise = row[inside], column[inside], noise[inside]
+    inside &= signal[row, column] - level > HOT_SIGMAS * noise
+    row, column, noise, level = row[inside], column[inside], noise[inside], level[inside]
     around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND]) - level
     own = signal[row, column] - level
     # A hot pixel has at most one brighter neighbour, because up to two adjacent pixels can be hot.
     hot = are_hot(np.concatenate([around, own[None]]), noise) & (np.count_nonzero(around > own, axis=0) <= 1)
-    return row[hot], column[hot], around[:, hot]
+    return row[hot], column[hot]
+
+
+@compiled_form_of(_hot_among_numpy)
+def hot_among(
+    signal: Image, row: IntArray, column: IntArray, noise: FloatArray, level: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """See `_hot_among_numpy`."""
+    found, count = np.empty(len(row), dtype=np.int64), 0
+    for k in range(len(row)):
+        inside = 0 < row[k] < signal.shape[0] - 1 and 0 < column[k] < signal.shape[1] - 1
+        if inside and _is_hot(signal, row[k], column[k], noise[k], level[k]):
+            found[count] = k
+            count += 1
+    return row[found[:count]], column[found[:count]]
 
 
 _DEAD_FRACTION = 1e-4

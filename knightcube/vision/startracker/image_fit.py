@@ -216,10 +216,19 @@ class _Seen:
         """Return the pose with the smallest sum of the stars' chi-squares, weighted with `weight` (n,)."""
         bends, known = len(self.unknowns.bend), self.before
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
-        given = np.ascontiguousarray(self.observed), self.whitener, np.ascontiguousarray(self.reference)
-        first = np.ascontiguousarray(start.matrix), float(start.scale), held, self.unknowns.scale
         try:
-            agreed, matrix, scale, held, inverse = _fitted(*given, self.late, weight, known, *first)
+            agreed, matrix, scale, held, inverse = _fitted(
+                np.ascontiguousarray(self.observed),
+                self.whitener,
+                np.ascontiguousarray(self.reference),
+                self.late,
+                weight,
+                known,
+                np.ascontiguousarray(start.matrix),
+                float(start.scale),
+                held,
+                self.unknowns.scale,
+            )
         except np.linalg.LinAlgError as error:
             raise AttitudeError(f"{len(weight)} stars are too close together for an attitude") from error
         if not agreed:
@@ -271,7 +280,7 @@ def _fitted_numpy(
         normal, gradient = _normal(whitener, seen, reference @ matrix.T, late, free_scale, bends)
         normal[last, last] += known
         gradient[last] += known * held
-        inverse = np.linalg.inv(normal)
+        inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         step = -inverse @ gradient
         if not np.all(np.abs(step[:first]) < 1.0):
             return False, matrix, scale, held, inverse
@@ -330,7 +339,7 @@ def _fitted(
         for k in range(len(known)):
             normal[first + k, first + k] += known[k]
             gradient[first + k] += known[k] * held[k]
-        inverse = np.linalg.inv(normal)
+        inverse[:] = np.linalg.inv(normal)
         longest, sound = 0.0, True
         for i in range(count):
             step[i] = 0.0

@@ -12,7 +12,6 @@ from knightcube.astro.arrays import BoolArray
 from knightcube.vision import frame
 from knightcube.vision.frame import (
     FrameState,
-    _bright_indices,
     _clipped_moments,
     are_hot,
     at_least,
@@ -20,7 +19,6 @@ from knightcube.vision.frame import (
     estimate_background,
     find_hot_pixels,
     frame_state,
-    hot_pixels_above,
     in_steps,
     interpolation_weights,
     label_pixels,
@@ -31,6 +29,7 @@ from knightcube.vision.frame import (
     saturation_level,
     saturation_of_bright,
 )
+from knightcube.vision.startracker.detection.survey import _bright_indices, hot_pixels_above
 from knightcube.vision.streaks.faint_stars import less_boxes
 from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import rate_at, star_camera, star_frame
@@ -363,3 +362,15 @@ def test_the_compiled_hot_pixels_are_those_of_numpy_among_pairs_and_squares() ->
     signal[draw.random(signal.shape) < 0.05] += 60.0
     signal[draw.random(signal.shape) < 0.05] += 25.0
     assert_forms_agree(frame._hot_places, signal, np.ones_like(signal), 1.0)
+    row, column = np.divmod(np.flatnonzero(signal > 5.0), 50)
+    noise, level = draw.uniform(0.5, 1.5, len(row)), draw.normal(0.0, 1.0, len(row))
+    for pixels in (signal, np.clip(signal + 20.0, 0.0, 255.0).astype(np.uint8)):
+        assert_forms_agree(frame.hot_among, pixels, row, column, noise, level)
+    assert len(frame.hot_among.numpy_form(signal, row, column, noise, level)[0]) > 20
+
+
+@pytest.mark.parametrize("blocks", [(1, 1), (3, 4)])
+def test_the_compiled_interpolation_between_blocks_equals_that_in_numpy(blocks: tuple[int, int]) -> None:
+    draw = np.random.default_rng(blocks)
+    row, column = draw.uniform(-20.0, 90.0, (2, 200))
+    assert_forms_agree(frame._among_blocks, draw.normal(size=blocks), 63, 70, column, row)

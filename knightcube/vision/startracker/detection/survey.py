@@ -22,11 +22,12 @@ import numpy.typing as npt
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.frame import (
+    HOT_SIGMAS,
     MAD_TO_SIGMA,
     Background,
     among_blocks,
     estimate_background,
-    hot_pixels_above,
+    hot_among,
     interpolation_weights,
     label_pixels,
     moments,
@@ -197,6 +198,64 @@ def without_hot_pixels(pixels: Image, most: int) -> tuple[Image, Background]:
     beside = np.stack([pixels[row + dr, column + dc] for dr, dc in around])
     repaired[row, column] = np.median(beside, axis=0).astype(pixels.dtype)
     return repaired, estimate_background(repaired, _SKY_BLOCK, _SINGLE_STRIDE)
+
+
+def hot_pixels_above(pixels: Image, background: Background, most: int) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the hot pixels of a frame (rows, columns), as `find_hot_pixels` does.
+
+    Only the pixels that exceed the lowest threshold of the surrounding blocks are tested, so that the
+    background is not interpolated at every pixel. The returned arrays are empty if at most `most` pixels
+    exceed this threshold.
+    """
+    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
+
+    columns = pixels.shape[1]
+    # Between block centres, level and noise are interpolated with those of the adjacent blocks.
+    limit = background.level + HOT_SIGMAS * background.noise
+    lowest = ndimage.minimum_filter(limit, size=3, mode="nearest")
+    if np.issubdtype(pixels.dtype, np.integer):
+        # Integer pixels are compared with an integer threshold, which is four times as fast as in floating
+        # point.
+        lowest = np.clip(np.ceil(lowest), np.iinfo(pixels.dtype).min, np.iinfo(pixels.dtype).max)
+    lowest = lowest.astype(pixels.dtype)
+    row, column = np.divmod(_bright_indices(np.ascontiguousarray(pixels), lowest), columns)
+    if len(row) <= most:
+        return row[:0], column[:0]
+    level, noise = (
+        among_blocks(grid, background.shape, column, row) for grid in (background.level, background.noise)
+    )
+    return hot_among(pixels, row, column, noise, level)
+
+
+def _bright_indices_numpy(pixels: Image, lowest: Image) -> IntArray:
+    """Return the flat indices (m,) of the pixels that reach the threshold `lowest` of their block.
+
+    Rows and columns beyond the last whole block belong to the last blocks.
+    """
+    (rows, columns), (down, across) = pixels.shape, lowest.shape
+    height, owner = rows // down, np.minimum(np.arange(columns) // (columns // across), across - 1)
+    found: list[IntArray] = []
+    for block in range(down):
+        first, last = block * height, rows if block == down - 1 else (block + 1) * height
+        found.append(np.flatnonzero(pixels[first:last] >= lowest[block, owner]) + first * columns)
+    return np.concatenate(found)
+
+
+@compiled_form_of(_bright_indices_numpy)
+def _bright_indices(pixels: Image, lowest: Image) -> IntArray:
+    """See `_bright_indices_numpy`."""
+    (rows, columns), (down, across) = pixels.shape, lowest.shape
+    found, count = np.empty(rows * columns, dtype=np.int64), 0
+    for row in range(rows):
+        of_row = lowest[min(row // (rows // down), down - 1)]
+        for block in range(across):
+            limit, first = of_row[block], block * (columns // across)
+            last = columns if block == across - 1 else first + columns // across
+            for column in range(first, last):
+                if pixels[row, column] >= limit:
+                    found[count] = row * columns + column
+                    count += 1
+    return found[:count].copy()
 
 
 def find_bright(pixels: Image, sky: SkyBackground, sigmas: float) -> BrightPixels:
