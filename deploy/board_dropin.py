@@ -124,7 +124,9 @@ def _network(peers: Sequence[IPv4Network]) -> list[str]:
 
 
 def _text(lines: list[str]) -> str:
-    first = "# Made by install.sh from the configuration: run it again when devices or network change there."
+    first = (
+        "# Written by install.sh from the configuration: run it again after a change of devices or network."
+    )
     return "\n".join([first, *lines]) + "\n"
 
 
@@ -175,7 +177,7 @@ def _bus(config: Config) -> list[str]:
 def check_single(path: Path) -> None:
     """Raise ConfigError for a configuration that extends another file, which its checksum does not cover."""
     if len(read_document(read_text(path), str(path)).chain) > 1:
-        problem = "its checksum covers one file: write it as one file by `knightcube check FILE --merged NEW`"
+        problem = "the checksum covers a single file: merge the files by `knightcube check FILE --merged NEW`"
         raise ConfigError(str(path), f"`extends` cannot be used on a board: {problem}")
 
 

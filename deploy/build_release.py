@@ -259,7 +259,9 @@ def main(words: list[str]) -> int:
     parser.add_argument("--python", default="python3")
     parser.add_argument("--wheels", default="")
     parser.add_argument("--venv", default="")
-    parser.add_argument("--reuse", default="", metavar="RELEASE", help="take the packages of this release")
+    parser.add_argument(
+        "--reuse", default="", metavar="RELEASE", help="copy the installed packages of this release"
+    )
     parser.add_argument("--dry-run", action="store_true")
     options = parser.parse_args(words)
     if options.action == "build":

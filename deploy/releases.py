@@ -152,9 +152,11 @@ def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
     found = [release for release in (current, previous) if release is not None]
     if not found:
         return None, ""
-    reasons = [] if current is not None else ["the symbolic link `current` names no complete release"]
+    reasons = (
+        [] if current is not None else ["the symbolic link `current` does not point to a complete release"]
+    )
     if len(found) > 1 and trials.failed(found[0]) and not trials.failed(found[1]):
-        reasons.append(f"release {found[0].name} ended {UNCLEAN} times before a flight lasted a minute")
+        reasons.append(f"release {found[0].name} ended {UNCLEAN} times within a minute of its start")
         found.reverse()
     chosen = found[0]
     for release in found:

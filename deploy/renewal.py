@@ -590,7 +590,11 @@ class Renewal:
             if done.returncode == 0:
                 return dict(json.loads(done.stdout))
             problems += done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
-        raise Refused(problems[0] if problems else "no release or no root.json is installed")
+        raise Refused(
+            problems[0]
+            if problems
+            else "no release is installed, or root.json is missing: run deploy/install.sh"
+        )
 
     def _confirm(self, name: str, kind: str) -> None:
         """End the trial and keep the new version. Raises Refused."""
@@ -599,7 +603,7 @@ class Renewal:
             raise Refused(f"no {kind} is on trial")
         board = self._board
         if board.active(SAFE) or not (board.active(FLIGHT) and board.active(LINK)):
-            raise Refused("flight or link is not up: confirm it when both are")
+            raise Refused("flight or link is not running: confirm the trial when both run")
         if other := self._other_release(trial):
             raise Refused(f"flight or link run release {other} instead")
         state.versions[kind] = trial.version
@@ -731,9 +735,9 @@ class Renewal:
         trial.left_s -= self._elapsed
         other = self._other_release(trial) if up else ""
         if board.active(SAFE):
-            self._begin_revert("the flight ended five times in a minute")
+            self._begin_revert("the flight software ended five times in a minute")
         elif trial.down_s >= DOWN_S:
-            self._begin_revert(f"flight or link were not up for {DOWN_S:.0f} s")
+            self._begin_revert(f"flight or link did not run for {DOWN_S:.0f} s")
         elif other:
             self._begin_revert(f"flight or link run release {other} instead")
         elif contact.get("fault") and contact["session"] != trial.session and not trial.despite_faults:

@@ -96,7 +96,9 @@ class SafeState:
         self._seen = [*self._seen[-63:], data]
         self._count += 1
         left = max(0.0, self.due - now)
-        text = text or f"{name}: safe state, flight tried in {left:.0f} s, try {self._tries.number}"
+        text = (
+            text or f"{name}: safe state, start {self._tries.number} of the flight software in {left:.0f} s"
+        )
         say(text)
         return pack(obeyed, name, self._count, text)
 
@@ -139,7 +141,7 @@ def listen(path: str) -> socket.socket | None:
         ears.setblocking(False)
         return ears
     except OSError as error:
-        say(f"{path} cannot be listened to: {error.strerror}")
+        say(f"cannot listen on {path}: {error.strerror}")
         return None
 
 
@@ -159,7 +161,7 @@ def serve(state: SafeState, path: str) -> None:
         if now >= zero_due:
             acknowledged = coils_off()
             if acknowledged is not zeroed:
-                say("coils at zero" if acknowledged else "the coils' chip does not answer")
+                say("coils at zero" if acknowledged else "the coils' PWM chip does not answer")
             zeroed = acknowledged
             zero_due = time.monotonic() + (COILS_S if zeroed else RETRY_S)
             # A socket whose file was removed is replaced.
@@ -182,10 +184,10 @@ def main() -> int:
     now = time.monotonic()
     tries = Tries(os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], now)
     state = SafeState(tries, now)
-    say(f"the flight ended too often; attempt {tries.number} in {state.due - now:.0f} s")
+    say(f"the flight software ended too often: start {tries.number} in {state.due - now:.0f} s")
     serve(state, os.environ.get("KNIGHTCUBE_COMMANDS", ""))
     tries.keep(time.monotonic())
-    say(f"the flight is started again, attempt {tries.number}")
+    say(f"the flight software is started again, start {tries.number}")
     return 0
 
 

@@ -340,7 +340,9 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
         parts.append(SensorPart(sensor.part, partial(_started, part, rig, sensor), axes))
         measured |= set(axes)
     if "magnetic" not in measured:
-        raise ConfigError(f"{kind}.sensors", "lack the magnetic field: add a sensor of `magnetic`")
+        raise ConfigError(
+            f"{kind}.sensors", "do not measure the magnetic field: add a sensor that measures `magnetic`"
+        )
     known = unit.calibration
     settings = SensorUnitSettings(
         mounting=attitude_matrix(np.array(unit.mounting)),

@@ -663,7 +663,7 @@ def open_unix(path: Path) -> DatagramChannel:
         bound = _bound_unix(path)
     except OSError as error:
         reason = error.strerror or error
-        raise UsageError(f"commands.socket: {path} cannot be listened to: {reason}") from error
+        raise UsageError(f"commands.socket: cannot listen on {path}: {reason}") from error
     return DatagramChannel("socket", bound, path)
 
 
@@ -700,7 +700,7 @@ def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> Datagr
         bound.bind((host, int(port)))
     except (OSError, OverflowError) as error:
         bound.close()
-        raise UsageError(f"commands.udp: {address} cannot be listened to: {error}") from error
+        raise UsageError(f"commands.udp: cannot listen on {address}: {error}") from error
     _filter_datagrams(bound, IDENTIFIERS, peers)
     return DatagramChannel("udp", bound, peers=peers)
 

@@ -577,7 +577,9 @@ class Sealer:
         with self._vault.locked():
             entry = self._vault.read(self._name)
             if entry is None:
-                raise FlightError(f"both copies of the counter of SPI {self._spi} are lost: use its reserve")
+                raise FlightError(
+                    f"both copies of the counter of SPI {self._spi} are lost: use the reserve SPI"
+                )
             reserved = replace(entry, unused=entry.unused + self._block)
             if reserved.unused > HIGHEST_COUNTER:
                 raise FlightError(f"the counters of SPI {self._spi} are used up: change its key")

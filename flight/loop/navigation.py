@@ -328,7 +328,7 @@ class Navigation:
         if agreement.holds:
             self._agreed_ns = reading.time_ns
         if agreement.objection:
-            text = f"{agreement.objection} disagree with the estimate"
+            text = f"{agreement.objection} disagrees with the estimate"
             self._events.report(events.IMU_REFUSED, reading.arrival_ns, text)
 
     def _watch_line(self, now_ns: int) -> None:

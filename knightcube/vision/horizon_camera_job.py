@@ -106,7 +106,7 @@ def _sun(job: HorizonCameraJob) -> MeasuredDirection | None:
     from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
     from knightcube.vision.sun import LINEAR, SunSettings, sun_of_cameras  # noqa: PLC0415 - see the top
 
-    coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
+    coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the solar strings deliver no readings")
     if job.strings is not None:
         coarse = coarse_sun(job.strings[1], job.strings[0], _expected_nadir(job.knowledge))
     frames = {number: image for number, image in job.frames.items() if number not in job.earth_only}

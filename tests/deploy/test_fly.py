@@ -150,10 +150,14 @@ def test_a_damaged_record_keeps_releases_py_from_nothing(
     [
         pytest.param(_sparse, "is not a regular file of at most", id="sparse"),
         pytest.param(
-            _fifo, f"the symbolic link `current` names no complete release; {FIRST} flies", id="a FIFO"
+            _fifo,
+            f"the symbolic link `current` does not point to a complete release; {FIRST} flies",
+            id="a FIFO",
         ),
         pytest.param(
-            Path.unlink, f"the symbolic link `current` names no complete release; {FIRST} flies", id="missing"
+            Path.unlink,
+            f"the symbolic link `current` does not point to a complete release; {FIRST} flies",
+            id="missing",
         ),
     ],
 )

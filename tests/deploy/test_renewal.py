@@ -83,7 +83,7 @@ def test_a_unit_that_does_not_come_up_ends_the_trial(board: RenewedBoard, unit: 
     assert board.flown() == "second", "it may still come"
     board.step(100.0)
     assert board.flown() == before
-    assert "were not up for 180 s" in board.reports(request)[-1][1]
+    assert "did not run for 180 s" in board.reports(request)[-1][1]
 
 
 def test_nothing_is_confirmed_while_the_flight_is_down(board: RenewedBoard) -> None:

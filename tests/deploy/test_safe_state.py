@@ -40,9 +40,9 @@ def test_its_packets_are_those_of_the_tables() -> None:
 @pytest.mark.parametrize(
     ("command", "obeyed", "due", "text"),
     [
-        (Ping(7), 1, 130.0, "ping: safe state, flight tried in 20 s, try 1"),
-        (ChangeMode(Mode.HOLD), 1, 110.0, "mode: safe state, flight tried in 0 s, try 1"),
-        (ChangeMode(Mode.SAFE), 1, 3710.0, "safe: safe state, flight tried in 3600 s, try 1"),
+        (Ping(7), 1, 130.0, "ping: safe state, start 1 of the flight software in 20 s"),
+        (ChangeMode(Mode.HOLD), 1, 110.0, "mode: safe state, start 1 of the flight software in 0 s"),
+        (ChangeMode(Mode.SAFE), 1, 3710.0, "safe: safe state, start 1 of the flight software in 3600 s"),
         (Slew(0.1), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
         (Clear("x"), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
     ],
@@ -107,7 +107,7 @@ def test_the_process_zeroes_the_coils_answers_and_ends_when_the_flight_is_to_be_
         process.wait()
     assert process.returncode == 0
     assert (tmp_path / "calls").read_text(encoding="ascii") == "off\n"
-    assert "attempt 1 in 30 s" in said
+    assert "start 1 in 30 s" in said
     assert "coils at zero" in said
-    assert "the flight is started again, attempt 1" in said
+    assert "the flight software is started again, start 1" in said
     assert (tmp_path / "tries").read_text(encoding="ascii").startswith("1 ")

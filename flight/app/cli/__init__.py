@@ -79,8 +79,8 @@ GROUPS = {
 
 COMMANDS = {
     "run": ("fly", "fly a configuration"),
-    "link": ("operate", "connect a flight to its ground by protected frames"),
-    "check": ("fly", "check a configuration and the devices that it names, before it is flown"),
+    "link": ("operate", "connect flight software and ground by protected frames"),
+    "check": ("fly", "check a configuration and its devices before a flight"),
 }
 """Group and purpose of each command of the flight application; entry points in `ENTRY_POINTS` add more."""
 

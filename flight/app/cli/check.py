@@ -165,7 +165,7 @@ def check_values(config: Config) -> None:
     if isinstance(config, OrbitConfig) and config.gps is None and config.elements is None:
         target = config.targets[0].point
         cure = "add `gps`, or `elements`, which `knightcube elements` makes"
-        raise ConfigError("targets[0].point", f"is {target}: pointing needs the position: {cure}")
+        raise ConfigError("targets[0].point", f"is {target}: pointing needs the satellite's position: {cure}")
 
 
 def _write(path: Path, text: str) -> None:
@@ -195,7 +195,7 @@ def flight_problems(result: RunResult) -> list[str]:
     if result.interrupted:
         problems.append(f"the flight was {result.reason}")
     if not ending.coils_at_zero and not ending.coil_error:
-        problems.append("the coils were not left at zero")
+        problems.append("the coil currents are not zero at the end")
     if not result.faults:
         problems += [f"alarm: {with_cause(name, ending)}" for name in ending.alarms]
         problems += [

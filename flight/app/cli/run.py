@@ -38,7 +38,9 @@ def summary_text(result: RunResult, elapsed: float) -> str:
         text = (
             f"emulated devices late by more than {1e-6 * LATE_NS:g} ms {count} times, at most {longest:.2f} s"
         )
-        lines.append(("devices", f"{text}: gaps in their readings are not the flight's fault"))
+        lines.append(
+            ("devices", f"{text}: the emulation, not the flight software, causes gaps in their readings")
+        )
     lines += [("log", str(result.folder)), ("next", f"{PROGRAM} report {result.folder}")]
     return "".join(f"{name + ':':10}{text}\n" for name, text in lines)
 

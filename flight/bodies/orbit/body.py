@@ -193,7 +193,7 @@ class OrbitView:
         rate = self._detumbler.rate if mode is Mode.DETUMBLE else None
         if rate is None:
             return mode.label
-        return f"{mode.label} {math.degrees(float(np.linalg.norm(rate))):.2f} deg/s by the magnetometer"
+        return f"{mode.label} {math.degrees(float(np.linalg.norm(rate))):.2f} deg/s from the magnetometer"
 
 
 class OrbitFeed:

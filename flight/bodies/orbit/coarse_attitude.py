@@ -120,7 +120,7 @@ class CoarseSunFeed:
         excess = float(np.linalg.norm(seen) - np.linalg.norm(sky.field))
         if abs(excess) > STRENGTH_SIGMA * sigma:
             self._turns.forget()
-            return f"the field is {excess * 1e6:+.1f} uT off its model and gives no attitude"
+            return f"the measured field differs from its model by {excess * 1e6:+.1f} uT: no attitude"
         # The body rotates while the cells are read one after another.
         blur = float(np.linalg.norm(gyro)) * self._period_ns / SECOND_NS / np.sqrt(12.0)
         fix = self._turns.accept(reading.currents, seen, sigma, sky, blur)

@@ -112,7 +112,7 @@ class SunAcquisitionLaw(_MagneticLaw):
         self._acquisition, self._strings = law, strings
         self._events = log
         self._found: bool | None = None
-        self._reason = "the strings give no readings"
+        self._reason = "the solar strings deliver no readings"
 
     def update_sun(self, reading: StringReading) -> None:
         """Accept a reading of the solar cells, in any mode."""

@@ -132,8 +132,8 @@ class PointingPaths:
         flown = table.below(self._fastest)
         if flown is None:
             turn, most = np.rad2deg([table.fastest, self._fastest])
-            limit = f"above {most:.2f} it is detumbled or the camera pauses"
-            return f"it turns the body at {turn:.2f} deg/s, and {limit}"
+            limit = f"but above {most:.2f} deg/s it is detumbled or the camera pauses"
+            return f"the path rotates the body at {turn:.2f} deg/s, {limit}"
         law = PointingLaw(flown, self._limit)
         begin_ns = origin_ns + round(law.span[0] * SECOND_NS)
         found = _Followed(law, origin_ns, begin_ns, table.slew)
@@ -262,7 +262,7 @@ class PointingTargets:
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite needs a pointing goal; a target q2 is for the testbed")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
-            raise UsageError("no star camera searches for objects: add `camera: {objects: {}}`")
+            raise UsageError("the star camera does not search for objects: add `camera: {objects: {}}`")
         return Target(COMMANDED + number, PointingTargetLaw(wanted, self._paths))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
@@ -403,8 +403,8 @@ class ObjectAim:
                 ]
             )
             text = (
-                f"object {self._followed} leaves the field in {table.path.times[first]:.0f} s: up to "
-                f"{fastest:.2f} deg/s and {needed:.4f} deg/s^2, the body makes {made:.4f}"
+                f"object {self._followed} leaves the field of view in {table.path.times[first]:.0f} s: "
+                f"it needs {fastest:.2f} deg/s and {needed:.4f} deg/s^2, the body reaches {made:.4f} deg/s^2"
             )
             self._events.report(events.OBJECT_ESCAPES, now_ns, text)
         self._escapes = bool(len(outside))
@@ -528,7 +528,9 @@ class PointingPlanner:
         if astray.since is not None:
             if not self._held:
                 degrees = math.degrees(self._paths.off)
-                text = f"{degrees:.0f} deg off its path: damping the rotation before a new plan"
+                text = (
+                    f"the attitude is {degrees:.0f} deg from its path: damping the rotation before a new plan"
+                )
                 self._events.report(events.ASTRAY, now_ns, text)
             self._held = True
             if not astray.ready:

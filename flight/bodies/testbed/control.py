@@ -400,9 +400,8 @@ class Planning:
             if self._settings.strategy is Strategy.GOAL:
                 self._goal_ns = end_ns
             if plan.status is PlanStatus.STRETCHED:
-                text = (
-                    f"plan {job.number}: {plan.horizon_asked:g} s is too short, flying {plan.horizon:.2f} s"
-                )
+                asked = f"plan {job.number}: {plan.horizon_asked:g} s is too short"
+                text = f"{asked}, the path takes {plan.horizon:.2f} s"
                 self._events.report(events.PLAN_STRETCHED, now_ns, text)
         self._record(job, plan, reason or plan.status.value, not reason, now_ns)
 
@@ -466,7 +465,7 @@ class ThreadTargets:
         Raises UsageError if q2 is beyond its limit.
         """
         if isinstance(wanted, PointingTarget):
-            raise UsageError("the testbed accepts a q2, not a direction")
+            raise UsageError("the testbed accepts only a target q2, not a pointing goal")
         if not abs(wanted) <= Q2_LIMIT:  # NaN compares false
             raise UsageError(f"q2 {wanted} is not within +-{Q2_LIMIT}")
         return Target(COMMANDED + number, ThreadLaw(wanted))
@@ -637,7 +636,9 @@ class CageField:
                 state = self._elements.at(date)
                 there = local_frame(state.position, state.velocity) @ field(date, state.position)
             except OrbitError as error:
-                raise ConfigError("cage.elements", f"give no field at {date:.4f} (UTC): {error}") from error
+                raise ConfigError(
+                    "cage.elements", f"determine no field at {date:.4f} (UTC): {error}"
+                ) from error
             least = min(least, self._scale * math.hypot(there[0], there[2]))
         return least
 

@@ -448,7 +448,7 @@ class Scheduling:
         if utc_ns - entry.at_ns > LATEST_NS:
             return f"it is {_utc(utc_ns)}"
         if self._mode == Mode.SAFE:
-            return "only the ground may decide in mode SAFE"
+            return "the flight is in mode SAFE"
         try:
             command_of_words(entry.command, stored=True)
         except CommandError as error:  # the entry was scheduled by another software release

@@ -115,7 +115,7 @@ NEW_KEY = telecommand(
 PORTION = telecommand(
     "portion",
     0x2A3,
-    "Carry a portion of a packet that is longer than the frames allow",
+    "Transfer a portion of a packet that is too long for one frame",
     Field("total", "u1", "-", "number of portions of the packet, 2 to 8"),
     Field("number", "u1", "-", "number of this portion, 1 to `total`, in this order"),
     Field("data", "u1", "-", "bytes of the packet; zeros fill the last portion", _PORTION_BYTES),
@@ -320,7 +320,7 @@ class Joiner:
         if portion.number == 1 and 2 <= portion.total <= _MOST_PORTIONS:
             before = []
         elif not before or (portion.total, portion.number) != (before[0].total, len(before) + 1):
-            raise CommandError(f"{portion}: a portion before it is missing, send the command again")
+            raise CommandError(f"{portion}: an earlier portion is missing: send the command again")
         if portion.number < portion.total:
             self._portions = [*before, portion]
             return b""
@@ -409,7 +409,7 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
     for one in packet.fields:
         value = getattr(directive, one.name)
         if isinstance(value, str) and len(value.encode()) >= int(one.kind[1:]):
-            raise CommandError(f"{value}: too long, {one.name} has less than {one.kind[1:]} bytes")
+            raise CommandError(f"{value}: too long, {one.name} must have fewer than {one.kind[1:]} bytes")
         values[one.name] = list(value) if isinstance(value, bytes) else value
     try:
         return Packer(LAYOUTS).pack(packet, utc_ns, values)
@@ -450,7 +450,7 @@ def unpack(data: bytes) -> Directive | None:
             values[one.name] = bytes(raw.tolist()) if one.count > 1 else raw.item()
     directive: Directive = _KINDS[layout.packet.name](**values)
     if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
-        raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is not an interval of time")
+        raise CommandError(f"the end {directive.end:g} s must not be before the begin {directive.begin:g} s")
     if values.get("part", 0) >= len(PARTS):
         raise CommandError(f"part {values['part']} is unknown")
     if values.get("kind", 0) >= len(KINDS):

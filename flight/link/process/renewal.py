@@ -67,7 +67,7 @@ class Renewal:
         since the start of the link. The host's clock may be wrong, so expiry dates are not compared with it.
         """
         if not self._status.exists():
-            return "this board has no renewal: deploy/install.sh installs it"
+            return "the renewal service is not installed on this board: run deploy/install.sh"
         name = f"{done.spi}-{done.counter}-{done.request.packet}-{done.request.sequence}"
         values: dict[str, Any] = {"do": type(directive).__name__.lower()}
         if isinstance(directive, Activate):

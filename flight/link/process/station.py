@@ -153,7 +153,7 @@ class UdpLine:
             self._socket.bind(host_port(address))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            raise UsageError(f"link.udp: {address} cannot be listened to: {error}") from error
+            raise UsageError(f"link.udp: cannot listen on {address}: {error}") from error
         if peers is not None:
             with contextlib.suppress(OSError):  # without a socket filter, `receive` checks the senders
                 _accept_only(self._socket, peers)
@@ -261,7 +261,7 @@ class TcpLine:
         try:
             self._listener = socket.create_server(host_port(address), backlog=_STRANGERS)
         except (OSError, OverflowError) as error:
-            raise UsageError(f"link.tcp: {address} cannot be listened to: {error}") from error
+            raise UsageError(f"link.tcp: cannot listen on {address}: {error}") from error
         self._listener.setblocking(False)
 
     @property
@@ -785,7 +785,7 @@ class Station:
                 return sealer.seal(header, data)[0]
             except FlightError as error:
                 problem = problem or error
-        raise problem or FlightError("there is no SPI of telemetry")
+        raise problem or FlightError("no SPI is configured for telemetry")
 
     def _report(self, *reports: Report) -> None:
         for one in reports:

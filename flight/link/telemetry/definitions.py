@@ -199,7 +199,7 @@ WORKLOAD = Packet(
         Field("level", "u1", "-", "level of the reduction; 0 if all work is done", limits=_LEVEL),
         counter("frames_shed", "frames of the star camera that were not taken since start"),
         counter("plans_shed", "periodic plans that were not made since start"),
-        counter("frames_late", "frames since start that met a busy worker or whose processing took too long"),
+        counter("frames_late", "frames since start whose processing took too long or whose worker was busy"),
         counter("plans_late", "plans since start that took too long"),
         counter("cycles_lost", "control cycles skipped since start"),
     ),
@@ -241,7 +241,7 @@ POWER = Packet(
 MAX_NODES = 40
 """Maximum number of path nodes in a plan packet."""
 
-_WANTED = "currents that the coils as described need for the dipole, before the correction of sign and gain"
+_WANTED = "currents for the dipole with the configured coils, before the correction of sign and gain"
 _WRITTEN = "currents written to the PWM chip, after the correction of sign and gain, limited and quantised"
 _Q2 = Limits(fault=(-Q2_LIMIT, Q2_LIMIT))
 
@@ -532,11 +532,11 @@ DIRECTIONS = Packet(
         Field("frames", "u1", "-", "bit mask of the cameras whose frames were read"),
         Field("sun", "f8", "-", "direction of the Sun, body axes; NaN if unknown", 3),
         Field("sun_sigma", "f4", "rad", "standard deviation of the Sun's direction per axis; NaN if unknown"),
-        Field("sun_cameras", "u1", "-", "cameras that show the Sun, as bits; 0 if from the solar strings"),
+        Field("sun_cameras", "u1", "-", "bit mask of the cameras that show the Sun; 0 if from solar cells"),
         flag("sun_used", "whether the estimate used the Sun's direction"),
         Field("nadir", "f8", "-", "direction of nadir, body axes; NaN if unknown", 3),
         Field("nadir_sigma", "f4", "rad", "standard deviation of nadir per axis; NaN if unknown"),
-        Field("nadir_cameras", "u1", "-", "cameras that show the limb, as bits; 0 if from all brightnesses"),
+        Field("nadir_cameras", "u1", "-", "bit mask of the cameras that show the limb; 0 if from brightness"),
         flag("nadir_used", "whether the estimate used the nadir"),
     ),
 )

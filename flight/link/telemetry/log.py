@@ -258,7 +258,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
     """
     if coming_bytes > budget_bytes:
         raise UsageError(
-            f"archive budget of {budget_bytes} bytes: it must hold the logs of one run, {coming_bytes} bytes"
+            f"archive budget of {budget_bytes} bytes is too small: one run needs {coming_bytes} bytes"
         )
     runs, taken = find_runs(archive), _numbered(archive)
     folder = archive / f"run-{taken[-1][0] + 1 if taken else 1:06d}"
@@ -271,7 +271,9 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
         make_lasting(archive)
     except OSError as error:
         if error.errno not in DISK_TROUBLE:
-            raise UsageError(f"{archive}: a run cannot begin there: {error.strerror or error}") from error
+            raise UsageError(
+                f"{archive}: the folder of a new run cannot be made: {error.strerror or error}"
+            ) from error
     return NewRun(folder, dropped)
 
 

@@ -187,4 +187,7 @@ def test_check_refuses_a_target_if_the_position_is_never_known(tmp_path: Path) -
     path.write_text("extends: orbit_3u\ngps: none\nelements: null\n", encoding="utf-8")
     done = command("check", path)
     assert done.returncode == 2
-    assert "`targets[0].point` is nadir: pointing needs the position: add `gps`, or `elements`" in done.stderr
+    assert (
+        "`targets[0].point` is nadir: pointing needs the satellite's position: add `gps`, or `elements`"
+        in done.stderr
+    )

@@ -78,7 +78,7 @@ def test_the_plan_s_configuration_is_found_in_any_folder(
         (
             "steps:",
             "commands: {socket: /nowhere/x}\nsteps:",
-            "`commands.socket` /nowhere/x cannot be listened to",
+            "`commands.socket` cannot listen on /nowhere/x",
         ),
         ("steps:", "modes: {initial: slew}\nsteps:", "expected one of detumble, hold, safe, testbed-demo"),
         (

@@ -98,7 +98,7 @@ def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> Non
             "fault noticed: blind (2): no estimate for 60 s",
         ),
         (replace(WELL, alarms=("imu-silent",), faults={"blind": 2}), {"faults": ("imu: silent",)}, None),
-        (replace(WELL, coils_at_zero=False), {}, "the coils were not left at zero"),
+        (replace(WELL, coils_at_zero=False), {}, "the coil currents are not zero at the end"),
         (replace(WELL, coils_at_zero=False, coil_error="no answer"), {}, "no answer"),
         (WELL, {"interrupted": True}, "the flight was stopped by SIGINT"),
         (WELL, {"log_error": "the disk is full"}, "the disk is full"),
@@ -242,7 +242,7 @@ def test_a_configuration_that_is_refused_is_one_line_and_status_2(
         (
             "gps: none\nelements: null",
             None,
-            "`targets[0].point` is sun: pointing needs the position: add `gps`",
+            "`targets[0].point` is sun: pointing needs the satellite's position: add `gps`",
         ),
         (
             "simulation: {utc: '2027-01-01T00:00:00Z'}",

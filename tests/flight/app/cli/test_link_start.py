@@ -96,7 +96,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", port))
         service = start(config)
-        service.says(f"cannot start yet: link.udp: 127.0.0.1:{port} cannot be listened to")
+        service.says(f"cannot start yet: link.udp: cannot listen on 127.0.0.1:{port}")
         service.notifies("STATUS=waiting to start")
         service.notifies("EXTEND_TIMEOUT_USEC=")
     while "link open on UDP" not in (line := service.says("")):
@@ -161,7 +161,7 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
 ) -> None:
     config = write_linked_config(place, tcp="203.0.113.7:5010")
     service = start(config)
-    service.says("link.tcp: 203.0.113.7:5010 cannot be listened to")
+    service.says("link.tcp: cannot listen on 203.0.113.7:5010")
     service.says("tried again in 0.4 s")
     service.process.terminate()
     assert service.process.wait(_LONGEST_S) == 0

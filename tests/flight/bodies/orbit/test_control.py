@@ -54,7 +54,7 @@ def test_it_says_that_the_sun_is_found_and_turns_to_it() -> None:
     seen = Seen()
     assert seen.fly(0, 6, np.maximum(np.concatenate([SUN, -SUN]), 0.0))
     assert [name for name, _ in seen.told] == ["sun-missed", "sun-found"]
-    assert seen.told[0][1] == "the strings give no readings"
+    assert seen.told[0][1] == "the solar strings deliver no readings"
 
 
 def test_by_a_field_that_is_stuck_it_does_nothing_until_the_field_lives_again() -> None:

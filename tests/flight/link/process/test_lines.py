@@ -160,5 +160,5 @@ def test_a_tnc_line_without_a_free_file_descriptor_connects_later(monkeypatch: p
 
 @pytest.mark.parametrize("kind", [UdpLine, TcpLine])
 def test_an_address_that_is_not_there_is_a_mistake_of_the_users(kind: Callable[[str], object]) -> None:
-    with pytest.raises(UsageError, match="cannot be listened to"):
+    with pytest.raises(UsageError, match="cannot listen on"):
         kind("203.0.113.7:9")

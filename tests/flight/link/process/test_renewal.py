@@ -126,7 +126,7 @@ def test_confirmation_and_withdrawal_are_requests(ends: Ends) -> None:
 
 def test_a_board_without_the_privileged_program_refuses(ends: Ends) -> None:
     ends.renewal.unlink()
-    assert "has no renewal" in ends.command(Confirm(0))
+    assert "renewal service is not installed" in ends.command(Confirm(0))
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_safe_suspends_the_schedule(link: BothEnds) -> None:
     link.record(link.mode_packet(Mode.SAFE, "commanded"))
     link.turn(8.0)
     assert link.obeyed == []
-    assert "only the ground may decide in mode SAFE" in texts(link, counter)[-1]
+    assert "the flight is in mode SAFE" in texts(link, counter)[-1]
 
 
 def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> None:
@@ -261,7 +261,7 @@ def test_a_command_is_due_from_its_time_on_for_ten_seconds(
         return
     assert isinstance(one, Report)
     assert one.stage is Stage.FAILED
-    assert {"late": "not executed, it is", "safe": "only the ground may decide"}[outcome] in one.text
+    assert {"late": "not executed, it is", "safe": "the flight is in mode SAFE"}[outcome] in one.text
 
 
 @pytest.mark.parametrize(("early_ns", "scheduled"), [(1, True), (0, False), (-1, False)])

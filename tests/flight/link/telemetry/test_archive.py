@@ -81,10 +81,10 @@ def test_a_board_that_crashes_at_every_start_does_not_fill_the_disk_with_folders
 def test_a_budget_below_the_coming_run_and_a_place_that_cannot_be_written_are_clear_errors(
     tmp_path: Path,
 ) -> None:
-    with pytest.raises(UsageError, match="archive budget of 10 bytes: it must hold the logs of one run, 11"):
+    with pytest.raises(UsageError, match="archive budget of 10 bytes is too small: one run needs 11"):
         begin_run(tmp_path, 10, 11)
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match="a run cannot begin there: Not a directory"):
+    with pytest.raises(UsageError, match="the folder of a new run cannot be made: Not a directory"):
         begin_run(tmp_path / "file" / "runs", 10, 1)
 
 
