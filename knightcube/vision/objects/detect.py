@@ -442,7 +442,7 @@ class Judge:
             return Judgement(Verdict.STAR)
         try:
             light = self._light(ends, per_length=_FEW_PATHS)
-            if self._gained(light, light.explain(ends)) < self.objects.improvement:
+            if light.chi_square - light.chi_square_with(ends) < self.objects.improvement:
                 if self._only_stars(light, self.objects.improvement):
                     return Judgement(Verdict.STARS, light=light)
                 return self._stars_or_unclear(self._light(ends))
@@ -468,12 +468,12 @@ class Judge:
                 return Judgement(Verdict.STARS, light=light)
             light = self._light(corners)
             hopeless = light.chi_square - light.pixels < enough
-            tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
+            tried = [] if hopeless else [light.chi_square_with(ends) for ends in lines]
         except FlightError:
             return Judgement(Verdict.UNCLEAR)
         if not tried:
             return self._stars_or_unclear(light)
-        ends, _ = min(tried, key=lambda one: one[1].chi_square)
+        ends = lines[int(np.argmin(tried))]
         candidate = None if self._moves_like_a_star(ends) else self._candidate(ends, (), light, (), enough)
         if candidate is not None:
             return Judgement(Verdict.OBJECT, candidate)
@@ -560,14 +560,14 @@ class Judge:
         enough = self.objects.crossing_improvement
         try:
             few = self._light(ends, stars, _FEW_PATHS)
-            gained = self._gained(few, few.explain(ends))
+            gained = few.chi_square - few.chi_square_with(ends)
             if gained < enough:
                 longer = few.located(ends, among_stars=True) if gained >= _PART * enough else None
                 if longer is None:
                     return None
                 ends = longer.ends
                 few = self._light(ends, stars, _FEW_PATHS)
-                if self._gained(few, few.explain(ends)) < enough:
+                if few.chi_square - few.chi_square_with(ends) < enough:
                     return None
             return self._candidate(ends, (), self._light(ends, stars), stars, enough)
         except FlightError:

@@ -21,6 +21,7 @@ remains after the subtraction of the stars is then fitted as a point or a line.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -29,11 +30,11 @@ from scipy import ndimage
 from scipy.linalg import lapack
 from scipy.optimize import nnls
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.frame import Background, label_pixels, line_of
+from knightcube.vision.frame import label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 from knightcube.vision.objects.streak_images import (
     fitted_line,
@@ -160,8 +161,7 @@ class StarLight:
         self._known = tuple(known)
         points = np.concatenate([stars.reshape(-1, 2), *lines])
         self._near = pixels_near(points, _REACH * psf_sigma, rows, columns)
-        signal = segmented.signal[self._near[:, 1], self._near[:, 0]].astype(np.float64)
-        self._weight = _pixel_weights(signal, segmented.background, gain, saturation)
+        signal, self._weight, self.expected = self._counts(self._near)
         self._target = signal * self._weight
         images = streak_images(self._near, stars, psf_sigma, False)[:, 0]
         images *= self._weight
@@ -171,7 +171,10 @@ class StarLight:
         self._power = float(self._target @ self._target)
         self.pixels = len(self._near)
         self._brightness, self.chi_square = _brightnesses(self._normal, self._right, self._power)
-        self.expected = float(np.sum(_noise_share(signal, self._weight, segmented.background, gain)))
+
+    def chi_square_with(self, ends: FloatArray) -> float:
+        """Return the chi-square of stars and an object between `ends` (2, 2), px, see `explain`."""
+        return min(self._with_line(line)[1] for line in self._object_images(ends))
 
     def explain(self, ends: FloatArray) -> Explanation:
         """Return the quality of the hypothesis of stars and one object between `ends` (2, 2), px.
@@ -179,9 +182,7 @@ class StarLight:
         The object's path is straight in the image or relative to the stars, whichever gives the smaller
         chi-square.
         """
-        paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
-        first = int(np.abs(paths[1] - paths[0]).max() < _SAME_PATH)
-        lines = [self._weighted_image(path) for path in paths[first:]]
+        lines = self._object_images(ends)
         fits = [self._with_line(line) for line in lines]
         best = int(np.argmin([fit[1] for fit in fits]))
         line, (brightness, chi_square) = lines[best], fits[best]
@@ -193,6 +194,18 @@ class StarLight:
         by_stars = target - self._brightness @ stars
         misfit, of_stars = (float(each @ each) / len(each) for each in (missed, by_stars))
         return Explanation(chi_square, misfit, of_stars, float(brightness[-1]))
+
+    def _object_images(self, ends: FloatArray) -> list[FloatArray]:
+        """Return the weighted images (p,) of an object whose path is straight in the image or among stars."""
+        paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
+        first = int(np.abs(paths[1] - paths[0]).max() < _SAME_PATH)
+        return [self._weighted_image(path) for path in paths[first:]]
+
+    def _counts(self, pixels: IntArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return counts (p,), weights (p,) and expected chi-square of pixels (p, 2), see `_counts_at`."""
+        background = self._segmented.background
+        levels = background.typical_level, background.typical_noise
+        return _counts_at(self._segmented.signal, pixels, *levels, float(self._gain), float(self._saturation))
 
     def located(self, ends: FloatArray, among_stars: bool) -> LocatedEnds | None:
         """Return the most likely ends of the light of an object's streak, or None if no streak is found.
@@ -262,8 +275,7 @@ class StarLight:
         """
         rows, columns = self._segmented.signal.shape
         pixels = pixels_near(curve, _REACH * self._psf_sigma, rows, columns)
-        signal = self._segmented.signal[pixels[:, 1], pixels[:, 0]].astype(np.float64)
-        weight = _pixel_weights(signal, self._segmented.background, self._gain, self._saturation)
+        signal, weight, _ = self._counts(pixels)
         regions = self._segmented.regions
         own = regions.labels[pixels[:, 1], pixels[:, 0]]
         weight[(own != label) & np.isin(own, regions.label)] = 0.0
@@ -348,11 +360,9 @@ class StarLight:
         columns = self._segmented.signal.shape[1]
         near, own = (each[:, 1] * columns + each[:, 0] for each in (self._near, region))
         place = np.minimum(np.searchsorted(near, own), len(near) - 1)
-        column, row = region[near[place] != own].T if len(near) else region.T
-        signal = self._segmented.signal[row, column].astype(np.float64)
-        weight = _pixel_weights(signal, self._segmented.background, self._gain, self._saturation)
-        noise = _noise_share(signal, weight, self._segmented.background, self._gain)
-        outside = float(np.sum((signal * weight) ** 2 - noise))
+        beside = region[near[place] != own] if len(near) else region
+        signal, weight, expected = self._counts(np.ascontiguousarray(beside))
+        outside = float(np.sum((signal * weight) ** 2)) - expected
         return self.chi_square - self.expected + outside
 
     def _with_line(self, line: FloatArray) -> tuple[FloatArray, float]:
@@ -442,21 +452,56 @@ def _light_along(
     return np.asarray(light / np.maximum(share, 1e-300)), np.asarray(share, dtype=float)
 
 
-def _pixel_weights(signal: FloatArray, background: Background, gain: float, saturation: float) -> FloatArray:
-    """Return the reciprocal standard deviations of pixels with `signal` counts above `background`.
+def _pixel_weights(
+    signal: FloatArray, level: float, noise: float, gain: float, saturation: float
+) -> FloatArray:
+    """Return the reciprocal standard deviations of pixels with `signal` counts above the background `level`.
 
     The standard deviation includes the noise of the background, photon noise (`gain` in electrons per count)
     and the model error of bright streaks. Pixels above 95 % of the `saturation` counts have the weight 0.
     """
     light = np.maximum(signal, 0.0)
-    clipped = signal + background.typical_level >= 0.95 * saturation
-    error = np.sqrt(background.typical_noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
+    clipped = signal + level >= 0.95 * saturation
+    error = np.sqrt(noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
     return np.where(clipped, 0.0, 1.0 / error)
 
 
-def _noise_share(signal: FloatArray, weight: FloatArray, background: Background, gain: float) -> FloatArray:
-    """Return the shares of pixel noise and photon noise in the variances of pixels with the given weights."""
-    return (background.typical_noise**2 + np.maximum(signal, 0.0) / gain) * weight**2
+def _counts_at_numpy(
+    image: Image, pixels: IntArray, level: float, noise: float, gain: float, saturation: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the counts (p,) above the background and the weights (p,) of pixels, and expected chi-square.
+
+    The expected chi-square is the sum of the shares of pixel noise and photon noise in the variances.
+
+    Args:
+        image: counts above the background (rows, columns).
+        pixels: pixels (x, y) in the image (p, 2).
+        level: level of the background, counts.
+        noise: standard deviation of a pixel of the background, counts.
+        gain: electrons per count.
+        saturation: counts at which a pixel saturates, see `_pixel_weights`.
+    """
+    signal = image[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    weight = _pixel_weights(signal, level, noise, gain, saturation)
+    return signal, weight, float(np.sum((noise**2 + np.maximum(signal, 0.0) / gain) * weight**2))
+
+
+@compiled_form_of(_counts_at_numpy)
+def _counts_at(
+    image: Image, pixels: IntArray, level: float, noise: float, gain: float, saturation: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """See `_counts_at_numpy`."""
+    signal, weight, expected = np.empty(len(pixels)), np.zeros(len(pixels)), 0.0
+    for p in range(len(pixels)):
+        counts = float(image[pixels[p, 1], pixels[p, 0]])
+        light = max(counts, 0.0)
+        random = noise * noise + light / gain
+        variance = random + (SHAPE_ERROR * light) ** 2
+        signal[p] = counts
+        if counts + level < 0.95 * saturation:
+            weight[p] = 1.0 / math.sqrt(variance)
+            expected += random / variance
+    return signal, weight, expected
 
 
 def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[FloatArray, float]:
@@ -582,14 +627,15 @@ def cut_patch(
     top, left = max(top - _ROOM, 0), max(left - _ROOM, 0)
     bottom, right = min(bottom + _ROOM, rows), min(right + _ROOM, columns)
     signal = segmented.signal[top:bottom, left:right].astype(np.float64)
-    weight = _pixel_weights(signal, segmented.background, gain, saturation)
+    background = segmented.background
+    weight = _pixel_weights(signal, background.typical_level, background.typical_noise, gain, saturation)
     mask = regions.labels[top:bottom, left:right] == regions.label[index]
     corner = np.array([left, top], dtype=float)
     above, below, before, after = (
         np.inf if off else 0.0 for off in (top == 0, bottom == rows, left == 0, right == columns)
     )
     beyond = ((above, below), (before, after))
-    return Patch(signal, weight, segmented.background.typical_noise, corner, mask, beyond, psf_sigma, gain)
+    return Patch(signal, weight, background.typical_noise, corner, mask, beyond, psf_sigma, gain)
 
 
 def _smoothed(light: FloatArray, psf_sigma: float) -> FloatArray:

@@ -13,6 +13,7 @@ from knightcube.vision.objects.star_light import (
     StarLight,
     _brightest_path,
     _convolved,
+    _counts_at,
     _fit_line,
     _smoothed,
     brightest_left,
@@ -187,3 +188,15 @@ def test_all_forms_smooth_alike_and_as_scipy_does(shape: tuple[int, int]) -> Non
     assert_forms_agree(_convolved, light, np.array([0.5, 0.2, 0.05]))
     expected = ndimage.gaussian_filter(light, 1.3, mode="constant")
     np.testing.assert_allclose(_smoothed(light, 1.3), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("saturation", [60.0, np.inf])
+def test_all_forms_return_the_same_counts_and_weights(saturation: float) -> None:
+    draw = np.random.default_rng(6)
+    image = draw.normal(20.0, 30.0, (12, 15)).astype(np.float32)
+    pixels = np.stack([draw.integers(0, 15, 40), draw.integers(0, 12, 40)], axis=1)
+    assert_forms_agree(_counts_at, image, pixels, 5.0, 4.0, 2.0, saturation)
+    assert _counts_at(image, pixels[:0], 5.0, 4.0, 2.0, saturation)[2] == 0.0
+    assert np.isfinite(saturation) == bool(
+        np.any(_counts_at(image, pixels, 5.0, 4.0, 2.0, saturation)[1] == 0.0)
+    )
