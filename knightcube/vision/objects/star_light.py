@@ -729,26 +729,25 @@ def _brightest_path_numpy(
 ) -> tuple[float, int, int]:
     """Return the result of `_brightest_path`."""
     rows, columns = seen.shape
-
-    def along(row: IntArray, column: IntArray, number: int) -> FloatArray:
-        x, y = column + steps[number, 0], row + steps[number, 1]
-        light = seen[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)]
-        light = np.where(y < 0, beyond[0], np.where(y >= rows, beyond[1], light))
-        light = np.where(x < 0, beyond[2], np.where(x >= columns, beyond[3], light))
-        return np.asarray(factor[number] * light)
-
-    x, y = np.arange(columns), np.arange(rows)[:, None]
-    row, column = np.nonzero(along(y, x, 0) >= threshold)
-    least = along(row, column, 0)
-    for number in range(1, len(steps)):
-        least = np.minimum(least, along(row, column, number))
+    # The image is framed by the values beyond it, so that no step leaves the array.
+    x, y = np.abs(steps).max(axis=0)
+    framed = np.empty((rows + 2 * y, columns + 2 * x))
+    framed[:y], framed[y + rows :] = beyond[0], beyond[1]
+    framed[:, :x], framed[:, x + columns :] = beyond[2], beyond[3]
+    framed[y : y + rows, x : x + columns] = seen
+    flat, step = framed.reshape(-1), (steps[:, 1] + y) * framed.shape[1] + steps[:, 0] + x
+    pixel = (np.arange(rows)[:, None] * framed.shape[1] + np.arange(columns)).reshape(-1)
+    least = np.full(len(pixel), np.inf)
+    for number in range(len(steps)):
+        least = np.minimum(least, factor[number] * flat.take(pixel + step[number]))
         kept = np.flatnonzero(least >= threshold)
-        if len(kept) < len(row):
-            row, column, least = row[kept], column[kept], least[kept]
+        if len(kept) < len(pixel):
+            pixel, least = pixel[kept], least[kept]
     if not len(least):
         return -np.inf, -1, -1
     best = int(np.argmax(least))
-    return float(least[best]), int(column[best]), int(row[best])
+    row, column = divmod(int(pixel[best]), framed.shape[1])
+    return float(least[best]), column, row
 
 
 @compiled_form_of(_brightest_path_numpy)

@@ -246,15 +246,19 @@ def _pixels_near_numpy(points: FloatArray, reach: float, rows: int, columns: int
     points = points[inside].astype(np.int64)
     first = points.min(axis=0, initial=columns + rows) - r
     width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
-    # A map of the points is combined with copies of itself that are shifted by all steps within a disc.
+    # A map of the points is widened along its rows, and combined with shifted copies of itself to discs.
     lit = np.zeros((height, width), dtype=np.bool_)
     lit[points[:, 1] - first[1], points[:, 0] - first[0]] = True
     marked = np.zeros_like(lit)
+    wide = [lit]
+    for right in range(1, r + 1):
+        wide.append(wide[-1].copy())
+        for step in (-right, right):
+            wide[-1][:, _shifted(width, step)] |= lit[:, _shifted(width, -step)]
     for down in range(-r, r + 1):
-        for right in range(-r, r + 1):
-            if down**2 + right**2 <= reach**2:
-                onto = _shifted(height, down), _shifted(width, right)
-                marked[onto] |= lit[_shifted(height, -down), _shifted(width, -right)]
+        if abs(down) <= reach:
+            half = math.floor(math.sqrt(reach**2 - down**2))
+            marked[_shifted(height, down)] |= wide[half][_shifted(height, -down)]
     row, column = np.nonzero(marked)
     near = np.stack([column, row], axis=-1) + first
     return np.ascontiguousarray(near[np.all((near >= 0) & (near < (columns, rows)), axis=-1)])
