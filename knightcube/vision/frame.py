@@ -109,8 +109,8 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
             of_row[0, block] = (1.0 - share) * level[top, of] + share * level[bottom, of]
             of_row[1, block] = (1.0 - share) * variance[top, of] + share * variance[bottom, of]
         for block in range(-1, across):
-            # These columns reach from this block's centre to the next centre, and include the columns before
-            # the first centre.
+            # Each pass covers the columns from the centre of one block to the next centre. The first pass
+            # covers the columns before the first centre.
             first = max(math.ceil(block * width + 0.5 * (width - 1)), 0)
             last = columns if block == across - 1 else math.ceil((block + 1) * width + 0.5 * (width - 1))
             _fill_row(signal[row], floor[row], pixels[row], of_row, max(block, 0), width, first, last)
@@ -154,10 +154,10 @@ def estimate_background(
     per block give the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block
     that is filled by a bright object gets the median noise of the surrounding 3 x 3 blocks.
 
-    Under stray light, the level varies within a block. In this case, the block size and the stride are
-    halved, and the moments are computed from the differences between the pixels and the level interpolated
-    between the centres of the larger blocks. Stray light is assumed if many neighbouring blocks differ,
-    unless `stray_light` states it.
+    Under stray light, the level varies within a block. Under stray light, the block size and the stride are
+    therefore halved, and the moments are computed from the differences between the pixels and the level
+    interpolated between the centres of the larger blocks. Stray light is assumed if many neighbouring blocks
+    differ, unless `stray_light` states it.
     """
     coarse = _of_blocks(pixels, block, stride, None)
     if not (_is_uneven(coarse) if stray_light is None else stray_light):
@@ -249,8 +249,8 @@ _SAMPLES, _FEW = 16, 24
 def _ordered(values: FloatArray, place: int, scratch: FloatArray) -> float:
     """Return the value that has the index `place` in ascending order; `scratch` is overwritten.
 
-    This quickselect takes the pivot from a sorted sample of the values. It discards the values on the wrong
-    side of the pivot without branches, which the processor could not predict.
+    This quickselect takes the pivot from a sorted sample of the values. The values on the wrong side of the
+    pivot are discarded without branches, because the processor could not predict a branch.
     """
     current, size, few = values, len(values), np.empty(_SAMPLES)
     while size > _FEW:
@@ -639,15 +639,16 @@ def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> 
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
 """Limits for the neighbours of a hot pixel.
 
-Each neighbour of a hot pixel must satisfy two conditions. It is below the first value times the hot pixel's
-brightness plus the second value times the noise. It is also below the third value times the hot pixel's
-brightness.
+Each neighbour of a hot pixel must be below two limits. The first limit is the first value times the
+brightness of the hot pixel plus the second value times the noise. The second limit is the third value times
+the brightness of the hot pixel.
 """
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 """Thresholds (noise standard deviations) for the recognition of two adjacent hot pixels.
 
-The first value is the minimum brightness of the brightest pixel. The second value is the number of standard
-deviations by which noise may raise the third brightest pixel.
+For two adjacent hot pixels, the first value is the minimum brightness of the brightest pixel. The second
+value is the number of standard deviations by which noise may raise the third brightest pixel beside two hot
+pixels.
 """
 _REPAIR_SIGMAS, HOT_SIGMAS = 10.0, 8.0
 """Minimum brightness (noise standard deviations) of replaced hot pixels, and of excluded hot pixels."""
@@ -768,9 +769,10 @@ _PLATEAU = 6
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
 """Limits by which saturation is recognised in a frame of point stars.
 
-The first value is the minimum number of pixels with the highest count. The second value is the minimum ratio
-of this number to the number of pixels with slightly smaller counts. The third value is the width of the range
-of slightly smaller counts, as a fraction of the difference between the highest count and the median.
+The first limit is the minimum number of pixels with the highest count. The second limit is the minimum ratio
+of the number of pixels with the highest count to the number of pixels with slightly smaller counts. The third
+limit is the width of the range of slightly smaller counts, as a fraction of the difference between the
+highest count and the median.
 """
 
 
@@ -807,7 +809,7 @@ def saturation_level(pixels: Image, given: float | None) -> float:
 def saturation_count(pixels: Image) -> float:
     """Return the saturation count: the highest count if several pixels have it, otherwise the type's maximum.
 
-    This function is for frames of streaks, in which a bright star covers many pixels.
+    The function `saturation_count` is for frames of streaks, in which a bright star covers many pixels.
     """
     highest = pixels.max()
     # A frame with only one value is dead, unless the value is the maximum of its type.

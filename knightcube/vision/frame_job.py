@@ -12,8 +12,8 @@
 the identification, the streaks are fitted a second time, with a corrected focal length or with the directions
 of the identified stars.
 
-The control process creates the job and receives the result. The streak estimators and scipy occupy tens of MB
-and are not needed by the control process. They are therefore imported at their first use.
+The control process creates the job and receives the result. The streak estimators and scipy are imported at
+their first use, because they occupy tens of MB and the control process does not need them.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Interface of an alternative estimator of the motion from streaks. Its objects must support pickling."""
+    """Interface of an alternative estimator of the motion from streaks, with support for pickling."""
 
     def motion(
         self,
@@ -380,7 +380,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate from a frame by the decision tree in the module docstring."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    # A fit to a few short streaks is uncertain. In this case, the stars are searched near their predicted
+    # If the streaks are few and short, a fit is uncertain, and the stars are searched near their predicted
     # positions.
     trails, prior = _short_trails(job), job.attitude_prior
     if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):

@@ -65,7 +65,7 @@ _MAX_EXCESS = 3.0
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 """Prior standard deviations that fix omitted lens terms (px for the centre).
 
-Terms are omitted in this order.
+Lens terms are omitted in the order k2, k1, centre.
 """
 _USUAL_SHAPE = 0.02
 """Prior standard deviation of aspect, of shear, and of the tangential displacement of an image corner."""
@@ -327,7 +327,7 @@ class DeterminedLens:
             uncertainty.
         omitted: omitted lens terms by their names "k1", "k2" and "centre".
         accuracy: standard deviations of the lens by the keys of `camera.accuracy` in a configuration. A key
-            is missing if the stars do not determine its term.
+            of `accuracy` is missing if the stars do not determine its lens term.
     """
 
     calibration: Calibration
@@ -362,7 +362,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
 
 
 def _shape_prior(frames: Sequence[MatchedFrame], initial: CameraModel) -> LensPrior:
-    """Return the prior in which each pair of terms without symmetry about the axis is free if significant."""
+    """Return the prior in which aspect and shear, and p1 and p2, are free if they are significant."""
     corner = math.hypot(*initial.ideal.centre) / initial.focal_length
     free = LensPrior(pixels=_USUAL_SHAPE, tangential=_USUAL_SHAPE / corner)
     try:
@@ -399,8 +399,8 @@ def lens_accuracy(
     The standard deviations of focal length and centre are taken from the fit `found`, which does not include
     the omitted terms. The standard deviation of the focal length includes its difference from the fit
     `whole`, which includes all terms. The standard deviation of the distortion is the relative displacement
-    of an image corner. It includes the uncertainty of the fit with all terms, and the difference between the
-    two fits.
+    of an image corner. The standard deviation of the distortion includes the uncertainty of the fit with all
+    terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -422,9 +422,9 @@ def calibrate_one_lens(
 ) -> tuple[DeterminedLens, dict[int, str]]:
     """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    A frame is excluded if it was taken with another focus or zoom, or if its solution is wrong. The criteria
-    are a focal length that differs from the median by more than 5 standard deviations and by more than 1 %,
-    and a fit that rejects more than half of the frame's matches.
+    A frame is excluded if it was taken with another focus or zoom, or if its solution is wrong. A frame is
+    excluded if its focal length differs from the median by more than 5 standard deviations and by more than 1
+    %, or if a fit rejects more than half of its matches.
 
     Args:
         frames: the frames.

@@ -9,8 +9,8 @@ calibration on the ground. The estimate after one frame is the prior of the fit 
 frames, the variances grow as in a slow random walk.
 
 A frame that contradicts the estimated parameters, but agrees with the configuration, indicates that the lens
-has changed. In this case, the estimated parameters are discarded, and the estimation starts again from the
-configuration.
+has changed. After a change of the lens, the estimated parameters are discarded, and the estimation starts
+again from the configuration.
 """
 
 from __future__ import annotations
@@ -71,8 +71,9 @@ class MatchedFrame:
         directions: unit vectors (n, 3) to the stars in any reference frame.
         covariance: covariances (n, 2, 2) of the star positions, px^2, used instead of `sigma`, or None if the
             errors along both axes are equal.
-        late: derivatives (n, 2) of the star positions by the line time of the shutter, px/s. The line time is
-            then the tenth parameter of the fit. If `late` is None, the fit has nine lens parameters.
+        late: derivatives (n, 2) of the star positions by the line time of the shutter, px/s. If `late` is
+            given, the line time is the tenth parameter of the fit. If `late` is None, the fit has nine lens
+            parameters.
     """
 
     points: FloatArray
@@ -261,7 +262,8 @@ def residual_lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[Float
 def residual_spread(lengths: Sequence[FloatArray]) -> float:
     """Return the standard deviation per axis of the residuals, estimated from their median.
 
-    It is at least one. Raises CalibrationError if half of the stars are behind the camera.
+    The returned standard deviation is at least one. Raises CalibrationError if half of the stars are behind
+    the camera.
     """
     median = float(np.median(np.concatenate(lengths)))
     if not median < np.inf:
@@ -313,7 +315,7 @@ def matched_frame(
 
 
 LEARNED = (*PARAMETERS[:5], "line_time", "psf_sigma")
-"""Names of the parameters that are estimated from frames. Units: px for three, none for k1 and k2, s, px."""
+"""Names of the parameters estimated from frames, in the units px, px, px, none, none, s and px."""
 _LINE_TIME, _PSF = 9, 10
 _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
 """Indices of the estimated parameters LEARNED in an array of PARAMETERS, line time and point-spread width."""

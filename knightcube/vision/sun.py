@@ -6,7 +6,7 @@ Only every n-th row of the image is read (`stride`), and bright patches on the r
 Sun. The edge of a bright patch is traced along radial lines (spokes) from its centre, and a circle on the
 sphere is fitted to the edge points. The centre of this circle is the centre of the Sun, even if the disc is
 saturated, has glare, or is truncated by the edge of the image. The initial circle is the consensus among
-circles through triples of edge points. It is refined by geometric least squares (Gauss-Newton). Tukey's
+circles through triples of edge points, and is refined by geometric least squares (Gauss-Newton). Tukey's
 biweight of each point's distance from the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud
 beside the disc or a hot pixel on its edge.
 

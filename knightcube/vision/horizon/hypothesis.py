@@ -5,7 +5,7 @@ edges form. Chance edges are edges such as coasts and the borders of clouds. The
 estimated from the number of edges beside the limb. A coast or the border of a cloud with the radius of
 curvature R, tangent to the limb, stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan
 lines that cross the same segment of a coast or cloud are not independent. The test therefore counts limb
-segments of this length instead of scan lines.
+segments of the length 2 sqrt(2 g R) instead of scan lines.
 """
 
 from __future__ import annotations
@@ -134,7 +134,10 @@ def _placed_by_profile(
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""Trial distances (px) from the limb within which edges are counted. The most significant result is used."""
+"""Trial distances (px) from the limb within which edges are counted.
+
+The trial distance with the most significant result is used.
+"""
 _ROUND = 0.1
 """Assumed radius of curvature of coasts and other lines of chance edges, as a fraction of the image size."""
 _BESIDE = 0.05
@@ -217,7 +220,7 @@ def log10_chance(
 _UNKNOWN_TURN = 1.0
 """Prior standard deviation (rad) of an unknown rotation about nadir.
 
-The rotation has no effect for a sphere.
+For a spherical Earth, the rotation about nadir has no effect.
 """
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun at a limb point (rad) below which the limb is too dark to show an edge."""

@@ -362,7 +362,7 @@ _LEAST = 8
 _MOST = 0.6
 """Fraction of contradicting samples above which an image contradicts the attitude.
 
-Clouds alone cause less.
+Clouds alone cause a lower fraction of contradicting samples.
 """
 
 

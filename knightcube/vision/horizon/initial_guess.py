@@ -1,9 +1,9 @@
 """Initial guess of a horizon: the cone with which most edges agree, and the camera's rotation about nadir.
 
-All rays u to the limb of a sphere make the same angle rho with the nadir n. Therefore u.g = 1 with g = n /
-cos rho, and this equation is linear in g (Christian & Robinson 2016). If the angle rho is known, two rays to
-the limb determine the nadir up to two solutions. If the angle rho is unknown, three rays to the limb
-determine rho and the nadir. Every pair of edges gives a trial cone, or every triple if the altitude is
+All rays u to the limb of a sphere make the same angle rho with the nadir n. The limb therefore satisfies the
+equation u.g = 1, which is linear in g = n / cos rho (Christian & Robinson 2016). If the angle rho is known,
+two rays to the limb determine the nadir up to two solutions. If the angle rho is unknown, three rays to the
+limb determine rho and the nadir. Every pair of edges gives a trial cone, or every triple if the altitude is
 unknown. If there are too many pairs or triples of edges, an evenly spaced selection is used. An edge agrees
 with a cone if the edge lies near the cone and the bright side of the edge is towards nadir. The edges of the
 best cone are removed and the search is repeated, so that the terminator, a coast or a band of clouds gives a
@@ -148,7 +148,7 @@ def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
 
 
 def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the indices of up to `tries` triples of `count` items, with differences of all sizes."""
+    """Return the indices of up to `tries` triples of `count` items, both close together and far apart."""
     number = np.arange(tries)
     first = number % count
     # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the index differences

@@ -11,8 +11,8 @@ the Earth. The gradient of the residuals is analytic.
 The limb cone is fitted by a Gauss-Newton iteration. Huber's weights, with zero weight beyond five standard
 deviations, exclude clouds, glare and the ends of the terminator. The standard deviation of the residuals is
 estimated from the median of the residuals if this estimate exceeds the stated standard deviation. The limb
-does not determine the limb height, the rotation about nadir and the altitude. These parameters have a prior,
-so that the covariance includes their uncertainty.
+height, the rotation about nadir and the altitude have a prior, because the limb does not determine them. The
+covariance therefore includes the uncertainty of limb height, rotation and altitude.
 
 Along a line of sight with the tangent height h, the optical depth of the air is t(h) = t0 exp(-h/H) with t0 =
 t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and H

@@ -13,8 +13,8 @@ the image is ambiguous. If no limb passes all tests, the image is refused, and t
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
 searched again with the nadir of the other cameras as prior knowledge. One common limb is then fitted to the
-limb points of all images. The unknown height of the air displaces every limb outwards. This error displaces
-the nadir only if the images show one side of the limb but not the opposite side.
+limb points of all images. The unknown height of the air displaces every limb outwards. An unknown height of
+the air displaces the nadir only if the images show one side of the limb but not the opposite side.
 """
 
 from __future__ import annotations
@@ -159,9 +159,9 @@ _MOST_ALTITUDE = 3.0
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 """Thresholds of three tests that a horizon must pass.
 
-The first threshold is the largest fraction of bright samples in the sky and on the night side. The second is
-the minimum coverage of the sunlit limb by edges. The third is the largest fraction of limb points on the
-night side.
+The first threshold is the largest fraction of bright samples in the sky and on the night side. The second
+threshold is the minimum coverage of the sunlit limb by edges. The third threshold is the largest fraction of
+limb points on the night side.
 """
 _RIVAL = 0.3
 """Fraction of the best horizon's edge count above which a second horizon makes the result ambiguous."""
@@ -248,8 +248,8 @@ def nadir_of_uncertain_field(
     The image is searched with eleven trial focal lengths. Nadir and altitude are means over the horizons of
     all focal lengths. The weight of a horizon is the probability of its focal length and of its misfit. The
     uncertainties include the differences between the horizons. A horizon that contradicts the brightness of
-    the image keeps its weight, because the brightness does not determine the focal length. If such horizons
-    have more than half of the total weight, the image is refused. See `find_nadir`.
+    the image keeps its weight, because the brightness does not determine the focal length. If horizons that
+    contradict the brightness have more than half of the total weight, the image is refused. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)

@@ -1,8 +1,8 @@
 """Settings of the horizon search, the response of the detector, and prior knowledge for one image.
 
 A horizon does not determine the rotation about nadir. Prior knowledge (position, Sun, rough attitude,
-directions from other sensors) determines the rotation about nadir. A fitted horizon is also tested against
-this knowledge.
+directions from other sensors) determines the rotation about nadir. Prior knowledge is also a test of a fitted
+horizon.
 """
 
 from __future__ import annotations
@@ -153,8 +153,8 @@ class HorizonSettings:
     Attributes:
         edges: settings of the search for edges.
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
-            of the limb height is valid for air of unknown scale height (6.5 to 9.5 km) and unknown haze. The
-            value 1,000 m is valid if scale height and haze are known.
+            of the limb height is valid for air of unknown scale height (6.5 to 9.5 km) and unknown haze. If
+            scale height and haze are known, a standard deviation of 1,000 m is valid.
         altitude_sigma: standard deviation of the altitude of a known position, m.
         altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
             would accept any bright disc as the Earth, for instance a lens ghost.
@@ -166,7 +166,7 @@ class HorizonSettings:
         candidates: maximum number of candidate horizons in one image.
         tries: maximum number of pairs or triples of edges that are tried for each horizon.
         sphere_sigma: standard deviation per axis, rad, of the limb's tilt by the Earth's flattening for a
-            camera close to the surface. It is added to the uncertainty of nadir if the direction of the
+            camera close to the surface. The tilt is added to the uncertainty of nadir if the direction of the
             flattening is unknown. The tilt of the limb decreases with the square of the distance from the
             Earth's centre.
     """

@@ -26,7 +26,10 @@ _MOVED = 0.25
 _QUIET_FRAMES = 12
 """Number of counted frames without a change after which a block shows structure."""
 _LARGEST = 0.4
-"""Largest fraction of the image that an estimated mask may cover. A larger mask is discarded."""
+"""Largest fraction of the image that an estimated mask may cover.
+
+An estimated mask that covers a larger fraction is discarded.
+"""
 
 
 def polygon_mask(rows: int, columns: int, polygons: Sequence[Sequence[tuple[float, float]]]) -> BoolArray:

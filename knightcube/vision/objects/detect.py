@@ -6,22 +6,23 @@ In camera axes, all stars rotate about the same axis by the same angle. Three in
 not that of a star: the perpendicular bisector of its chord misses the common centre of rotation, the streak
 subtends a different angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is
 large (Sease, eq. (4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight,
-the centre of rotation is almost at infinity in the image. In this case, the slope and the length of the chord
-are used instead of the centre and the angle. In a wide field, the pinhole projection changes slopes and
-lengths by far more than their errors. Each indicator is therefore compared with the indicator of a star at
-the same position, in units of the expected error of an endpoint. An indicator must exceed 2.5 standard
-deviations over the streaks of the image (Sease, text at Table 4.4), and also a minimum threshold, which was
-measured in images without objects.
+the centre of rotation is almost at infinity in the image. If the centre of rotation is farther away than
+`_FARTHEST_CENTRE`, the slope and the length of the chord are used instead of the centre and the angle. In a
+wide field, the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is
+therefore compared with the indicator of a star at the same position, in units of the expected error of an
+endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the image (Sease, text at Table
+4.4), and also a minimum threshold, which was measured in images without objects.
 
 A streak with a large indicator may also be the overlapping streaks of two stars, or a segment of a faint
-star's streak ("overlapping streak" in Sease, Table 4.4). For these streaks and regions, the class `Judge`
-tests whether stars alone explain the pixels (`star_light`). Sease discards regions with more than two corners
-(peaks of the corner detector). Such a region may consist of several stars, or of an object that crosses a
-star. Bright points in an image whose stars are streaks are objects that the camera tracks (Sease, Figure
-4.5). Saturated regions, regions with large indicators, and regions in which objects and stars may merge are
-searched again after the stars are subtracted. The only input besides the image is the rotation of the camera
-during the exposure. The maximum-likelihood estimate of the rotation from all pixels of the streaks is more
-accurate than an estimate from the streak ends, and succeeds in more images.
+star's streak ("overlapping streak" in Sease, Table 4.4). The class `Judge` tests whether stars alone explain
+the pixels of a streak with a large indicator or of a region with more than two corners (`star_light`). Sease
+discards regions with more than two corners (peaks of the corner detector). A region with more than two
+corners may consist of several stars, or of an object that crosses a star. Bright points in an image whose
+stars are streaks are objects that the camera tracks (Sease, Figure 4.5). Saturated regions, regions with
+large indicators, and regions in which objects and stars may merge are searched again after the stars are
+subtracted. Besides the image, the search for objects needs only the rotation of the camera during the
+exposure. The maximum-likelihood estimate of the rotation from all pixels of the streaks is more accurate than
+an estimate from the streak ends, and succeeds in more images.
 """
 
 from __future__ import annotations
@@ -124,8 +125,8 @@ def lengths(endpoints: FloatArray) -> FloatArray:
 def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return the norms (n,) of the OLAE residuals of streaks (Sease, eq. (4.7)).
 
-    The first argument is the unit vectors to the first and the last end of each streak (n, 2, 3). The second
-    argument `rotation` (3,), rad, is the rotation vector of the camera.
+    The array `vectors` (n, 2, 3) contains the unit vectors to the first and the last end of each streak, and
+    `rotation` (3,), rad, is the rotation vector of the camera.
     """
     angle = float(np.linalg.norm(rotation))
     scale = np.tan(0.5 * angle) / angle if angle > 0.0 else 0.5
@@ -151,8 +152,8 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 # Distance of the rotation centre from the boresight, in focal lengths, above which slopes are used instead.
-# This distance is computed from the rotation axis, because the errors of a fitted centre make its distance
-# too small.
+# The distance of the rotation centre is computed from the rotation axis, because the errors of a fitted
+# centre make its distance too small.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -284,7 +285,7 @@ class SpaceObject:
         relative_rate: angular rate of the object relative to the stars, rad/s.
         direction: direction of the motion relative to the stars, a unit vector (x, y) in the image.
         other_relative_rate: angular rate of the object relative to the stars for the reverse order of the
-            ends, rad/s. One image does not show the order.
+            ends, rad/s. One image does not show the order of the ends in time.
     """
 
     endpoints: FloatArray
@@ -343,8 +344,8 @@ _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided to compare their brightness.
 _PARTS = 12
 # Limits of the excess of chi-square (over its expected value) that remains with an object, relative to the
-# decrease of chi-square by the object. The first limit applies to every object. The second, lower limit is
-# required of a uniform streak that resembles that of a star.
+# decrease of chi-square by the object. The first value limits the excess of chi-square beside every object.
+# The second value is a stricter limit for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
 # Fraction of the required decrease of chi-square above which the light may be a part of an object's streak.
 _PART = 0.6
@@ -690,9 +691,9 @@ class Judge:
     def begins_a_star(self, ends: FloatArray, flux: float) -> bool:
         """Return whether a line between `ends` (2, 2), px, may be the part of a star beside other stars.
 
-        In this case, the line lies on the path of a star that begins or ends at one end of the line. The
-        whole path is at least about as bright as the line of `flux` counts, because other stars cover the
-        rest of the path.
+        A line may be the part of a star if it lies on the path of a star that begins or ends at one end of
+        the line. The whole path must be at least about as bright as the line of `flux` counts, because other
+        stars cover the rest of the path.
         """
         length = max(float(np.linalg.norm(ends[1] - ends[0])), 1.0)
         directions = self.pinhole.unit_vectors(ends[[0, 0, 1, 1]])
@@ -722,8 +723,8 @@ class Judge:
         """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
 
         The object moves from the first of the `ends` (2, 2), px, to the second. Both ends of a streak are
-        rotated to mid-exposure like the directions of stars. The difference that remains is the motion
-        relative to the stars.
+        rotated to mid-exposure like the directions of stars. The difference between the rotated ends is the
+        motion of the object relative to the stars.
         """
         middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
         angle = np.arctan2(np.linalg.norm(np.cross(middle[0], middle[1])), middle[0] @ middle[1])
@@ -851,7 +852,8 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # The angle that a pixel subtends is largest on the boresight. This value is used for all directions.
+    # The angle that a pixel subtends on the boresight is the largest such angle, and is used for all
+    # directions.
     sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

@@ -346,7 +346,7 @@ def measure_objects(
         fits = _among_streaks(seen, stars, solution, motion, rotation, exposure, settings)
     else:
         fits = _among_points(seen, stars, settings)
-    # The fits of two areas may converge to the same object. In this case, only the first fit is kept.
+    # If the fits of two areas converge to the same object, only the first fit is kept.
     middles = np.array([fit.middle for fit, _ in fits]).reshape(-1, 2)
     away = np.linalg.norm(middles[:, None] - middles, axis=2)
     again = np.any(np.tril(away < _SAME, -1), axis=1)
@@ -387,7 +387,7 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of one count is computed from the identified streaks. It is NaN if no streak is
+    # The magnitude of one count is computed from the identified streaks, and is NaN if no streak is
     # identified.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None

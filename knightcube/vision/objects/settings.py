@@ -84,8 +84,8 @@ class ObjectSettings:
         most_corners: number of corners (peaks of the Harris response) above which a region is not examined.
         point_significance: minimum flux of a short region, in standard deviations.
         improvement: minimum decrease of chi-square when an object is added to a model of stars.
-        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars. It is
-            larger than `improvement`, because many lines are tested.
+        crossing_improvement: minimum decrease of chi-square for an object whose streak crosses stars, larger
+            than `improvement` because many lines are tested.
         worst_fit: largest chi-square per pixel along the streak of an accepted object.
         streak_sigma: standard deviation, per axis, of the midpoint of a streak that is too short to locate
             its ends, px.
@@ -119,8 +119,8 @@ class ObjectMeasurementSettings:
         faintest: V magnitude of the faintest object that is reported; the star catalogue must be complete to
             fainter magnitudes.
         significance: minimum flux of an area of light, in standard deviations.
-        clearance: minimum distance between an object and the nearest catalogue star, px. Half the length of
-            the object's area of light is added to this distance.
+        clearance: minimum distance between an object and the nearest catalogue star, px, in addition to half
+            the length of the object's area of light.
         floor: minimum standard deviation per axis of a position, px (from the campaign `object-passes`).
         centre_sigma: minimum standard deviation per axis, px, of the centroid that is used if the fit of an
             object fails.

@@ -8,8 +8,8 @@ object from a star.
 The class `StarField` keeps the directions of the stars of earlier frames. The predicted rotation of the
 camera assigns the points of a new frame to these stars, and the assigned stars correct the rotation. A point
 that is not assigned to a star is noise, an object, or a star that has entered the field of view. A tracker
-over several frames determines which of these points move. An object that moves less than the matching
-tolerance from frame to frame is mistaken for a star.
+over several frames determines which points move relative to the stars. An object that moves less than the
+matching tolerance from frame to frame is mistaken for a star.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class StarField:
         """Return the attitude of a frame relative to the field, and which of its points are stars.
 
         If fewer than three points are stars of the field, the field is not updated, and all points are
-        treated as stars. After three such successive frames, the field is cleared and begins with a new
-        frame.
+        treated as stars. After three successive frames with fewer than three stars of the field, the field is
+        cleared and begins with a new frame.
 
         Args:
             found: points of light in the frame.

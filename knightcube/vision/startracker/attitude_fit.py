@@ -118,8 +118,8 @@ class StarMatch:
 # Rotation step (rad) below which the iteration ends. After a step d, the error is about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition number of the normal equations. The value is reached if all stars lie within
-# 1e-6 rad of one direction.
+# Minimum reciprocal condition number of the normal equations, which is reached if all stars lie within 1e-6
+# rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -237,8 +237,8 @@ def _refined_numpy(
     """Return whether the fit converged, matrix, scale, covariance and squares of the `Refinement`."""
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
-    # The rows contain weighted predictions, residuals and derivatives by the scale. Their 9 x 9 Gram matrix
-    # contains all terms of the normal equations.
+    # The 9 x 9 Gram matrix of weighted predictions, residuals and derivatives by the scale contains all terms
+    # of the normal equations.
     rows = np.zeros((len(observed), 9))
     normal = np.zeros((parameters, parameters))
     failed = False, matrix, scale, np.zeros((parameters, parameters)), np.zeros(len(observed))

@@ -2,11 +2,11 @@
 
 In a frame of long streaks, most stars are fainter than the noise of a pixel. The light of these faint stars
 overlaps the bright streaks and displaces their measured positions. A close pair of stars is measured as one
-star. After a frame is identified, the positions of all stars are known from the catalogue. The magnitudes of
-all stars are also known from the catalogue. They are converted to counts by means of the measured stars.
-Stars that are too faint to be fitted, or too near to a brighter star, are subtracted from the frame, and the
-uncertainty of their brightness is added to the noise. The initial positions of the fitted stars are their
-catalogue positions. Light sources that are not in the catalogue are fitted but do not affect the motion.
+star. After a frame is identified, the positions of all stars are known from the catalogue. The catalogue
+magnitudes of all stars are converted to counts by means of the measured stars. Stars that are too faint to be
+fitted, or too near to a brighter star, are subtracted from the frame, and the uncertainty of their brightness
+is added to the noise. The initial positions of the fitted stars are their catalogue positions. Light sources
+that are not in the catalogue are fitted but do not affect the motion.
 """
 
 from __future__ import annotations

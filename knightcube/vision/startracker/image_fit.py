@@ -7,16 +7,16 @@ squares, found by a Gauss-Newton iteration, is the maximum likelihood estimate f
 that overlaps another star has a wrong position. Streaks with wrong positions are found by means of Huber's
 weights, which limit the influence of each star, and are excluded.
 
-Tilt, decentring and distortion of the lens are also fitted, with a prior from the calibration or from typical
-lenses. These lens errors are named `bend` in the code (see `sky_map`). The covariance of the attitude
-includes the remaining uncertainty of the lens. An error of the line time of a rolling shutter, which
-displaces each star along its motion in proportion to its row, is also fitted.
+Tilt, decentring and distortion of the lens (the lens errors `bend`, see `sky_map`) are also fitted, with a
+prior from the calibration or from typical lenses. The covariance of the attitude includes the remaining
+uncertainty of the lens. An error of the line time of a rolling shutter, which displaces each star along its
+motion in proportion to its row, is also fitted.
 
-Some stars do not agree with the model of their images, for example curved streaks or the rings of a defocused
-lens. Their positions have errors of some pixels, regardless of their brightness. If the residuals show such
-errors, a variance common to all stars is added to the noise, so that the sum of squares equals the number of
-degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the
-brightest stars would dominate the fit, and the covariance would be too small.
+A star has a position error of some pixels, regardless of its brightness, if its image does not agree with the
+model, for example a curved streak or the ring of a defocused lens. If the residuals show such errors, a
+variance common to all stars is added to the noise, so that the sum of squares equals the number of degrees of
+freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the brightest stars
+would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class Unknowns:
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
         scatter: whether a variance common to all stars is added to the variances of the positions for any
-            excess of the residuals. Otherwise the common variance is added only if the excess is significant
-            and a factor common to all variances explains it less well.
+            excess of the residuals. If `scatter` is false, a common variance is added only if the excess of
+            the residuals is significant and a factor common to all variances explains it less well.
     """
 
     scale: bool = False

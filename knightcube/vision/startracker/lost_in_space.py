@@ -123,7 +123,7 @@ def middle_sized(field: StarField, most: int) -> IntArray:
 def triples(count: int, shuffled: bool = False) -> IntArray:
     """Return all triangles (t, 3) of `count` stars, sorted by the index of each triangle's faintest star.
 
-    Shuffled triangles are in a random order, which is always the same.
+    If `shuffled` is true, the triangles are in a random order, which is the same in each call.
     """
     first, second, third = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
     ascending = (first < second) & (second < third)
@@ -218,7 +218,8 @@ class TriangleMatches:
 
 
 _BINS_PER_LN_SCALE = 15.0
-# Factors of a multiplicative hash, below 2^31 so that products of 32-bit numbers fit into 64 bits.
+# Factors of a multiplicative hash. Factors below 2^31 ensure that products of 32-bit numbers fit into 64
+# bits.
 _OF_STAR, _OF_PAIR, _OF_CODE = 1021, 257, 1_640_531_527
 
 
@@ -235,8 +236,8 @@ def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
     """Return the votes (k,) for each of k matches of triangles.
 
     The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
-    contain the pair. The votes of a match are the sum of the votes of its three pairs. Pairs that share the
-    first bits of their codes by chance, which is rare, only add wrong votes.
+    contain the pair. The votes of a match are the sum of the votes of its three pairs. Two pairs rarely have
+    the same first bits of their codes by chance. If they do, their votes are added by mistake.
     """
     bits = max(13, code.size.bit_length())
     slot = code >> np.uint32(32 - bits)
@@ -432,19 +433,20 @@ def _matching_entries(
     places: npt.NDArray[np.uint16],
     layout: IntArray,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Return the index entries (k,) among the `total` ones in `runs` that match, and their triangles (k,)."""
+    """Return those of the `total` index entries in `runs` that match (k,), and their triangles (k,)."""
     entry, query = np.empty(total + 8, dtype=np.int32), np.empty(total + 8, dtype=np.int32)
     found, sizes, most = 0, 1 << layout[2], 0
     for run in range(len(runs)):
         most = max(most, runs[run, 1] - runs[run, 0])
-    # Entries are compared eight at a time, so that the comparison takes vector instructions only.
+    # Eight entries are compared at a time, so that the compiled comparison consists of vector instructions.
     near = np.zeros(8 * (most // 8 + 1), dtype=np.uint8)
     eight = near.view(np.uint64)
     for run in range(len(runs)):
         begin, end, low, high, lower, upper, triangle = runs[run]
         if begin == end:
             continue
-        # The entries of a range are in the same cells. Entries before and after the range fail by length.
+        # All entries of a range are in the same cells. Entries before and after the range are excluded by the
+        # length of the longest side.
         form = np.int64(key[begin]) & ~(sizes - 1)
         shortest = form + min(math.ceil(limits[triangle, 0] * sizes), sizes - 1)
         longest = form + min(math.floor(limits[triangle, 1] * sizes), sizes - 1)
@@ -478,7 +480,7 @@ def _mark(
     short: tuple[np.uint8, np.uint8],
     middle: tuple[np.uint8, np.uint8],
 ) -> None:
-    """Write 1 to `near` (k,) for index entries between the limits of key and places, and 0 for others."""
+    """Write 1 to `near` (k,) for index entries within the limits of key and positions, otherwise 0."""
     for k in range(len(near)):
         one, two = np.uint8(places[k] & 0xFF), np.uint8(places[k] >> 8)
         fits = (lengths[k] >= length[0]) & (lengths[k] <= length[1])

@@ -6,10 +6,10 @@ up to 20.8". Aberration is computed by the exact formula of special relativity (
 
 The conversion also includes lens errors: tilt and decentring, which displace the optical axis from the image
 centre, and distortion. The lens errors displace a point with the tangents u by (u . a) u + |u|^2 b + k |u|^2
-u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). Pixels that are not square displace
-the point by p (u_x, -u_y) + q (u_y, u_x), with the aspect p and the shear q. An example is a picture that was
-scaled differently along its two axes. The eight lens errors form the vector (a, b, k, l, p, q), which is
-named `bend` in the code.
+u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). Pixels that are not square, for
+example in a picture that was scaled differently along its two axes, displace the point by p (u_x, -u_y) + q
+(u_y, u_x), with the aspect p and the shear q. The eight lens errors form the vector (a, b, k, l, p, q), which
+is named `bend` in the code.
 
 `Pointing` gives the right ascension, declination and roll of an attitude.
 """
@@ -76,8 +76,8 @@ def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
     """Return the reciprocal prior variances (6,) of lens errors for a known accuracy and square pixels.
 
     For an exact lens, an empty array (0,) is returned. An error of the optical axis's position in the image
-    has the effect of a tilt of the lens. An error of the optical axis also rotates all stars by the same
-    angle. This rotation is attributed to the camera's mounting, not to the lens.
+    has the effect of a tilt of the lens. The rotation of all stars by the same angle, which an error of the
+    optical axis also causes, is attributed to the camera's mounting instead of the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)
@@ -180,7 +180,7 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Number of iterations that invert the lens errors. Each iteration reduces the error to a few per cent.
+# Number of iterations that invert the lens errors; each iteration reduces the error to a few per cent.
 _BEND_STEPS = 8
 
 

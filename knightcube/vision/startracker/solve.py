@@ -103,7 +103,7 @@ class FrameSolution:
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution with `by` (3, 3), rad^2, added to the covariance of any attitude."""
+        """Return the solution with `by` (3, 3), rad^2, added to the attitude covariance if there is one."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
@@ -211,9 +211,9 @@ _LEAST_SIGNIFICANCE = 5.0
 _PLACELESS_PX = 5.0
 # Distance (px) below which a point may be a part of the same star as a matched point.
 _SPLIT_PX = 10.0
-# Thresholds for the number of such points from which stars are imaged as several points each. The number must
-# exceed the expected number by chance by the first value times its standard deviation plus the second value
-# times the number of matched points.
+# Thresholds for the number of points near matched points above which each star is assumed to be imaged as
+# several points. The number of points must exceed the number expected by chance by the first value times its
+# standard deviation plus the second value times the number of matched points.
 _SPLIT_SIGMAS, _SPLIT_SHARE = 4.0, 0.25
 # Largest chi-square of the difference from the prior attitude (1 false rejection in 100,000 frames).
 _NEAR = 25.9
@@ -415,7 +415,7 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
     """Return the solution with its covariance increased if the stars are wider than the given PSF.
 
     If star images have a tail, due to the lens or to stray light, the centroids depend on the weights of the
-    pixels. All positions then have a common error.
+    pixels, and all positions have a common error.
     """
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):

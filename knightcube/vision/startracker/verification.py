@@ -70,8 +70,8 @@ class Chance:
         """Return log10 of an upper bound of the expected number of chance matches as good as a given match.
 
         The faintest expected star that is compared is also selected for the most significant match. Because
-        of this selection, the bound is multiplied by j^2 pi^2/6, where j - 1 is the number of brighter
-        expected stars without a match.
+        of the selection of the faintest star, the bound is multiplied by j^2 pi^2/6, where j - 1 is the
+        number of brighter expected stars without a match.
 
         Args:
             gate: half-width within which a star matches, in standard deviations.
@@ -661,9 +661,9 @@ def _pair(
 ) -> None:
     """Write the nearest expected star of each observed star and its squared distance in standard deviations.
 
-    The distance is infinite for an observed star that is not the nearest one of its nearest expected star,
-    and for one farther than the chord `reach` from every expected star. The `tangent` (n,), at scale 1, of
-    the observed stars along the first axis ascends in the given `order`.
+    The distance is infinite if the nearest expected star of an observed star has a nearer observed star, or
+    if every expected star is farther away than the chord `reach`. The `tangent` (n,), at scale 1, of the
+    observed stars along the first axis ascends in the given `order`.
     """
     closest, owner = np.full(len(seen), -2.0), np.full(len(expected), -1)
     nearest[:] = 0
@@ -813,8 +813,8 @@ def _identified(field: StarField, matching: _Matching, refined: Refinement) -> S
 PRIOR_SIGMAS = 4.0
 """Largest error of a prior attitude that the search near it covers, in standard deviations."""
 _BRIGHTEST = 16
-# Maximum number of pairs of an observed and a predicted star. If the number of pairs is larger, the
-# comparison is ambiguous and takes longer than a search of the whole sky.
+# Maximum number of pairs of an observed and a predicted star. If more pairs were compared, the comparison
+# would be ambiguous and would take longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 

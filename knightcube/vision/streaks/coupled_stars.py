@@ -1,7 +1,7 @@
 """Solution of the normal equations of stars that share pixels, by conjugate gradients.
 
 The equations without the coupling of stars are the preconditioner, so that few iterations suffice. A vector
-of all parameters consists of the s parameters that all stars share, followed by the a own parameters of each
+of all parameters consists of the s parameters common to all stars, followed by a further parameters for each
 of the n stars.
 """
 

@@ -2,16 +2,16 @@
 
 The bright regions of the frame give initial guesses of the motion, and each guess is fitted to the brightest
 stars. A matched filter along each fitted motion detects faint stars. The final estimate is a joint fit of the
-motion and the bright stars. Its model includes the flux of the faint stars. A final check verifies that each
-modelled streak matches one complete streak in the frame. If the fitted rotation is too small, a streak is
-modelled as several segments. If it is too large, several streaks are modelled as one streak. All functions of
-this module are pure and deterministic.
+motion and the bright stars, with a model that includes the flux of the faint stars. A final check verifies
+that each modelled streak matches one complete streak in the frame. If the fitted rotation is too small, a
+streak is modelled as several segments. If the fitted rotation is too large, several streaks are modelled as
+one streak. All functions of this module are pure and deterministic.
 
 With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
 against it. Under a rolling shutter, a motion and its time reversal produce streaks of different lengths. A
 prior rate determines the sign of the rotation before the fit. Without a prior rate, both signs of the
 rotation are fitted, and the better fit is selected. If neither sign of the rotation fits significantly
-better, the sign remains unknown. The rate is then the mean of one fitted rate and the negative of the other
+better, the sign remains unknown, and the rate is the mean of one fitted rate and the negative of the other
 fitted rate. The covariance of the averaged rate includes the difference between the two fits.
 """
 

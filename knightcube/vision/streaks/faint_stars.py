@@ -7,7 +7,7 @@ the circles, the filter response is proportional to the brightness profile of th
 filter response is a star. The heights of overlapping peaks are the solution of a linear system. For bright
 stars, the second difference of the response along the circle separates overlapping triangles.
 
-If the brightest regions do not determine the rotation angle, all circles are searched. This search of all
+If the brightest regions do not determine the rotation angle, all circles are searched. The search of all
 circles is needed if streaks are faint and fragmented, or if the border truncates all streaks. The mean of the
 pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
 length with the largest sum of squared significances is the length of the streaks.
@@ -90,8 +90,8 @@ def sharp_peaks(
     """Return grid rows and columns of bright stars, found by the second difference of the filter response.
 
     The peaks of the second difference are narrow, so that stars close to each other on one circle are
-    separated. Only p samples with high filter responses are searched. Their flat indices are `place` (p,),
-    and their noise is `deviation` (p,).
+    separated. Only the p samples with high filter responses are searched. The arguments `place` (p,) and
+    `deviation` (p,) are the flat indices and the noise of these samples.
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -101,8 +101,8 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference is scaled so that it equals the response for an isolated star. Its noise is scaled
-    # by the same factor.
+    # The second difference, and its noise, are scaled so that the second difference equals the response for
+    # an isolated star.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -115,7 +115,7 @@ def sharp_peaks(
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return fractional grid rows and columns of the peaks that stronger peaks do not explain, descending.
+    """Return descending peaks that stronger peaks do not explain, as fractional grid rows and columns.
 
     Only the flat indices `place` (p,) of the filter response are searched. The range `span` (r, 2) of columns
     on the detector is that of `RunningSums`.
@@ -198,7 +198,7 @@ def _unshaded(
 
 
 def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return grid rows and columns of local maxima among the flat indices `place` (p,), descending."""
+    """Return grid rows and columns of local maxima among the indices `place` (p,), in descending order."""
     columns = values.shape[1]
     place = place[_summits(values.reshape(-1), place, columns)]
     place = place[np.argsort(-values.reshape(-1)[place], kind="stable")[:_MOST_PEAKS]]

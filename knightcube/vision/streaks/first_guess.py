@@ -267,8 +267,8 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Relative part of the standard error of a region's length, as a fraction of the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of two rankings. Only one ranking includes the votes against an
-# angle.
+# Maximum number of rotation angles from each of two rankings. Only one of the two rankings includes the votes
+# against a rotation angle.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) between the circles on which two fragments of one streak lie.
 _SAME_CIRCLE = 2.0
@@ -380,8 +380,8 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         return None
     axis, agree = found
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # Azimuth zero is the direction from the rotation axis to the image centre. It is arbitrary if the two
-    # coincide.
+    # Azimuth zero is the direction from the rotation axis to the image centre, and is arbitrary if the
+    # rotation axis passes through the image centre.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]

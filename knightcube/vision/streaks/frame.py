@@ -234,8 +234,8 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     """Return `frame` with the filter responses of a colour mosaic equalised, or None if they are equal.
 
     The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. Each bright region has
-    about the same flux on the four kinds of pixels of the pattern. The ratios of the sums of their counts are
-    therefore the responses to starlight.
+    about the same flux on the four kinds of pixels of the pattern. The ratios of the summed counts of the
+    four kinds of pixels are therefore the responses to starlight.
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:

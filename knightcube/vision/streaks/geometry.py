@@ -160,7 +160,7 @@ class CameraMotion:
         return np.asarray(self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY))
 
     def relative_rate(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rate about the mean axis at `time` (m,) over the mean rate, or its time derivative."""
+        """Return the rate about the mean axis at `time` (m,), relative to the mean, or its derivative."""
         vector = _rate(self, time) if derivative == 0 else self.acceleration[:, None] + self.higher(time, 2)
         relative = self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY)
         return np.asarray(np.broadcast_to(relative, time.shape))

@@ -786,7 +786,7 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return which stars in the motion fit agree with most others in the motion, or all if few agree."""
+    """Return which stars in the motion fit agree with the majority, or all of them if too few agree."""
     estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
     if estimates is None:

@@ -7,8 +7,8 @@ equations, which leaves the shared parameters (rate, acceleration, width). Stars
 coupled, and a few conjugate-gradient iterations account for the coupling.
 
 Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
-than the image of a single star, and the flux of a neighbouring star shifts the ends of a streak. The
-estimates of blended stars disagree with the majority. These stars are excluded from the fit of the motion.
+than the image of a single star, and the flux of a neighbouring star shifts the ends of a streak. Blended
+stars are excluded from the fit of the motion, because their estimates disagree with the majority.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def model_images(
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
     """Return the images whose combinations model long streaks, and the images of spots with derivatives.
 
-    The last image of each long streak is not initialised. It is memory for the residual.
+    The last image of each long streak is not initialised, because it is the memory for the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -359,7 +359,7 @@ def _spot_images(
 ) -> Float32Array:
     """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spot images of p x p pixels by parameter.
 
-    The last element along the second axis is not initialised. It is memory for the residual.
+    The last element along the second axis is not initialised, because it is the memory for the residual.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
@@ -538,7 +538,7 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
         return None
     out = np.empty((3, 3))
     for k in range(3):
-        # The equations are scaled so that the solution is of order one. The same tolerance is then valid for
+        # The equations are scaled so that the solution is of order one and the same tolerance is valid for
         # all frames.
         unit = np.zeros(SHARED + ALONE * len(evaluation.chi2))
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
@@ -633,7 +633,7 @@ def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) 
 
 
 def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
-    """Return the estimate of three rate components and of the point-spread width by each star.
+    """Return, for each star, its estimate of three rate components and of the point-spread width.
 
     The rate components are along the rotation axis and along two vectors normal to it. All estimates are
     changes relative to the scene, in rad per exposure for the rate and in px for the width.

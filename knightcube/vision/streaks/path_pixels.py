@@ -24,14 +24,14 @@ LINES = 10
 STEEPEST = 0.68
 """Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
 
-# Largest camera rotation (rad) within a part of a path. It ensures that the star's column or row changes
+# Largest camera rotation (rad) within a part of a path for which the column or row of the star changes
 # monotonically.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
 _SAMPLES = 17
 # Ratio of a star's speeds along rows and along columns at which its path is divided into parts. If the ratio
-# were 1, the border between two parts could follow a diagonal of pixels, and all pixels of the diagonal would
-# be omitted.
+# of the speeds were 1, the border between two parts could follow a diagonal of pixels, and all pixels of the
+# diagonal would be omitted.
 _DIAGONAL = 1.03
 # Number of instants at which the direction of part of a path is evaluated.
 _INSTANTS = 7

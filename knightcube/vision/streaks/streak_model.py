@@ -22,7 +22,7 @@ following equation gives the change dm of the counts if a parameter displaces th
 
 In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
 per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with
-coefficients for each block of pixels. One basis image is the first moment of m along the path. It describes
+coefficients for each block of pixels. One basis image, the first moment of m along the path, describes
 derivatives that vary along a block of pixels.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at

@@ -2,9 +2,9 @@
 
 The covariance due to photon noise is a lower limit. The covariance is increased by the scatter of the stars
 beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
-all stars equally and therefore cause no scatter. The first is a point spread with an unexpected width or
-profile, which moves the ends of all streaks. The second is vibration of the body. The residuals at the streak
-ends and along the streaks limit the errors from point spread and vibration.
+all stars equally and therefore cause no scatter. One error is a point spread with an unexpected width or
+profile, which moves the ends of all streaks. The other error is vibration of the body. The residuals at the
+streak ends and along the streaks limit the errors from point spread and vibration.
 """
 
 from __future__ import annotations
@@ -596,7 +596,7 @@ def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, mi
 
     If the residuals at the streak ends are not significant, the point spread has the modelled profile, with
     the same width along and across the streaks. Significant residuals at the streak ends indicate a different
-    profile of the point spread, or an unresolved fast vibration. Both shift the apparent ends.
+    profile of the point spread or an unresolved fast vibration, which shifts the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described

@@ -25,8 +25,8 @@ from knightcube.vision.streaks.path_pixels import LINES
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Addition to this threshold for another star's flux, relative to the brightest modelled pixel of the same
-# line.
+# Addition to the residual threshold for another star's flux, relative to the brightest modelled pixel of the
+# same line.
 _FOREIGN_SHARE = 0.6
 
 
@@ -205,8 +205,9 @@ def fit_vibration(
 def vibration_covariance(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> FloatArray:
     """Return the covariance (3, 3), rad^2, that a fitted vibration adds to the rotation over the exposure.
 
-    The point spread averages a vibration of short wavelength. The model of the streaks neglects this effect,
-    which also reduces the fitted amplitudes. The corresponding error of the streak ends is included.
+    The point spread averages a vibration of short wavelength. The model of the streaks neglects the averaging
+    by the point spread, which also reduces the fitted amplitudes. The corresponding error of the streak ends
+    is included.
     """
     vibration = scene.motion.vibration
     if not vibration.exists or not len(left.star):
@@ -369,8 +370,8 @@ def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, Flo
     ]
     information, score = sums.normal_equations(np.concatenate(functions))
     n = 9 + 6 * k
-    # The last k parameters are the changes of the frequencies. Their functions are scaled by the previous
-    # amplitudes.
+    # The last k parameters are the changes of the frequencies. The functions of the frequency changes are
+    # scaled by the previous amplitudes.
     chosen = np.zeros((len(score), n + k))
     chosen[:n, :n] = np.eye(n)
     amplitudes = np.stack([vibration.sine, vibration.cosine])

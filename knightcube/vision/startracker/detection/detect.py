@@ -1,6 +1,6 @@
 """Detection of the stars of a frame, in the whole frame or near predicted positions.
 
-`detect` searches a whole frame. It measures the local maxima of the areas above the noise, and flags sources
+`detect` searches a whole frame, measures the local maxima of the areas above the noise, and flags sources
 that are not stars. `measure_near` reads only small windows around predicted positions, for tracking.
 """
 
@@ -243,7 +243,7 @@ _WIDEST_CORE = 7.0
 _SHARPER, _BROADER = 0.55, 1.8
 _SURE = 3.0
 _LONGER_THAN_COMA = 12.0
-# Radius (px) around a source within which most sources must look like stars. Otherwise the source is clutter.
+# Radius (px) around a source within which most sources must look like stars for the source not to be clutter.
 _ABOUT = 48.0
 _ODD_PART, _LEAST_ODD = 0.5, 8
 _ODD_WIDTH, _ODD_LENGTH = 1.25, 2.5
@@ -315,7 +315,7 @@ def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, target
 
 
 def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
-    """Return the mask of the stars in the mask `sound` (n,) that determine the PSF.
+    """Return which of the usable stars `sound` (n,) determine the PSF.
 
     The PSF is determined by the stars that are not saturated, or by all stars if all are saturated.
     """

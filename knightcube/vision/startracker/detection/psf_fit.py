@@ -131,9 +131,10 @@ class StarTargets:
         return len(self.middle)
 
 
-# Length (px) below which a star's path is treated as a point. Such a path widens a PSF of 1 px by 0.2 %.
+# Length (px) below which a star's path is treated as a point; a path of this length widens a PSF of 1 px by
+# 0.2 %.
 _SHORTEST = 0.2
-# Number of quadrature nodes. Their error is 0.1 % of the flux for paths of four PSF widths.
+# Number of quadrature nodes, for an error of 0.1 % of the flux on paths of four PSF widths.
 _NODES = 4
 _BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 
@@ -580,8 +581,8 @@ def _weights(
 ) -> None:
     """Write variance and weight of the pixels of one star.
 
-    The weight is zero for a pixel that is not `usable`. It is also zero if the square of the residual `off`
-    exceeds `limit` times the tolerated variance.
+    The weight of a pixel is zero if the pixel is not `usable`, or if the square of its residual `off` exceeds
+    `limit` times the tolerated variance.
     """
     photon, mismatch = model
     for pixel in range(len(counts)):

@@ -5,8 +5,8 @@ of the brightest areas distinguish a frame of points from a frame of streaks.
 
 The smoothing kernel is [1 2 1] along rows and columns, which is nearly the matched filter for a star of 0.7
 to 1.5 px standard deviation. The threshold is derived from the noise of the smoothed frame. Demosaicing and
-JPEG compression correlate the noise of neighbouring pixels. A threshold derived from the noise of single
-pixels would therefore be too low, and thousands of peaks would exceed it. The frame is processed in bands of
+JPEG compression correlate the noise of neighbouring pixels. With a threshold derived from the noise of single
+pixels, thousands of peaks of the correlated noise would count as stars. The frame is processed in bands of
 rows that fit into the processor cache, without a copy of the frame.
 """
 
@@ -577,7 +577,8 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Maximum median sine of the angle between streaks and image flow. Lines of a foreground exceed it.
+# Maximum median sine of the angle between streaks and image flow. Lines of a foreground have larger angles to
+# the image flow than streaks.
 _CROOKED = 0.12
 
 

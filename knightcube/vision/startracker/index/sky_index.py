@@ -183,7 +183,7 @@ def choose_guide_stars(
     centre = np.stack(
         [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
     )
-    # The number of a group is the index of its first member. This member is the brightest, because the
+    # The number of a group is the index of its first member, which is its brightest star because the
     # catalogue is sorted by magnitude.
     first = np.flatnonzero(group == np.arange(len(catalogue)))
     magnitude = -2.5 * np.log10(joint[first])
@@ -260,10 +260,10 @@ class TriangleIndex:
 
     @cached_property
     def table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The arrays `key`, `corners`, places and `below`, contiguous and read-only, and the layout of keys.
+        """The arrays key, corners, positions and below, contiguous and read-only, and the layout of keys.
 
-        The places (m,), uint16, have the two columns of `shape` in their low and high bytes. The layout (4,)
-        is `CELLS`, `FINE`, `SIZE_BITS` and `RUN_BITS`.
+        The positions (m,), uint16, contain the two columns of `shape` in their low and high bytes. The layout
+        (4,) is `CELLS`, `FINE`, `SIZE_BITS` and `RUN_BITS`.
         """
         layout = np.array([CELLS, FINE, SIZE_BITS, RUN_BITS])
         places = np.ascontiguousarray(self.shape).view("<u2").ravel()
@@ -286,7 +286,8 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
     count = len(direction)
     result = np.full(count, farthest)
     wanted = np.arange(count)
-    # Most stars have a small reach. A fast comparison with the brightest stars of the sky shows which stars.
+    # A fast comparison with the brightest stars of the sky shows which stars have a small reach; most stars
+    # do.
     brightest = math.ceil(4.0 * _BRIGHTER * rank / least**2) if least > 0.0 else count
     if brightest < count:
         near = cKDTree(direction[:brightest]).query_ball_point(
@@ -340,7 +341,8 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
-    # Most circles contain enough of the sky's brightest stars. For the other circles, all stars are searched.
+    # Most circles contain enough of the sky's brightest stars. For a circle with too few of the brightest
+    # stars, all stars are searched.
     brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
     for count in sorted({brightest, len(direction)}):
