@@ -6,11 +6,12 @@ background. Sease, chapter 3, uses the mean of the image as threshold, but noise
 above the mean (errata). The sum over 3 x 3 pixels is nearly the matched filter of a star image one pixel
 wide.
 
-A hot pixel is a bright pixel with dark neighbours. A point of light cannot cause this pattern, because the
-optics spread its light over several pixels. If a star's image has a standard deviation of more than 0.5 px,
-the four neighbours of its brightest pixel have at least 15 % of the intensity of that pixel. Methods that
-need an image without gaps replace only those hot pixels that are detected with certainty. A fit to pixels
-excludes all suspected hot pixels. Excluding a pixel of a star by mistake does little harm.
+A hot pixel is a bright pixel with dark neighbours. A point of light cannot cause a bright pixel with dark
+neighbours, because the optics spread its light over several pixels. If a star's image has a standard
+deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the intensity
+of that pixel. Methods that need an image without gaps replace only those hot pixels that are detected with
+certainty. A fit to pixels excludes all suspected hot pixels. Excluding a pixel of a star by mistake does
+little harm.
 
 A frame that shows no scene is dead (all pixels are equal) or overexposed. Counts are multiples of 257 if
 8-bit counts were stored as 16 bits, and multiples of 16 if 12-bit counts were stored as 16 bits.

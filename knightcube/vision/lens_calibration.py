@@ -1,10 +1,10 @@
 """Calibration of a camera lens from solved frames: focal length, optical axis and radial distortion.
 
 The fit is a weighted least-squares fit in pixels to all frames at once, with an unknown attitude for each
-frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. Matches
-with residuals above five standard deviations are then rejected. The three attitude parameters of each frame
-are eliminated frame by frame with the Schur complement. The remaining system is 5 x 5 for any number of
-frames.
+frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. After
+the robust steps, matches with residuals above five standard deviations are rejected. The three attitude
+parameters of each frame are eliminated frame by frame with the Schur complement. The remaining system is 5 x
+5 for any number of frames.
 
 The data may not determine all parameters. In a narrow field, a shift of the optical axis has nearly the same
 effect as a rotation of the camera, so that a single frame hardly separates the two. Each parameter therefore

@@ -185,7 +185,8 @@ class StarTracker:
         index: a sky index, or the path of a sky index file. None: the default index.
         learn: whether the lens parameters are estimated from the solved images, which must be taken by one
             camera. The attribute `lens` contains the estimated lens parameters. The accuracy of the given
-            field of view or camera is `settings.lens`, or that of an uncalibrated camera.
+            field of view or camera is `settings.lens`. If `settings.lens` is None, the accuracy is that of an
+            uncalibrated camera.
 
     Raises:
         InputError: if a field of view is out of range or is given together with a camera, or if the index

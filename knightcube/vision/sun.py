@@ -4,11 +4,11 @@
 
 Only every n-th row of the image is read (`stride`), and bright patches on the rows are candidates for the
 Sun. The edge of a bright patch is traced along radial lines (spokes) from its centre, and a circle on the
-sphere is fitted to the edge points. The centre of this circle is the centre of the Sun, even if the disc is
-saturated, has glare, or is truncated by the edge of the image. The initial circle is the consensus among
-circles through triples of edge points, and is refined by geometric least squares (Gauss-Newton). Tukey's
-biweight of each point's distance from the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud
-beside the disc or a hot pixel on its edge.
+sphere is fitted to the edge points. The centre of the fitted circle is the centre of the Sun, even if the
+disc is saturated, has glare, or is truncated by the edge of the image. The initial circle is the consensus
+among circles through triples of edge points, and is refined by geometric least squares (Gauss-Newton).
+Tukey's biweight of each point's distance from the circle (Huber 1981, Robust Statistics, chapter 7) excludes
+a cloud beside the disc or a hot pixel on its edge.
 
 The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
 solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
@@ -301,7 +301,7 @@ def _disc(
 ) -> _Disc | None:
     """Return the disc of a bright patch around `middle` (2,), px, with its rim within `reach` rad, or None.
 
-    `strip` holds the rows of the image from row `first`.
+    The array `strip` contains the rows of the image from row `first` onwards.
     """
     axis = camera.unit_vectors(middle[None, :])[0]
     disc = None

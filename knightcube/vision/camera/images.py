@@ -255,11 +255,11 @@ _OTHER_BYTES = {
 def read_image(path: Path | str) -> Image:
     """Return the image (rows, columns) of a FITS, PNG, TIFF, JPEG or BMP file.
 
-    The format is recognised by the file's content, not by its name. Pixels are uint8 or uint16, and those of
-    FITS files may also be signed, 32-bit or floating-point. Colour images are converted to luminance (ITU-R
-    BT.601). Photographs are rotated according to the orientation in their EXIF data. All formats but FITS
-    need Pillow. Raises UsageError if the file is missing, damaged or in an unsupported format, if pixels are
-    not finite, or if Pillow is not installed.
+    The format is recognised by the file's content, not by its name. The pixels are uint8 or uint16. The
+    pixels of FITS files may also be signed, 32-bit or floating-point. Colour images are converted to
+    luminance (ITU-R BT.601). Photographs are rotated according to the orientation in their EXIF data. All
+    formats but FITS need Pillow. Raises UsageError if the file is missing, damaged or in an unsupported
+    format, if pixels are not finite, or if Pillow is not installed.
     """
     path = Path(path)
     content = _fits_content(path)
@@ -336,7 +336,7 @@ def _through_pillow(path: Path) -> Image:
         raise UsageError(f"{path}: is not a {', '.join(FORMATS)} or FITS image: convert it") from error
     except pillow.DecompressionBombError as error:
         raise UsageError(f"{path}: has too many pixels: {error}") from error
-    # Pillow raises any of these exceptions for damaged files.
+    # Pillow raises exceptions of many types for damaged files.
     except (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, struct.error) as error:
         raise UsageError(f"{path}: is damaged: {error}") from error
 

@@ -306,8 +306,8 @@ class Lens:
         """Return undistorted tangents of the field angles of distorted tangents (...), NaN beyond the fold.
 
         Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
-        that is nearer to the axis. From there, Newton's method passes the root at most once and then
-        converges from one side.
+        that is nearer to the axis. From these initial values, Newton's method overshoots the root at most
+        once and then converges from one side.
         """
         k1, k2 = self.k1, self.k2
         if k1 == k2 == 0.0:

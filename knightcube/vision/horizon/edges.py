@@ -1,8 +1,8 @@
 """Sub-pixel edges along scan lines of an image, as pixel positions and as directions.
 
 Selected columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section
-3.1. Each change from dark to bright is then located at the point of maximum slope of the brightness, smoothed
-by a Gaussian. The width of the smoothing Gaussian is doubled as long as the edge is wider than the Gaussian
+3.1. Each change from dark to bright is located at the point of maximum slope of the brightness, smoothed by a
+Gaussian. The width of the smoothing Gaussian is doubled as long as the edge is wider than the Gaussian
 (Lindeberg 1998, International Journal of Computer Vision 30, 117). Sharp edges and edges a hundred pixels
 wide are therefore both located at the steepest point of the brightness.
 """

@@ -314,8 +314,8 @@ def limb_radius_sigma(altitude: float) -> float:
     """Return the standard deviation (m) of the limb's mean radius if the position of the camera is unknown.
 
     The difference between the ellipsoid and the mean sphere is a spherical harmonic of degree 2. The mean of
-    this harmonic over the limb is its value at the sub-camera point multiplied by P2(cos a). P2 is the
-    Legendre polynomial, and a is the angle at the Earth's centre between the camera and the limb. The
+    a harmonic of degree 2 over the limb is its value at the sub-camera point multiplied by P2(cos a). P2 is
+    the Legendre polynomial, and a is the angle at the Earth's centre between the camera and the limb. The
     `altitude`, m, is measured from the mean sphere.
     """
     cosine = MEAN_RADIUS / (MEAN_RADIUS + altitude)

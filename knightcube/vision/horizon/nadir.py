@@ -12,9 +12,9 @@ the image is ambiguous. If no limb passes all tests, the image is refused, and t
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
-searched again with the nadir of the other cameras as prior knowledge. One common limb is then fitted to the
-limb points of all images. The unknown height of the air displaces every limb outwards. An unknown height of
-the air displaces the nadir only if the images show one side of the limb but not the opposite side.
+searched again with the nadir of the other cameras as prior knowledge. One common limb is fitted to the limb
+points of all images. The unknown height of the air displaces every limb outwards. An unknown height of the
+air displaces the nadir only if the images show one side of the limb but not the opposite side.
 """
 
 from __future__ import annotations

@@ -607,8 +607,8 @@ class Judge:
 
         If a streak differs from the streak of a star only near its ends, stars without an object fit most of
         its length nearly as well. For a `uniform` streak, it is therefore sufficient that the object explains
-        nearly all light that stars do not explain. A line that explains only a small part of this light is
-        rejected.
+        nearly all light that stars do not explain. A line that explains only a small part of the light
+        without stars is rejected.
         """
         gained = self._gained(light, found)
         remains = found.chi_square - light.expected

@@ -5,11 +5,11 @@ The worker measures the points of light in a frame (`measure.measure_points`). I
 streaks. Otherwise the centroids of all bright areas are measured, and a single frame does not distinguish an
 object from a star.
 
-The class `StarField` keeps the directions of the stars of earlier frames. The predicted rotation of the
-camera assigns the points of a new frame to these stars, and the assigned stars correct the rotation. A point
-that is not assigned to a star is noise, an object, or a star that has entered the field of view. A tracker
-over several frames determines which points move relative to the stars. An object that moves less than the
-matching tolerance from frame to frame is mistaken for a star.
+The class `StarField` keeps the directions of the stars of earlier frames. The points of a new frame are
+assigned to the stars of earlier frames by means of the predicted rotation of the camera, and the assigned
+stars correct the rotation. A point that is not assigned to a star is noise, an object, or a star that has
+entered the field of view. A tracker over several frames determines which points move relative to the stars.
+An object that moves less than the matching tolerance from frame to frame is mistaken for a star.
 """
 
 from __future__ import annotations

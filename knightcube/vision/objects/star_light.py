@@ -14,8 +14,8 @@ minimum brightness of the image along the star's path. An erosion of the image, 
 element, gives the minimum brightness along the path for every position of the star. Objects that cross the
 streaks of stars, and points on these streaks, nearly vanish in the eroded image. The stars of a region are
 subtracted one by one, the brightest first. The positions and brightnesses of all stars found are fitted
-together. The fit excludes pixels that are brighter than the model of these stars. The brightest light that
-remains after the subtraction of the stars is then fitted as a point or a line.
+together. The joint fit of the stars excludes pixels that are brighter than the model of the stars. The
+brightest light that remains after the subtraction of the stars is fitted as a point or a line.
 """
 
 from __future__ import annotations
@@ -211,8 +211,9 @@ class StarLight:
         """Return the most likely ends of the light of an object's streak, or None if no streak is found.
 
         The light is followed along the path of the streak beyond both ends. The initial ends are those of the
-        most likely part of the path with uniform brightness and no light outside. Ends and brightness are
-        then fitted to the pixels. Light is not followed into other regions. Known stars are subtracted.
+        most likely part of the path with uniform brightness and no light outside. From the initial ends, ends
+        and brightness are fitted to the pixels. Light is not followed into other regions. Known stars are
+        subtracted.
 
         Args:
             ends: initial guess of the two ends (2, 2), px.

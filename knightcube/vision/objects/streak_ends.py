@@ -382,7 +382,7 @@ def _corners_of_regions(
         boxes: first row, last row + 1, first column and last column + 1 of each region (n, 4).
         label: labels of the regions (n,).
         smooth: kernel of the Gaussian that smooths the image for the gradient.
-        slope: kernel of the derivative of this Gaussian.
+        slope: kernel of the derivative of the Gaussian that smooths the image.
         window: kernel of the window of the structure tensor.
         k: constant of the Harris response.
         relative: minimum response of a corner, relative to the largest response.
@@ -725,9 +725,9 @@ def find_corners(
     """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its cornerness (`response`).
 
     The position of a corner is the centre of intensity of the image `intensity` around the peak, where
-    `intensity` is the cornerness or, as in Sease, the frame. If the frame is used, the corners lie up to 2 px
-    inside the streak. A streak has two corners. A different number of corners indicates noise, crossing
-    streaks or another source.
+    `intensity` is the cornerness or, as in Sease, the frame. If the centre of intensity is computed from the
+    frame, the corners lie up to 2 px inside the streak. A streak has two corners. A different number of
+    corners indicates noise, crossing streaks or another source.
     """
     peaks = local_maxima(response, mask, relative)
     return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)

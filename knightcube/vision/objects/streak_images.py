@@ -310,7 +310,7 @@ def _mark_discs(
 ) -> int:
     """Mark discs of pixels around `centres` (m, 2), set the marked span of each row, and return the number.
 
-    The array `half` (2 r + 1,) holds the half-width of the disc in each row.
+    The array `half` (2 r + 1,) contains the half-width of the disc in each row.
     """
     rows, columns = marked.shape
     r, total = len(half) // 2, 0
@@ -442,8 +442,8 @@ def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: boo
         pixels: pixels (p, 2), row by row, on which the images are computed.
         paths: points of the paths (k, m, 2), px.
         sigma: standard deviation of the PSF, px.
-        slopes: whether the derivatives of the image, 1/px, for displacements of the whole path along x and
-            along y follow the image of each path.
+        slopes: whether the result contains, after the image of each path, its derivatives, 1/px, by
+            displacements of the whole path along x and along y.
     """
     images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
     for k in range(len(paths)):

@@ -256,7 +256,8 @@ def _refined_numpy(
             return failed
         step = -(covariance @ gradient)
         longest = float(np.abs(step).max())
-        # The largest element of a matrix times the largest of its inverse approximates the condition number.
+        # The largest element of a matrix multiplied by the largest element of its inverse approximates the
+        # condition number.
         condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
         if not 0.0 < condition < 1.0 or not longest < 1.0:
             return failed

@@ -1,6 +1,6 @@
 """Second fit of the streaks of an identified frame, with all stars of the catalogue, including faint stars.
 
-In a frame of long streaks, most stars are fainter than the noise of a pixel. The light of these faint stars
+In a frame of long streaks, most stars are fainter than the noise of a pixel. The light of faint stars
 overlaps the bright streaks and displaces their measured positions. A close pair of stars is measured as one
 star. After a frame is identified, the positions of all stars are known from the catalogue. The catalogue
 magnitudes of all stars are converted to counts by means of the measured stars. Stars that are too faint to be

@@ -13,10 +13,10 @@ uncertainty of the lens. An error of the line time of a rolling shutter, which d
 motion in proportion to its row, is also fitted.
 
 A star has a position error of some pixels, regardless of its brightness, if its image does not agree with the
-model, for example a curved streak or the ring of a defocused lens. If the residuals show such errors, a
-variance common to all stars is added to the noise, so that the sum of squares equals the number of degrees of
-freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this common variance, the brightest stars
-would dominate the fit, and the covariance would be too small.
+model, for example a curved streak or the ring of a defocused lens. If the residuals show position errors from
+such images, a variance common to all stars is added to the noise, so that the sum of squares equals the
+number of degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without a common variance,
+the brightest stars would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -508,7 +508,8 @@ def _with_scatter(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Se
     """Return stars, fit and a mask of the stars that agree (n,) after a common variance is added.
 
     Bright points that disagree with the fit for their measured variances may agree for the larger variances.
-    The common variance is then estimated again, with these points. Excluded streaks are not included again.
+    The common variance is estimated again with the points that agree. Excluded streaks are not included
+    again.
     """
     own = seen
     for _ in range(_AGREEMENT_ROUNDS):

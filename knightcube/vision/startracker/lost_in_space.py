@@ -5,7 +5,7 @@ guide stars. Each match of an observed triangle with a triangle of the index vot
 observed star and a guide star. A correct pair occurs in many triangles, whereas a chance pair occurs in only
 one. The matches with the most votes are verified against the whole field until one match is accepted. If no
 match is accepted, triangles of all observed stars are looked up instead of triangles of the brightest stars.
-About a thousand triangles are looked up. Even if most observed points are not stars, some of these triangles
+About a thousand triangles are looked up. Even if most observed points are not stars, some of the triangles
 consist of true stars only. If no match is accepted, the mirrored field is tried. Finally, if the given range
 of image scales is narrow, scales outside it are tried, because the range may be wrong.
 
@@ -77,7 +77,7 @@ def batches_of(
     """Yield batches of triangles (t, 3), and whether each batch includes faint stars.
 
     The size of a batch of the brightest stars is divided by the square root of the number of `steps` of
-    scale. The batches of many stars are those that `spread` returns; most frames need none of them.
+    scale. The function `spread` returns the batches of many stars, which most frames do not need.
     """
     brightest = triples(min(len(field), _BRIGHTEST))
     begin = 0
@@ -237,7 +237,8 @@ def _votes(code: npt.NDArray[np.uint32]) -> npt.NDArray[np.intp]:
 
     The votes of a pair of an observed star and a guide star are the number of matches of similar scale that
     contain the pair. The votes of a match are the sum of the votes of its three pairs. Two pairs rarely have
-    the same first bits of their codes by chance. If they do, their votes are added by mistake.
+    the same first bits of their codes by chance. If two pairs have the same first bits, their votes are added
+    by mistake.
     """
     bits = max(13, code.size.bit_length())
     slot = code >> np.uint32(32 - bits)
@@ -562,7 +563,7 @@ def _places(
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
     """Return the lowest position in a cell that agrees with each ratio, and the number of higher ones.
 
-    A position agrees with a side ratio if they differ by at most `slack`.
+    A position agrees with a side ratio if the two differ by at most `slack`.
     """
     # Positions within a cell are in units of 1 / FINE of its width, and refer to the middle of such a unit.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
@@ -618,7 +619,7 @@ def _runs(
     spans = high - low
     widest = int(spans.max(initial=0)) + 1
     here = np.arange(widest) <= spans[:, :, None]
-    # The ranges are in the order of the triangles, so that those of the first triangles are read first.
+    # The ranges are in the order of the triangles, so that the ranges of the first triangles are read first.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     short = low[query, 0] + along_short
     middle = low[query, 1] + along_middle
@@ -727,7 +728,7 @@ def _candidates(
     """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
 
     A match is omitted if two of its pairs of an observed star and a guide star are among the pairs `tried`
-    (k, 2). The third returned value is `tried` with the pairs of the new candidates.
+    (k, 2). The third returned value is the array `tried`, extended by the pairs of the new candidates.
     """
     return _choose(
         np.ascontiguousarray(observed.direction),
@@ -864,7 +865,7 @@ def _counted_votes(code: npt.NDArray[np.uint32]) -> IntArray:
 
 @loop_helper
 def _most_voted(votes: IntArray, wanted: int) -> IntArray:
-    """Return the indices (`wanted`,) of the matches with the most votes; of equal matches, the first ones."""
+    """Return the indices (`wanted`,) of the matches with the most votes; ties go to lower indices."""
     highest = 0
     for k in range(len(votes)):
         highest = max(highest, votes[k])

@@ -51,9 +51,9 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 BENDS, ASPECT = 8, 6
 """Number of lens errors in the vector `bend`, and index of the aspect."""
-# The first value is the standard deviation of the tilt of a typical lens, relative to the corner's tangent
-# (20 px of 1024 px). The other two values are the standard deviations of the two distortion terms of a
-# typical lens at the image corner (3 % and 1 %).
+# The value of `_TILT` is the standard deviation of the tilt of a typical lens, relative to the corner's
+# tangent (20 px of 1024 px). The values of `_DISTORTION` are the standard deviations of the two distortion
+# terms of a typical lens at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 _DECENTRING = 0.004
 """Prior standard deviation of a corner's displacement by decentring, relative to the corner's distance."""

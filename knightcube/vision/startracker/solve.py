@@ -74,8 +74,8 @@ class FrameSolution:
         tracked: whether the stars were identified by a search near the prior attitude.
         motion: motion of the camera from the streaks, camera frame, or None for points.
         mirrored: whether the image shows the mirrored sky. For a mirrored sky, `fix` is the attitude of the
-            image after left and right are swapped about the optical axis. The points are those of the
-            original image.
+            image after left and right are swapped about the optical axis. The points of a solution are those
+            of the original image even for a mirrored sky.
         psf_sigma: measured standard deviation of the point spread, px; NaN if unknown.
     """
 
@@ -422,7 +422,8 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
         return solution
     measured = float(np.median(width))
     doubt = _SHAPE_DOUBT * abs(measured - given) / solution.camera.focal_length
-    # The measured width is that of pixels, whose own variance is not part of the point spread.
+    # The measured width includes the averaging over a pixel, and the variance of a pixel is subtracted to
+    # obtain the width of the point spread.
     psf_sigma = math.sqrt(max(measured**2 - PIXEL_VARIANCE, 0.0))
     return replace(solution, psf_sigma=psf_sigma).wider(np.diag([doubt**2, doubt**2, 0.0]))
 

@@ -11,8 +11,8 @@ brightness limit and test are chosen (Bonferroni).
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
 all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
 distance is within the uncertainty of the prior. The largest set of pairs with a common displacement is used
-to refine the attitude. The refined attitude is then verified with the whole field as in lost in space, except
-that only attitudes near the prior count as searched.
+to refine the attitude. The refined attitude is verified with the whole field as in lost in space, except that
+only attitudes near the prior count as searched.
 """
 
 from __future__ import annotations
@@ -95,11 +95,11 @@ class Chance:
         """Return log10 of the expected number of chance matches of at least `matched` of `expected` stars.
 
         The first matched star may be any star of the sky. The second matched star lies in a ring around the
-        first star. The radius of the ring is the distance of the first two matched stars, and its width
-        follows from the range of the scale and from the gate. Every further matched star lies within the gate
-        of an expected star. The probability is multiplied by the number of ways to choose the matched stars
-        among the observed stars. The fit reduces the distances of the matched stars. The gate is therefore
-        increased by the factor 1/(1 - leverage).
+        first star. The radius of the ring is the distance of the first two matched stars. The width of the
+        ring is computed from the range of the scale and from the gate. Every further matched star lies within
+        the gate of an expected star. The probability is multiplied by the number of ways to choose the
+        matched stars among the observed stars. The fit reduces the distances of the matched stars. The gate
+        is therefore increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)

@@ -2,8 +2,8 @@
 
 Long streaks are fitted on strips of pixels along their paths, and stars with short or slow paths (spots) on
 square patches of pixels. The model of a streak on a strip expands the flux per px to first order around each
-block of pixels. This expansion is not valid if the speed is nearly zero. If the rate increases from zero or
-decreases to zero, a square patch of pixels covers the slow part of each streak.
+block of pixels. The first-order expansion of the flux is not valid if the speed is nearly zero. If the rate
+increases from zero or decreases to zero, a square patch of pixels covers the slow part of each streak.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ class FitWindows:
 
 
 def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
-    """Return the sums (count,) of the counts `first`, then `second`, on pixels that have the same `slot`."""
+    """Return the sums (count,) of the counts `first` and `second` on pixels that have the same `slot`."""
     light = np.concatenate([first, second.astype(np.float32)])
     return np.bincount(slot, light, count).astype(np.float32)
 

@@ -373,7 +373,7 @@ def _ideal_paths(
     """See `_ideal_paths_numpy`."""
     out = np.empty((6, len(time)))
     if len(higher) == 0 and _is_small(rate, acceleration, time):
-        # The compiled form of this branch uses the processor's vector instructions.
+        # The compiled form of the branch for small rotations uses the processor's vector instructions.
         for m in range(len(time)):
             turn, w, change = _motion_at(rate, acceleration, time[m])
             turned = _turned(turn, _small_turn(_inner(turn, turn)), _direction(view, stars, m))

@@ -598,8 +598,8 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     return replace(scene, motion=motion, stars=moved)
 
 
-# Largest change of the rate over the exposure, relative to the rate at mid-exposure.
-# For a motion that starts or ends at rest, this relative change is 2.
+# Largest change of the rate over the exposure, relative to the rate at mid-exposure. For a motion that starts
+# or ends at rest, the relative change of the rate is 2.
 _MOST_CHANGE = 2.2
 # Deviation (standard deviations) from the motion of the majority of stars above which a star is excluded from
 # the motion fit.

@@ -87,7 +87,7 @@ def cut_strips(
 
     The start and end times (n, 2) are in exposures from mid-exposure. The mask `ending` (n, 2) states which
     start and end times are ends of a streak. At an end of a streak, pixels beyond the end are included. If
-    `ending` is None, all these times are ends of a streak.
+    `ending` is None, all start and end times are ends of a streak.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
@@ -143,7 +143,7 @@ def _parts(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    # These times have no rounding errors, so that streak ends are recognised by equality.
+    # The start and end times have no rounding errors, so that streak ends are recognised by equality.
     edges[:, -1] = times[:, 1]
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)

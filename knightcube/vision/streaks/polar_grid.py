@@ -1,7 +1,8 @@
 """Running sums of the pixels on circles about the rotation axis of the camera.
 
-On these circles, all streaks are straight and equally long. The sums of 3 x 3 pixels of the frame are sampled
-on a polar grid. The running sum over the length of a streak is the matched filter of a streak.
+On circles about the rotation axis, all streaks are straight and equally long. The sums of 3 x 3 pixels of the
+frame are sampled on a polar grid. The running sum over the length of a streak is the matched filter of a
+streak.
 """
 
 from __future__ import annotations

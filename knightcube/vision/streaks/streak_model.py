@@ -432,11 +432,12 @@ def _endless_line(
 ) -> None:
     """Compute four values for each of `count` pixels on a line across an infinite streak, from `begin`.
 
-    The values are distance across the path, distance along the path from the centre of the block, exponent
-    of the profile, and factor of the profile. Distances (px) across and along the path from the point at
-    which the path crosses the line are `first` at the first pixel, and change by `each`. The values `path`
-    are curvature, acceleration along the path over squared speed, and distance of the line from the centre;
-    those of `profile` are inverse squared width, maximum, and relative correction for the fourth cumulant.
+    The values are distance across the path, distance along the path from the centre of the block, exponent of
+    the profile, and factor of the profile. Distances (px) across and along the path from the point at which
+    the path crosses the line are `first` at the first pixel, and change by `each`. The values `path` are the
+    curvature, the acceleration along the path divided by the squared speed, and the distance of the line from
+    the centre. The values `profile` are the inverse squared width, the maximum, and the relative correction
+    for the fourth cumulant.
     """
     across, ahead, by_across, by_ahead = first[0], first[1], each[0], each[1]
     bend, thinning, shift = path

@@ -164,7 +164,7 @@ class MotionResult(FrameMotion):
     def start_to_end(self) -> FloatArray | None:
         """The quaternion (4,) of the rotation over the exposure, A(q) v_start = v_end; None without a rate.
 
-        The quaternion follows from the mean rate and is exact for a fixed rotation axis.
+        The quaternion is computed from the mean rate and is exact for a fixed rotation axis.
         """
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 

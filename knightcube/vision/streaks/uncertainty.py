@@ -297,8 +297,8 @@ _MOST_IMPROVEMENT = 100.0
 class _PathLight:
     """Sums over the pixels of a streak that determine chi-square for any intensity along its path.
 
-    In these sums, d is the counts of a pixel, w the weight of the pixel, and g the point-spread profile
-    across the path.
+    The symbols in the sums are d for the counts of a pixel, w for the weight of the pixel, and g for the
+    point-spread profile across the path.
 
     Attributes:
         places: distances along the path (k,) from the point at which the star rests, px.
@@ -380,7 +380,7 @@ def _path_light(
 def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
     """Return the chi-square (s, l) of a streak for reversing motions.
 
-    The motion reverses once. The array `shares` (s,) holds ratios of the durations before and after the
+    The motion reverses once. The array `shares` (s,) contains ratios of the durations before and after the
     reversal, and `lengths` (l,) the path lengths, px. Flux of the star and sky level are fitted to the pixels
     for each trial motion.
     """

@@ -1,10 +1,10 @@
 """Fit of a vibration of the camera, which displaces all streaks of a frame in common.
 
 A vibration displaces the stars across their paths and changes their speed, and thereby the intensity, along
-their paths. The residuals of a fit without vibration show both effects as functions of time. The vibration is
-modelled as a sum of few sinusoids of the camera's rotation vector. The initial value of each frequency is the
-trial frequency that decreases chi-square most. Gauss-Newton steps improve frequencies and amplitudes, and
-between these steps the motion and the stars are fitted again.
+their paths. The residuals of a fit without vibration show the displacements and the changes of intensity as
+functions of time. The vibration is modelled as a sum of few sinusoids of the camera's rotation vector. The
+initial value of each frequency is the trial frequency that decreases chi-square most. Gauss-Newton steps
+improve frequencies and amplitudes, and the motion and the stars are fitted again between the steps.
 
 In one time bin, the residuals depend linearly on 12 numbers: the rotation vector, its time derivative, and
 the rotation vectors at the start and the end of the exposure, which move the ends of the streaks.

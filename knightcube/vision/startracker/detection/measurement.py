@@ -1,10 +1,10 @@
 """Positions and fluxes of stars, from a fit of the point spread function (PSF) or a centroid in a window.
 
 `first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
-frame from these fits. `measure` then fits each star with the PSF of the frame, or computes a centroid in a
-window whose border is subtracted (Michalski, eq. (12) to (21)). A window with the side length a (px) ends at
-column x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts
-eq. (16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
+frame from these fits. `measure` fits each star with the PSF of the frame, or computes a centroid in a window
+whose border is subtracted (Michalski, eq. (12) to (21)). A window with the side length a (px) ends at column
+x_start + a - 1. In Michalski, eq. (14) and (15), the window ends one pixel later, which contradicts eq.
+(16e), where the border has 4 (a - 1) pixels. Michalski, eq. (20), repeats x_CM instead of y_CM, and is
 corrected here (errata).
 
 Three other centroid methods start from the centre of mass and weight the pixels. `weighted` weights each

@@ -620,7 +620,7 @@ def _profile(offset: float, sigma: float, out: FloatArray) -> None:
 
 @loop_helper
 def _invert(normal: FloatArray, out: FloatArray) -> None:
-    """Write `_inverse` of one normal matrix (p, p), of which the lower triangle is given, to `out`."""
+    """Write the inverse of one normal matrix (p, p), given by its lower triangle, to `out`."""
     count = len(normal)
     scale = np.empty(count)
     for i in range(count):

@@ -17,8 +17,8 @@ contains a triangle if its longest side is at most the reach of each of its star
 on the field of view. About the same number of triangles of the brightest stars is found in frames of any
 field of view. Every part of the sky has about the same number of stars with a given reach, so dense regions
 do not add triangles. Near a cluster of bright stars, all stars have a short reach. To cover the neighbourhood
-of such clusters, the index also contains the triangles of the `few` brightest stars of circles of several
-radii that cover the sky.
+of clusters of bright stars, the index also contains the triangles of the `few` brightest stars of circles of
+several radii that cover the sky.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
 first part of a key is the orientation (left or right) of the triangle's corners, ordered by the lengths of
