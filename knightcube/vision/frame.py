@@ -155,8 +155,8 @@ def estimate_background(
     per block give the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block
     that is filled by a bright object gets the median noise of the surrounding 3 x 3 blocks.
 
-    Under stray light, the level varies within a block. Under stray light, the block size and the stride are
-    therefore halved, and the moments are computed from the differences between the pixels and the level
+    Under stray light, the level varies within a block. For a frame with stray light, block size and stride
+    are therefore halved, and the moments are computed from the differences between the pixels and the level
     interpolated between the centres of the larger blocks. Stray light is assumed if many neighbouring blocks
     differ, unless `stray_light` states it.
     """
