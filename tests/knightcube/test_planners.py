@@ -65,8 +65,8 @@ def test_a_slew_leads_from_nadir_to_the_sun_within_the_limits() -> None:
     path, around = found.plan.path, found.task.along(np.array([0.0, found.plan.horizon]))
     down = -around.position[0] / np.linalg.norm(around.position[0])
     assert attitude_matrix(path.quaternion[0]) @ down == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
-    # The equinox is at 14:46 UTC, 2.6 h after the end: the ecliptic longitude of date is -0.107 deg. That
-    # of J2000 is smaller by the precession of 26.2 years, 0.366 deg.
+    # The equinox is at 14:46 UTC, 2.6 h after the end, so the Sun's ecliptic longitude of date is -0.107 deg.
+    # The longitude of J2000 is smaller by the precession of 26.2 years, 0.366 deg.
     longitude, obliquity = np.radians([-0.473, 23.44])
     sun = np.array([1.0, np.sin(longitude) * np.cos(obliquity), np.sin(longitude) * np.sin(obliquity)])
     sun /= np.linalg.norm(sun)

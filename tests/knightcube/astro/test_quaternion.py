@@ -63,7 +63,7 @@ def test_attitude_matrix_is_eulers_formula(axis: FloatArray, angle: float) -> No
 
 
 def test_a_turn_about_z_carries_the_frame_with_it() -> None:
-    """After +90 degrees about z the body's x axis is the reference's y axis, so y reads (1, 0, 0)."""
+    """After +90 degrees about z the body's x axis is the reference's y, which is (1, 0, 0) in body axes."""
     q = quaternion.from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi]))
     assert _close(quaternion.attitude_matrix(q) @ [0.0, 1.0, 0.0], np.array([1.0, 0.0, 0.0]))
 

@@ -26,8 +26,8 @@ _PERIOD = 1.0
 def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> tuple[FloatArray, FloatArray]:
     """Return the NEES of direction and of rate (two degrees of freedom each) of each frame.
 
-    `sigma` (rad) is that of a sighting, and half of it that of the attitude. `known`: the gravity gradient is
-    known.
+    `sigma` (rad) is the standard deviation of a sighting, and half of it that of the attitude. `known` states
+    whether the gravity gradient is known.
     """
     motion = MotionModel()
     state = None
@@ -55,7 +55,7 @@ def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> t
 
 @pytest.mark.parametrize("known", [False, True])
 def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
-    """The sum of the NEES of 60 passes at their ends is a chi-square with 120 degrees of freedom."""
+    """The sum of the NEES at the ends of 60 passes is a chi-square with 120 degrees of freedom."""
     rng = np.random.default_rng(16)
     times = np.arange(0.0, 24.0, _PERIOD)
     place, rate = [], []
@@ -70,7 +70,7 @@ def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
 
 
 def test_the_gravity_gradient_takes_the_tides_out_of_a_minute_s_prediction() -> None:
-    """In ten passes within 250 km, an extrapolation along a straight line is 1.2e-3 rad or more off."""
+    """In ten passes within 250 km, a straight-line extrapolation has errors of at least 1.2e-3 rad."""
     rng = np.random.default_rng(9)
     times = np.arange(0.0, 60.5, 2.0)
     for _ in range(10):
@@ -127,7 +127,8 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
     rng = np.random.default_rng(5)
     times = np.arange(0.0, 30.0, 1.0)
     slow = a_pass(rng, np.radians(0.1), times, 15.0).directions
-    # The same sky, mirrored at a plane through the middle of the first path, where both paths cross.
+    # The second sky is the first one, mirrored at a plane through the middle of the path, where both paths
+    # cross.
     middle = slow[15]
     normal = np.cross(middle, slow[16])
     normal /= np.linalg.norm(normal)
@@ -146,7 +147,10 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
 
 
 def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None:
-    """Where they meet, to 3 px, the frame shows one object with the flux of both. Twenty pairs."""
+    """Where the two objects are within 3 px, the frame shows one object with the flux of both.
+
+    Twenty pairs are tested.
+    """
     rng = np.random.default_rng(77)
     times = np.arange(0.0, 30.0, 1.0)
     for _ in range(20):
@@ -171,7 +175,7 @@ def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None
 
 
 def _turn_onto(start: FloatArray, end: FloatArray, roll: float) -> FloatArray:
-    """Return the matrix (3, 3) that rotates `start` to `end` and then about it."""
+    """Return the matrix (3, 3) that rotates `start` to `end`, and then by `roll` about `end`."""
     across = np.cross(start, end)
     turn = np.arctan2(np.linalg.norm(across), start @ end) * across / np.linalg.norm(across)
     both = multiply(from_rotation_vector(-roll * end), from_rotation_vector(-turn))
@@ -186,7 +190,7 @@ def test_an_object_that_flashes_by_four_magnitudes_is_one_track() -> None:
     for index, time in enumerate(times):
         magnitude = np.array([5.0 + 3.0 * np.sin(2.0 * np.pi * time / 25.0)])
         seen = flown.directions[index : index + 1]
-        if magnitude[0] > 6.0:  # not seen
+        if magnitude[0] > 6.0:  # too faint to be detected
             seen, magnitude = np.zeros((0, 3)), np.zeros(0)
         _, ended = tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE, magnitude))
         assert not ended

@@ -17,7 +17,7 @@ SETTINGS = AdaptiveSettings(bandwidth=1.0, adaptation=10.0, reference_bandwidth=
 
 
 def test_with_the_plant_known_the_body_follows_the_reference_model() -> None:
-    """The angle of a critically damped model of second order is 1 - (1 + wt) exp(-wt)."""
+    """The angle of a critically damped second-order model is 1 - (1 + wt) exp(-wt)."""
     rows = fly(AdaptiveController(BELIEVED, PERIOD, SETTINGS), BELIEVED, held(0.1), 20.0, noise=0.0)
     x = 0.5 * rows[:, 0]
     np.testing.assert_allclose(rows[:, 1], 0.1 * (1.0 - (1.0 + x) * np.exp(-x)), atol=3e-3)
@@ -72,7 +72,7 @@ def placed(bandwidth: float) -> PidController:
 
 
 def test_a_small_step_is_the_response_of_three_equal_poles() -> None:
-    """With b = 0 the target enters only by the integral: theta = 1 - (1 + wt + (wt)^2/2) exp(-wt)."""
+    """With b = 0 the target acts only through the integral: theta = 1 - (1 + wt + (wt)^2/2) exp(-wt)."""
     w, size = 0.8, 0.02
     rows = fly(placed(w), BELIEVED, held(size), 15.0, noise=0.0)
     x = w * rows[:, 0]

@@ -24,7 +24,7 @@ from knightcube.vision.horizon.initial_guess import shortest_turn
 from knightcube.vision.horizon.limb import turn
 
 PAPER_POINTS = np.array([[258.0, 128.0], [215.0, 256.0], [200.0, 384.0]])
-"""Edge points of the MAQSAT picture (Meller 3.1)."""
+"""Edge points (px) of the MAQSAT picture in the paper (Meller et al., section 3.1)."""
 
 
 def test_the_papers_three_points_give_its_circle_to_its_digits() -> None:
@@ -133,7 +133,7 @@ def test_cameras_that_look_the_same_way_are_refused() -> None:
 
 
 def test_nadir_is_carried_on_by_the_rotation_of_a_sight() -> None:
-    """The shortest rotation has an axis normal to the line of sight, for which equation (6) is exact."""
+    """Equation (6) is exact for the shortest rotation, whose axis is normal to the line of sight."""
     before = np.array([0.0, 0.0, 1.0])
     rotation = turn(np.array([0.02, -0.01, 0.0]))
     nadir = np.array([0.1, 0.9, 0.3])

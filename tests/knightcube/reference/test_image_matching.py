@@ -35,7 +35,10 @@ def _stars(seed: int, noise: float, half_deg: float = 10.0) -> tuple[FloatArray,
     ("axis", "limits"), [((0, 0, 1), (0.01,)), ((1, 0, 0), (200, 8)), ((0.6, 0.8, 0), (200, 8))]
 )
 def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limits: tuple[float, ...]) -> None:
-    """A roll of 1 deg about the boresight is exact after one step; a tilt of 1 deg leaves arcseconds."""
+    """A roll of 1 deg about the boresight is exact after one step.
+
+    After a tilt of 1 deg, arcseconds remain.
+    """
     observed, reference, true = _stars(3, 0.0)
     prior = multiply(from_rotation_vector(np.radians(1.0) * np.array(axis)), true)
     for steps, limit in enumerate(limits, start=1):

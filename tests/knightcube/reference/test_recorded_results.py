@@ -54,7 +54,7 @@ def sky() -> KnownSky:
 
 
 def kind() -> ListKind:
-    """Return lists with two false stars and a tenth of the others missing."""
+    """Return the kind of list with two false stars and a tenth of the true stars missing."""
     faintest = float(sky().stars.magnitude[-1])
     return ListKind(
         field_deg=FIELD_DEG, noise_px=0.2, known_deg=0.05, faintest=faintest, false_stars=2, lost=0.1
@@ -62,7 +62,7 @@ def kind() -> ListKind:
 
 
 def drawn(seed: int) -> StarList:
-    """Return a list of stars."""
+    """Return a star list that is drawn with a seed."""
     return draw(kind(), sky().index.stars, np.random.default_rng(seed))
 
 

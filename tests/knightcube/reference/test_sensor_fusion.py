@@ -75,7 +75,7 @@ def fly(seconds: int, sunlit: float) -> list[tuple[float, FloatArray, SeparateAt
         if number % 20 != 19:
             continue
         truth = multiply(from_rotation_vector(at * RATE), START)
-        # The satellite moves by 0.065 deg/s along its orbit, and the field turns twice as fast.
+        # The satellite moves by 0.065 deg/s along its orbit, and the field rotates twice as fast.
         down = np.array([math.cos(1.14e-3 * at), math.sin(1.14e-3 * at), 0.0])
         field = np.array([math.cos(2.3e-3 * at), 0.3, math.sin(2.3e-3 * at)]) / math.hypot(1.0, 0.3)
         sun = _direction(truth, SUN, SUN_SIGMA, rng) if at < sunlit else None

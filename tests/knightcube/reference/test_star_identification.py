@@ -64,7 +64,7 @@ def _right(answer: StarMatch, drawn: StarList) -> bool:
         return False
     claimed = answer.star >= 0
     off = angle_between(answer.fix.quaternion, drawn.attitude)
-    # About the boresight, the error of a star counts with its lever arm, a tenth of a radian.
+    # About the boresight, a star's error is divided by its lever arm, a tenth of a radian.
     return bool(
         np.all(answer.star[claimed] == drawn.star[claimed])
         and off < 10.0 * drawn.kind.noise_px / drawn.camera.focal_length / 0.1
@@ -146,7 +146,7 @@ def test_points_strewn_at_random_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_mirrored_sky_is_refused(name: str) -> None:
-    """Angles, areas and moments are those of the sky; only the orientation differs."""
+    """A mirrored sky has the same angles, areas and moments; only the orientation differs."""
     drawn = _drawn(_kind(), 4)[0]
     field = drawn.field()
     mirrored = replace(field, direction=field.direction * np.array([-1.0, 1.0, 1.0]))
@@ -171,7 +171,7 @@ def test_a_field_of_view_that_is_not_known_is_refused_with_the_reason(name: str)
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_two_points_within_their_errors_of_one_another_do_no_harm(name: str) -> None:
-    """One guide star is the best match of both points, and does not determine an attitude."""
+    """One guide star is the best match of both points, and a single star does not determine an attitude."""
     drawn = _drawn(_kind(noise_px=2.0), 11)[0]
     field = drawn.field()
     twice = field.subset(np.repeat(np.arange(len(field)), 2))
@@ -217,7 +217,7 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
         points += int(true.sum())
         strangers += int(shared.shares[~true].sum())
         off = shared.rate - rate
-        # chi-square with 3 degrees of freedom, exceeded once in 60,000
+        # 25 is exceeded by a chi-square with 3 degrees of freedom once in 60,000 cases
         assert off @ np.linalg.solve(shared.covariance, off) < 25.0
         assert _right(identify_by_rate(drawn.field(), _sky(), motion=motion), drawn)
     assert kept >= 0.99 * points
@@ -233,7 +233,7 @@ def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
 
 
 def test_a_previous_attitude_turned_by_the_rate_names_too_few_stars_for_a_pattern() -> None:
-    """Four stars a second later, which are not enough for identification lost in space."""
+    """Only four stars are detected a second later, which are too few for lost-in-space identification."""
     drawn = _drawn(_kind(), 8)[0]
     whole, rate = _motion(drawn, 8)
     few = np.arange(5)

@@ -30,7 +30,7 @@ def _found_by_hand(key: FloatArray, low: float, high: float) -> list[int]:
 def test_ranges_hold_the_keys_that_a_search_through_all_finds(
     drawn: FloatArray, ends: list[tuple[float, float]], cells: int | None
 ) -> None:
-    """The keys are often equal; cells are few or many; ranges are empty, reversed or beyond all keys."""
+    """Keys are often equal, cells few or many, and ranges empty, reversed or beyond all keys."""
     key = np.sort(drawn)
     index = star_tables.build_k_vector(key, cells)
     start, stop = index.ranges([low for low, _ in ends], [high for _, high in ends])

@@ -166,7 +166,7 @@ def in_phases(flown: Run, times: FloatArray) -> dict[str, BoolArray]:
 
 
 def _figures(errors: AttitudeErrors, inside: BoolArray) -> list[float]:
-    """Return the number of samples, and the sums of the squared errors, rad^2, of claim, and normalised."""
+    """Return the number of samples, and sums of squared errors, claimed variances and normalised squares."""
     error, sigma = errors.error[inside], errors.sigma[inside]
     sums = (np.sum(error**2), np.sum(sigma**2), np.mean((error / sigma) ** 2, axis=1).sum())
     return [float(len(error)), *map(float, sums)]
@@ -194,7 +194,7 @@ def _excursions(flown: Run, body: AttitudeErrors) -> dict[str, float]:
 
 
 def _inertia(flown: Run) -> dict[str, float] | None:
-    """Return the largest error of J / trace(J) after detumbling, its claim, and the NEES of an element."""
+    """Return the largest error of J / trace(J) after detumbling, its claimed sigma, and the NEES."""
     packets, true = flown["description"], flown["true_description"]
     periods = [stop for _, stop, slowed in detumbling_periods(flown, math.inf) if slowed]
     later = packets[seconds(packets) >= periods[0]] if periods else packets[:0]

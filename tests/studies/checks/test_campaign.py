@@ -42,7 +42,7 @@ def wait(case: Case) -> Result:
 
 
 def die(case: Case) -> Result:
-    """End the worker process, in the first two attempts of a case whose factor is 1 or always if it is 2."""
+    """End the worker process: always for a case with factor 2, in the first two attempts for factor 1."""
     attempts = Path(case.parameters["log"]) / case.key
     attempts.write_text(attempts.read_text() + "x" if attempts.exists() else "x")
     if case.parameters["factor"] == 2 or (case.parameters["factor"] == 1 and attempts.read_text() != "xxx"):

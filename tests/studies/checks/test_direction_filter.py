@@ -1,4 +1,4 @@
-"""Tests of the filter of Fig. 3: its start, operation without lost sensors, and reported accuracy."""
+"""Tests of the filter of Meller et al., Fig. 3: start, operation with lost sensors, reported accuracy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the benchmark `executive`: a bare loop, workers that are kept busy, and a few seconds of a flight.
+"""Tests of the benchmark `executive`: its bare loop, workers that are never idle, and a short flight.
 
 The criteria for the flight do not depend on the load of the machine: the kernel reports for how long the
 control thread had no processor. The lateness is checked only if the machine was calm.

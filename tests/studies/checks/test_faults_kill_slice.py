@@ -1,4 +1,4 @@
-"""Tests of killed flight processes with running devices, and that driven coils and torn logs are found."""
+"""Tests of killed flight processes with running devices; driven coils and damaged logs are detected."""
 
 from __future__ import annotations
 

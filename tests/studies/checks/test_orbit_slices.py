@@ -83,7 +83,7 @@ def test_the_limb_by_day_is_the_half_that_the_sun_shines_on() -> None:
 
 
 def test_the_true_body_sways_as_it_is_said_to() -> None:
-    """Over five hours the motion is 3 deg rms per axis within a third, and the rates match the attitudes."""
+    """Over five hours the motion is 3 deg rms per axis to a third, and the rates agree with the attitudes."""
     rng = np.random.default_rng(SEED)
     frame = np.broadcast_to(np.eye(3), (36_000, 3, 3))
     attitudes = orbit_world._sway(frame, rng)

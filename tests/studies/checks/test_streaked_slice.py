@@ -18,7 +18,7 @@ def _flown(row: str, runs: int) -> list[dict[str, object]]:
 
 
 def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path) -> None:
-    """Without an allowance for the shutter the errors are up to 7 sigma, or 0.4 px instead of 0.05 px."""
+    """If the covariance ignored the unknown shutter, errors would reach 7 sigma, or 0.4 px, not 0.05 px."""
     own = STREAKED.summarise(_flown("rolling 30 us, unstated", 2), tmp_path).facts["all"]
     assert own["attitudes"] == own["frames"] == 6
     assert own["worst"] < 4.5

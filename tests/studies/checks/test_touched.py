@@ -1,4 +1,4 @@
-"""Tests that a control cycle, the opening of a flight and a star fix enter no more files than permitted."""
+"""Tests that a control cycle, the opening of a flight and a star fix use at most the permitted files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the tuning study: the gains of the campaign meet its criterion, and it finds better ones."""
+"""Tests of the tuning study: the campaign's gains satisfy its criterion, and a search finds better ones."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def test_the_builder_refuses_a_text_that_is_not_a_table_of_the_field() -> None:
 
 
 def test_the_stored_table_is_the_builder_s() -> None:
-    """The columns have the builder's order, so that the published dipole of 2025 is in its columns."""
+    """The columns have the builder's order, so the published dipole of 2025 is in the expected columns."""
     with np.load(true.TABLE) as stored:
         epochs, table = stored["epoch"], stored["coefficient"]
     assert epochs.tolist() == [2000, 2005, 2010, 2015, 2020, 2025, 2030]

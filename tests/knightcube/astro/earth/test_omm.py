@@ -293,7 +293,7 @@ def test_any_damaged_text_of_elements_is_refused_in_one_line_or_read(
 
 
 def test_the_uncertainty_covers_an_error_of_the_drag_term() -> None:
-    """Elements with B* 0 of an orbit with B* 5e-4: 226 km after 6 days, and 5514 km after 30 days."""
+    """Elements with B* 0 for an orbit with B* 5e-4 have errors of 226 km after 6 days, 5514 km after 30."""
     lines = (
         "1 99001U 26001A   26320.50000000  .00000000  00000-0  00000+0 0  9995",
         "2 99001  97.4640 337.4170 0011973 295.7805  64.3547 15.30000000000102",

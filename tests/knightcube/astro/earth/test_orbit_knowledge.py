@@ -85,7 +85,7 @@ def fix_of(state: FloatArray, date: float, **spread: float) -> GpsFix:
 
 
 def test_a_fix_carried_on_is_where_another_integrator_has_the_satellite() -> None:
-    """Dormand and Prince's order 8 of sim_hal after 20 minutes agrees to 20 m and 0.02 m/s."""
+    """The Dormand-Prince integrator of sim_hal agrees to 20 m and 0.02 m/s after 20 minutes."""
     elements = KeplerianElements(
         semi_major_axis=EARTH_RADIUS + 380e3, eccentricity=0.002, inclination=0.9, ascending_node=1.0
     )

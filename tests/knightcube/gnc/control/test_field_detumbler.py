@@ -1,4 +1,4 @@
-"""Tests of detumbling by magnetometer only: its start, and a spin about the field direction.
+"""Tests of detumbling by magnetometer alone: its start, and a spin about the field direction.
 
 The momentum plan must remove the planned momentum in the planned time, close to the minimum time.
 """
@@ -40,12 +40,13 @@ INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
 LIMIT = 0.1
 FIELD, TURN = np.array([0.0, 0.0, 4e-5]), np.array([0.0, 2.2e-3, 0.0])
 OWN_FIELD = 4e-4
-"""Field of the coils at the magnetometer (T per A m^2), equal to the Earth's field at full dipole."""
+"""Field that the coils cause at the magnetometer (T per A m^2); at full dipole it equals the Earth's
+field."""
 CYCLE_NS = 100_000_000
 
 
 class Body(NamedTuple):
-    """A body whose inertia differs from its description, and the limit of its coils, A m^2."""
+    """A body whose inertia differs from its description, with the dipole limit of its coils (A m^2)."""
 
     described: FloatArray
     inertia: FloatArray
@@ -86,10 +87,11 @@ def fly(
     body: Body | None = None,
     seed: int = 4,
 ) -> FloatArray:
-    """Return the speed (n,) rad/s of each cycle; `gyro` is the function that measures the rate.
+    """Return the magnitude (n,), rad/s, of the rate in each cycle; the function `gyro` measures the rate.
 
     The field rotates `sooner` times as fast as in orbit; samples are `late` s older than the last command.
-    For a `body` that differs from its description, the speed follows from its energy and mean moment.
+    For a `body` that differs from its description, the result is computed from energy and mean moment of
+    inertia.
     """
     law, rng = detumbler(body), np.random.default_rng(seed)
     limit, inertia = (LIMIT, INERTIA) if body is None else (body.limit, body.inertia)
@@ -122,9 +124,9 @@ def fly(
 
 
 def test_a_slow_spin_along_the_field_is_braked_as_the_field_turns_and_spiked_samples_do_not_mislead() -> None:
-    """B-dot takes at least 2,000 s; the minimum is 714 s, in which the field rotates by 90 deg.
+    """B-dot takes at least 2,000 s; the minimum time is 714 s, in which the field rotates by 90 deg.
 
-    The rate of 0.5 deg/s is reached a little earlier. The coils add nothing to the spin.
+    The rate falls to 0.5 deg/s a little earlier. The coils must not increase the spin.
     """
     speeds = fly(np.array([0.0, 0.0, 0.03]), 850.0, spikes=0.1)
     assert speeds.max() < 1.1 * speeds[0]
@@ -140,10 +142,10 @@ THREE_UNITS = np.diag([0.0066, 0.0333, 0.0333])
 def test_the_coils_never_spin_up_a_body_of_another_inertia_beyond_the_multiple(
     seed: int, described: FloatArray, limit: float, speed: float, multiple: float
 ) -> None:
-    """The rate along the field is unknown at first, and the energy is known to the accuracy of the inertia.
+    """Initially the rate along the field is unknown, and the energy is known to the accuracy of the inertia.
 
-    The speed of a long body changes by itself while its energy stays. Within 400 s the bodies are fastest
-    before 300 s.
+    The rate of an elongated body changes by itself at constant energy. In 400 s the bodies are fastest before
+    300 s.
     """
     body = unlike(described, limit, seed)
     off = 0.1 * speed * np.random.default_rng(seed).standard_normal(3)
@@ -175,13 +177,13 @@ def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
 
 @pytest.mark.parametrize("late", [0.001, 0.04])
 def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
-    """The component along the field first grows across it while the field rotates."""
+    """The component along the field becomes observable only as the field rotates."""
     speeds = fly(np.array([0.1, 0.05, 0.03]), 240.0, late=late)
     assert speeds[-1] < math.radians(0.5)
 
 
 def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
-    """The IMU answers, but its samples are rejected: the coils must not act on a predicted field alone."""
+    """The IMU responds, but its samples are rejected; the coils must not act on a predicted field alone."""
     law = detumbler()
     law.begin(0)
 
@@ -215,7 +217,7 @@ def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
     for k in range(TRUSTED):
         now_ns = SCHEDULE.settle_ns + 20_000_000 * k
         law.dipole(now_ns)
-        law.sample(now_ns, FIELD if k else FIELD + 1e-4)  # the first is spiked
+        law.sample(now_ns, FIELD if k else FIELD + 1e-4)  # the first sample is an outlier
         assert not law.dipole(now_ns).any()
     assert not law.trusted
     assert law.rate is None
@@ -362,7 +364,8 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
         ahead = rng.standard_normal((9, 3))
         field = ahead[0] + 0.5 * rng.standard_normal(3)
         turned = aligned_to(ahead, field)
-        np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)  # a rotation
+        # The field series is only rotated.
+        np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)
         assert np.linalg.det(turned[1:4]) == pytest.approx(np.linalg.det(ahead[1:4]))
         if ahead[0] @ field > 0.0:
             along = field / np.linalg.norm(field) * np.linalg.norm(ahead[0])
@@ -370,7 +373,7 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
 
 
 def test_a_field_along_the_orbit_is_known_from_its_direction_and_its_change() -> None:
-    """The direction of the field near the equator oscillates; the prediction is in other axes."""
+    """The direction of the field near the equator oscillates; the prediction is given in other axes."""
     times = braking(LIMIT).instants
     angle = 0.3 * np.sin(1.1e-3 * times)
     true = 3e-5 * np.stack([np.sin(angle), 0.2 * np.cos(angle) ** 2, np.cos(angle)], axis=1)

@@ -1,4 +1,4 @@
-"""Tests of the tracker: gains, closed form, error equations, differences, and the closed loop."""
+"""Tests of the LQ tracker: gains, error equations, derivatives by differences, and the closed loop."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def path() -> PolynomialPath:
 
 
 def test_the_error_follows_the_linear_system_exactly(path: PolynomialPath) -> None:
-    """From 0.6 rad off, the error e obeys e'' = -K (e', e) while the coil is strong enough."""
+    """From an error of 0.6 rad, the error e obeys e'' = -K (e', e) while the coil is strong enough."""
     tracker = LqTracker(STRONG, *WEIGHTS)
     start = path.sample(0)
     run = fly(STRONG, tracker, path, (start.angle - 0.6, start.rate + 0.1), 4.0)

@@ -92,7 +92,7 @@ def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float)
 
 
 def test_a_disturbance_reduces_the_braking_down_to_a_twentieth_of_the_torque() -> None:
-    """The approach becomes slower with the disturbance down to a minimum."""
+    """The approach is slower for a larger disturbance, down to a minimum."""
     tracker, wanted = LqTracker(PLANT, 20.0, 1.0), PathSample(0.5, 0.0, 0.0)
 
     def wish(disturbance: float) -> float:
@@ -112,7 +112,7 @@ def test_a_disturbance_reduces_the_braking_down_to_a_twentieth_of_the_torque() -
     ("angle", "authority"), [(1.519, True), (1.522, False), (-1.519, True), (-1.522, False)]
 )
 def test_beyond_87_degrees_no_current_turns_the_body(angle: float, authority: bool) -> None:
-    """The cosine of 1.5208 is 0.05."""
+    """The cosine of 1.5208 rad, the angle of 87 deg, is 0.05."""
     command = LqTracker(PLANT, 20.0, 1.0).command(PathSample(0.0, 0.0, 0.0), angle, 0.0)
     assert command.authority is authority
     assert (command.current != 0.0) is authority
@@ -147,14 +147,14 @@ def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reac
         assert rate == pytest.approx(0.0, abs=1e-9)
         assert max(np.abs(angles)) < 0.2 + 1e-9
         extremes.append((min(angles), max(angles), angle))
-    # A swing is released at the largest angle; a double pulse returns to its start.
+    # A free swing is released at its largest angle; a double pulse returns to its start.
     assert extremes[1][2] == pytest.approx(0.2)
     assert extremes[3][2] == pytest.approx(-0.2)
     assert extremes[0][2] == pytest.approx(0.0, abs=1e-9)
     assert extremes[0][1] == pytest.approx(0.75**2 * 0.2)
     assert made[1][2].duration == made[3][2].duration == 3.0
     assert made[1][2].share == 0.0
-    # The opposite pulse is short: a second at most.
+    # The opposite pulse lasts at most one second.
     short = made[0][3].duration
     assert short == pytest.approx(min(1.0, 0.5 * math.sqrt(0.2 / strength)))
     assert made[2][0].share == -made[0][0].share
@@ -198,7 +198,7 @@ def test_a_body_that_does_not_come_to_rest_is_given_up_after_a_minute() -> None:
 
 
 def test_a_pulse_ends_where_the_body_could_not_be_stopped_within_the_bound() -> None:
-    """With 0.7 of the torque available, the stopping distance is w^2 / (2 a)."""
+    """The stopping distance w^2 / (2 a) assumes 0.7 of the available torque."""
     bound = angle_of(0.2)
     braking = 0.7 * 0.5 * STRENGTH * math.cos(0.3)
     limit = math.sqrt(2.0 * braking * (bound - 0.3))

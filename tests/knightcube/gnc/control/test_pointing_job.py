@@ -54,9 +54,9 @@ def table() -> PointingTable:
 
 
 def flown(table: PointingTable, sizes: Callable[[float], FloatArray]) -> list[float]:
-    """Return the error (deg) from the law after each step of a body under `SIZE` and `RESIDUAL`.
+    """Return the pointing error (deg) after each step of a body under the torques `SIZE` and `RESIDUAL`.
 
-    `sizes` returns the estimated torque sizes at a time, s.
+    The function `sizes` returns the estimated torque coefficients at a time (s).
     """
     law, step = PointingLaw(table, LIMIT), STEP / FINE
     q, w = BEGIN.quaternion, BEGIN.rate
@@ -136,7 +136,7 @@ def test_a_slew_with_an_isolated_coil_is_made_by_the_other_two_within_their_limi
     assert np.abs(currents).max() < LIMIT
     missed = np.linalg.norm(torques - [found.torque for found in made], axis=1)
     assert missed.sum() < 0.05 * np.linalg.norm(torques, axis=1).sum()
-    # The planner knows the heat of the remaining coils.
+    # The planner's heat is that of the remaining coils.
     heat = 5.0 * float((currents**2).sum(axis=1).mean()) * path.horizon
     assert heat < 1.2 * path.heat(left.heat)
 
@@ -158,7 +158,7 @@ def test_a_body_within_a_cone_slews_out_of_it() -> None:
 
 
 def test_a_body_within_one_cone_still_avoids_the_other() -> None:
-    """The camera would cross the Sun halfway, and starts near the limb of the Earth."""
+    """On a direct path the camera would cross the Sun halfway; it starts near the Earth's limb."""
     free = slew(BEGIN, WISH, NADIR, AXES, ORBIT, np.inf)
     assert free is not None
     halfway = len(free.quaternion) // 2
@@ -187,7 +187,7 @@ def rest_of(table: PointingTable, since: float, q: FloatArray, w: FloatArray) ->
 def test_the_rest_of_a_slew_begins_where_the_body_will_be_and_arrives_at_the_same_time(
     table: PointingTable,
 ) -> None:
-    """The body is 0.04 deg off the running path."""
+    """The body is 0.04 deg away from the path that it follows."""
     path = table.slew
     assert path is not None
     since = path.horizon / 3.0
@@ -220,7 +220,7 @@ def test_on_a_known_body_the_rest_is_the_rest_of_the_running_plan(table: Pointin
 
 
 def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> None:
-    """Near the end, correcting 3 deg would need several times the heat of the running path."""
+    """Near the end, a correction of 3 deg would need several times the heat of the current path."""
     assert table.slew is not None
     since = 0.8 * table.slew.horizon
     there = table.slew.references(np.array([since]))
@@ -230,7 +230,7 @@ def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> N
 
 
 def test_a_rest_goes_no_deeper_into_a_cone_than_the_running_path(table: PointingTable) -> None:
-    """The running path was planned without this cone, and crosses the Sun halfway."""
+    """The current path was planned without this exclusion cone, and crosses the Sun halfway."""
     path = table.slew
     assert path is not None
     halfway = path.references(np.array([0.5 * path.horizon])).quaternion[0]

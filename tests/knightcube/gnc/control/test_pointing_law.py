@@ -53,14 +53,14 @@ def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_
 
 @pytest.fixture(scope="module")
 def law() -> PointingLaw:
-    """Return the nadir law; the orbit is in the plane of the dipole, where the field rotates least."""
+    """Return the nadir law, in an orbit through the dipole's poles, where the field rotates least."""
     return PointingLaw(table_from(np.zeros(3), np.zeros(3), 290, until=6_500.0), LIMIT)
 
 
 def fly(
     law: PointingLaw, start: FloatArray, sizes: FloatArray, residual: FloatArray, seconds: float
 ) -> FloatArray:
-    """Return the rotation errors (n, 3), rad, from the reference under `SIZE` and `RESIDUAL`, every 10 s."""
+    """Return rotation errors (n, 3), rad, every 10 s, of a body under the torques `SIZE` and `RESIDUAL`."""
     now = law.wanted(STEP)
     q, w = multiply(from_rotation_vector(start), now.quaternion), now.rate
     turns = []
@@ -118,7 +118,7 @@ def test_the_shapes_are_constant_with_the_flight_and_with_the_sun() -> None:
 
 
 def test_a_path_from_upside_down_is_one_that_the_coils_manage_and_ends_in_the_law() -> None:
-    """Without feedback, the path's dipoles keep the body on the path for ten minutes, near the law."""
+    """Without feedback, the path's dipoles keep the body on the path, and near the law, for ten minutes."""
     table = table_from(np.array([0.0, 2.8, 0.6]), np.radians([0.2, -0.1, 0.1]), 200, until=4_000.0)
     off = np.degrees(angle_between(table.path.quaternion, table.wanted.quaternion))
     assert off[0] == pytest.approx(np.degrees(np.linalg.norm([0.0, 2.8, 0.6])), abs=0.1)
@@ -183,7 +183,7 @@ def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
     for _ in range(50):
         rate, field = 0.02 * rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
         torque = np.cross(damping_dipole(inertia, rate, field), field)
-        # Power of the torque -J rate across the field, which is never positive for equal moments.
+        # The power of the torque -J rate across the field is never positive for equal moments of inertia.
         assert float(rate @ torque) < 1e-3 * float(np.linalg.norm(rate) * np.linalg.norm(torque))
         assert (
             abs(float(torque @ field)) < 1e-12 * float(np.linalg.norm(torque) * np.linalg.norm(field)) + 1e-24
@@ -199,7 +199,7 @@ def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
     astray = PathRecovery()
     assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
     assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
-    # The body is still damped when it is nearer again.
+    # The body is still damped when its error has become small again.
     assert seen(astray, 0.0, 2.0 * SLOW, 20.0) == (10.0, False)
     assert seen(astray, 3.0 * FAR, 0.9 * SLOW, 30.0) == (10.0, True)
     astray.planned()

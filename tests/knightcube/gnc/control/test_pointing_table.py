@@ -42,11 +42,11 @@ LIMIT, STEP = 0.0959, 10.0
 X, Y, Z = np.eye(3)
 LAW = AttitudeLaw(Z, nadir, X, velocity).attitudes
 SIZES = np.array([0.0, 2e-10, 0.0, -1e-10, 1e-9, 2e-9, 3e-10, 0.0, 2e-10])
-"""Torque sizes (N m) of a KnightCube with a mass offset of 6 mm, from a seed of `orbit-pointing`."""
+"""Torque coefficients (N m) of a KnightCube with a mass offset of 6 mm, from a seed of `orbit-pointing`."""
 DEAR = PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=3e-4)
 CHEAP = replace(DEAR, roll=np.radians(10.0), axis=Z)
 BULGED = np.array([4.6e-11, 8.9e-11, -1.1e-10, 3.9e-9, 1.7e-9, 2.35e-9, 3.6e-10, 4.0e-10, 2.2e-10])
-"""Torque sizes (N m) of a seed of `orbit-pointing` in which a KnightCube was lost."""
+"""Torque coefficients (N m) of a seed of `orbit-pointing` that is difficult for a KnightCube."""
 KEPT = 180
 
 
@@ -125,7 +125,10 @@ def test_more_dipole_than_there_is_and_more_rate_than_allowed_are_refused() -> N
 
 
 def test_the_flow_of_an_error_is_the_derivative_of_the_acceleration(rolling: PlannedMotion) -> None:
-    """Compare with differences: a rotation changes the torques of coils, gravity, drag and sunlight."""
+    """Compare with finite differences.
+
+    A rotation changes the torques of coils, gravity, drag and sunlight.
+    """
     ahead, count, size = expected(), 200, 1e-4
     motion = rolling.references(ahead.wanted.times).until(count)
     dipole = rolling.control[:count]
@@ -170,7 +173,7 @@ def test_a_begin_off_the_law_is_led_into_it() -> None:
 
 @pytest.mark.parametrize("roll", [60.0, -100.0])
 def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: float) -> None:
-    """Full steps with the derivative of the continuous motion would give errors of 40 deg, or no motion."""
+    """Full steps with the derivative of the continuous motion would cause errors of 40 deg, or fail."""
     ahead = expected(BULGED)
     q = multiply(from_rotation_vector(np.radians([1.0, -1.0, roll])), ahead.wanted.quaternion[0])
     begun = ahead.wanted.until(KEPT + 1)
@@ -184,7 +187,7 @@ def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: 
 
 
 def test_the_derivative_of_a_step_is_exact(rolling: PlannedMotion) -> None:
-    """Compare with differences, for a body that rotates at 2 deg/s, or 20 deg in a step."""
+    """Compare with finite differences, for a body that rotates at 2 deg/s, or by 20 deg in a step."""
     ahead, size = expected(), 1e-6
     spun = PlannedMotion(rolling.quaternion, rolling.rate + np.array([0.02, -0.02, 0.02]), rolling.control)
     linear = derivative(ahead, spun)

@@ -33,7 +33,7 @@ def follow(
 
 
 def apart(propagated: PropagatedSun) -> float:
-    """Return the angle, deg, between the propagated Sun and the true one."""
+    """Return the angle (deg) between the propagated and the true Sun direction."""
     assert propagated.direction is not None
     return float(np.degrees(np.arccos(np.clip(propagated.direction @ SUN, -1.0, 1.0))))
 

@@ -1,4 +1,4 @@
-"""Tests that the residual dipole is learned from the rate within its bound, for any coil currents."""
+"""Tests that the residual dipole is estimated from the rate within its bound, for any coil currents."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STEP = 0.1
 
 
 def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
-    """Return the dipole learned in 1,500 s in a field that rotates as along half an orbit."""
+    """Return the dipole estimated in 1,500 s, in a field that rotates as along half an orbit."""
     observer, rng = ResidualDipole(np.diag(INERTIA), bound), np.random.default_rng(5)
     rate = np.array([1e-3, -2e-3, 5e-4])
     for k in range(round(1500.0 / STEP)):

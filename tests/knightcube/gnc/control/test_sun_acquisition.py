@@ -15,9 +15,9 @@ SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 INERTIA, LIMIT = np.array([1.10e-3, 1.05e-3, 0.99e-3]), 0.0959
 Z = np.array([0.0, 0.0, 1.0])
 TURN = np.array([0.0, 2.2e-3, 0.0])
-"""Rate (rad/s) of the field, two rotations per orbit."""
+"""Rotation rate (rad/s) of the field: two rotations per orbit."""
 OWN_FIELD = 4e-4
-"""Field of the coils at the magnetometer (T per A m^2)."""
+"""Field that the coils cause at the magnetometer (T per A m^2)."""
 BIAS = np.array([4e-4, -3e-4, 5e-4])
 STEP_NS = 100_000_000
 

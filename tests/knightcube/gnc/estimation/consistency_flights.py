@@ -1,17 +1,18 @@
 """Flights that compare the filter's errors with its covariance: NEES and NIS with all disturbances.
 
-The worlds are sim_hal's testbed and a body that is free in orbit. The testbed has a thread of 0..2e-5 N m/rad
-and 0..4e-6 N m s/rad, which the filter does not know, and a torque of the air; the estimate steers it through
-steps of q2. The free body rotates about three axes from a random attitude, with a random walk of the torque
-and a rotating field. The coils' gain has an error of 10 % (1 sigma).
+The worlds are sim_hal's testbed and a body that is free in orbit. The testbed has a thread of 0 to 2e-5 N
+m/rad and 0 to 4e-6 N m s/rad, which the filter does not know, and an aerodynamic torque. A controller moves
+it through steps of q2 on the basis of the estimate. The free body rotates about three axes from a random
+attitude, with a random walk of the torque and a rotating field. The coils' gain has an error of 10 % (1
+sigma).
 
-The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias, loses 2 % of its
-packets and is silent twice for 0.5..1 s. Every 5 s the star camera gives, with a delay of 0.2..0.6 s, the
-mean rate over 1 s with a full covariance if the stars are streaks, and on the free body also an attitude.
+The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias. It loses 2 % of its
+packets, and is silent twice for 0.5 to 1 s. Every 5 s the star camera gives the mean rate over 1 s with a
+full covariance if the stars are streaks, and on the free body also an attitude. The camera's results are
+delayed by 0.2 to 0.6 s.
 
 NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band is that of chi-square over
-independent runs. NIS divided by its degrees of freedom has a band of the same kind, over all accepted
-measurements.
+independent runs. NIS divided by its degrees of freedom has a similar band, over all accepted measurements.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4
 EXPOSURE, CAMERA_PERIOD = 40, 200
 """Exposure and period of the camera in cycles."""
 LEAST_STREAK = 1.0e-3
-"""Length (rad) of the shortest streak: three px of a field of 20 deg."""
+"""Length (rad) of the shortest streak, which is 3 px in a field of 20 deg."""
 RATE_SIGMAS: FloatArray = np.array([1.5e-5, 1.5e-5, 1.5e-4])
 TRACKER_SIGMAS: FloatArray = np.array([5e-5, 5e-5, 5e-4])
 
@@ -263,7 +264,7 @@ def _result(suspended: bool, tally: Tally, bias: FloatArray, last: Estimate) -> 
 
 
 def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
-    """Return error^T P^-1 error of the free error states."""
+    """Return the normalised squared error of those error states that the world can have."""
     turn = to_rotation_vector(multiply(world.attitude, conjugate(estimate.quaternion)))
     error = np.concatenate(
         [
@@ -282,7 +283,7 @@ def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
 
 
 def _free_errors(suspended: bool) -> IntArray:
-    """Return the indices of the existing errors among the filter's 15."""
+    """Return the indices of the error states that the world can have, out of the filter's 15."""
     return np.array([1, 4, 7, 10, 12, 13, 14]) if suspended else np.array([*range(12), 14])
 
 
@@ -297,7 +298,7 @@ def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
 
 
 def scene_facts(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the figures of all runs of one scene."""
+    """Return the statistics of all runs of one scene."""
     degrees = results[0]["degrees"]
     nees = np.array([result["nees"] for result in results]) / degrees
     means = nees.mean(axis=0)

@@ -22,11 +22,11 @@ NO_ERRORS = BodyErrors(
     camera=0.0,
     horizon=0.0,
 )
-"""A description of body and devices that is exact."""
+"""Description of body and devices without errors."""
 
 
 def moved(state: FilterState, error: FloatArray) -> FilterState:
-    """Return the state plus an error."""
+    """Return a filter state to which an error vector is added."""
     e = error.tolist()
     return FilterState(
         compose(exponential(*e[0:3]), state.quaternion),

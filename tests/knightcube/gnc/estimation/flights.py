@@ -60,7 +60,7 @@ def fly(
     amplitude: float = 0.05,
     driven: Callable[[int, FloatArray], FloatArray] = lambda _, command: command,
 ) -> Flight:
-    """Return a flight with noise of the unit and of the coils, a gyro bias, and a thread or drag.
+    """Return a flight with noise of the IMU and of the coils, a gyro bias, and a thread or drag.
 
     `amplitude` (A) is the amplitude of the currents; `driven` gives the coils' currents by cycle and command.
     """

@@ -100,7 +100,7 @@ class SingleAxisFilter:
         self._command_times.append(time_ns)
         self._commands.append(current)
         oldest = bisect.bisect_right(self._command_times, time_ns - self._settings.history_ns) - 1
-        if oldest > 64:  # removed occasionally, not in each cycle
+        if oldest > 64:  # old commands are removed occasionally, not in each cycle
             del self._command_times[:oldest], self._commands[:oldest]
 
     def start(self, angle: Measurement, rate: Measurement) -> None:
@@ -247,7 +247,7 @@ class SingleAxisFilter:
             self.restarts += 1
 
     def _forget(self, now_ns: int) -> None:
-        """Delete checkpoints and commands that are too old, not in each cycle."""
+        """Delete checkpoints and commands that are too old; this is not done in each cycle."""
         horizon_ns = now_ns - self._settings.history_ns
         if len(self._history) > 2 and self._history[0].measurement.time_ns < horizon_ns - 1_000_000_000:
             keep = bisect.bisect_left(self._history, horizon_ns, key=lambda c: c.measurement.time_ns)

@@ -51,7 +51,7 @@ def assert_same(a: Estimate, b: Estimate) -> None:
 
 @BOTH
 def test_late_measurements_give_what_they_would_have_given_in_time(suspended: bool) -> None:
-    """A mean rate, and a star attitude in the middle of its exposure, arrive in all orders."""
+    """A mean rate, and a star attitude at the middle of the exposure, arrive late in all orders."""
     flight = fly(1, 100, suspended)
     mean = exposure(flight, 40, 60, 1e-10 * np.eye(3))
     off = multiply(from_rotation_vector(np.full(3, 1e-5)), flight.attitudes[50])
@@ -113,7 +113,7 @@ def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> N
 
 
 def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
-    """The holding current is correct for each assumed plant."""
+    """The current that holds the body is correct for each assumed plant."""
     flight = fly(5, 400, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -149,7 +149,7 @@ def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
 def test_a_drop_out_widens_the_covariance_and_is_recovered_from(suspended: bool) -> None:
     """In three seconds without samples, sigma grows and the error stays within four sigma.
 
-    Afterwards both decrease again.
+    Then sigma and error decrease again.
     """
     flight = fly(7, 500, suspended)
     filter_ = begin(flight, suspended)
@@ -193,7 +193,8 @@ def test_the_gate_knows_its_degrees_of_freedom() -> None:
         flight = fly(9, 1000, suspended)
         filter_ = begin(flight, suspended, replace(SETTINGS, gate_sigma=2.0))
         follow(filter_, flight)
-        assert 60 < filter_.refused < 125  # 2000 measurements; the refused ones reduce the spread of the rest
+        # Of 2000 measurements; refusals reduce the spread of the accepted ones.
+        assert 60 < filter_.refused < 125
         assert filter_.restarts == 0
 
 
@@ -321,9 +322,9 @@ def test_an_attitude_that_wraps_round_is_a_small_innovation() -> None:
 
 @BOTH
 def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
-    """A cycle takes under 0.5 ms on average and a replay of 1.6 s under 20 ms of CPU.
+    """On average a cycle takes less than 0.5 ms of processor time, and a replay of 1.6 s less than 20 ms.
 
-    The bounds are twice that.
+    The tested bounds are twice these times.
     """
     flight = fly(14, 400, suspended)
     filter_ = begin(flight, suspended)

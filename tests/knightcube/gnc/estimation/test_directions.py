@@ -64,7 +64,7 @@ def test_rows_are_how_the_innovation_answers_to_each_error(
         bump = step * np.eye(SIZE)[column]
         up, down = (np.array(innovation(moved(STATE, sign * bump), seen, False).value) for sign in (1, -1))
         scale = 1.0 if name == "direction" else 4e-5
-        # The plane is normal to the expected direction and moves with it in second order.
+        # The tangent plane is normal to the expected direction, whose motion changes it only in second order.
         np.testing.assert_allclose((down - up) / (2.0 * step), rows[:, column], atol=2e-6 * scale)
 
 
@@ -89,7 +89,8 @@ def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
         for measurement in (seen, wide)
     ]
     assert squares[0] > 0.01
-    # The plane is normal to the expected direction, 2 mrad off, so the square of the innovation stays.
+    # The tangent plane is normal to the expected direction, which is wrong by 2 mrad, so the squared
+    # innovation hardly changes.
     assert squares[1] == pytest.approx(squares[0], rel=0.05)
 
 
@@ -171,7 +172,8 @@ def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> 
     sigma = np.sqrt(np.diag(estimate.covariance)[FIELD_BIAS])
     assert np.all(sigma < 8e-9)
     error = estimate.field_bias - bias
-    assert error @ np.linalg.solve(estimate.covariance[FIELD_BIAS, FIELD_BIAS], error) < 16.3  # 99.9 %
+    # 99.9 % quantile of chi-square.
+    assert error @ np.linalg.solve(estimate.covariance[FIELD_BIAS, FIELD_BIAS], error) < 16.3
 
 
 def test_without_a_bias_of_the_magnetometer_none_is_estimated() -> None:

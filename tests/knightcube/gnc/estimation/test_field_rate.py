@@ -56,7 +56,8 @@ def follow(
 def test_all_three_components_of_the_rate_are_found_and_the_claim_is_honest(degrees: FloatArray) -> None:
     found, last = follow(np.radians(degrees), INERTIA, 60.0)
     error = found.rate - last[:3]
-    assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3  # one in a thousand
+    # Limit that one in a thousand cases exceeds.
+    assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3
     assert np.linalg.norm(error) < 0.04 * np.linalg.norm(last[:3])
     assert found.restarts == 0
 
@@ -89,7 +90,7 @@ def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() ->
 
 
 def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
-    """The body is at rest in a constant field, so only the gyro shows rotation about the field."""
+    """The body is at rest in a constant field, so only the gyro measures a rotation about the field."""
     found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
     false = 0.05 * FIELD / np.linalg.norm(FIELD)
 

@@ -114,7 +114,8 @@ def test_two_directions_make_a_coarse_attitude_fine_and_a_false_one_is_refused()
     assert found.knowledge is Knowledge.COARSE
     precise = 1e-4**2 * np.eye(3)
     for reference in np.eye(3)[:2]:
-        for _ in range(2):  # the first update starts a degree off, and is linear in small rotations only
+        # Two updates, because the first starts with an error of a degree and is linearised.
+        for _ in range(2):
             assert found.direction(attitude_matrix(true) @ reference, reference, precise) or found.refused
     assert found.knowledge.value == "fine"
     assert angle_between(found.quaternion, true) < 2e-3

@@ -70,7 +70,7 @@ class Craft:
         return np.asarray(np.mean(rates, axis=0) + BIAS + GYRO_SIGMA * self.rng.standard_normal(3))
 
     def seen(self, sigma: float) -> FloatArray:
-        """Return the attitude with an error of `sigma` (rad) per axis."""
+        """Return the true attitude with a random error of `sigma` (rad) per axis."""
         return multiply(from_rotation_vector(sigma * self.rng.standard_normal(3)), self.quaternion)
 
 
@@ -227,7 +227,7 @@ def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> N
 
 
 def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
-    """False directions caused the bias. As an initial value, it would lead each new start astray."""
+    """The bias was caused by false directions. As an initial value, it would falsify each new start."""
     craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
     known = settings.error_state(INERTIA).prior[SLOW, SLOW]
     taught = np.zeros(len(known))
@@ -276,7 +276,8 @@ def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
     off = to_rotation_vector(multiply(apart.quaternion, conjugate(together.quaternion)))
     assert np.linalg.norm(off) < 1e-8
     assert np.linalg.norm(together.motion.inverse @ np.cross(uneven, FIELD)) > 1e-6
-    # The rotation due to the dipole itself rotates the field, which is of third order in the time.
+    # The rotation that the dipole causes also rotates the field in body axes, an effect of third order in
+    # time.
     assert apart.rate == pytest.approx(together.rate, abs=1e-8)
 
 
@@ -300,7 +301,7 @@ def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time()
 
 
 def test_after_a_large_correction_the_remaining_error_is_that_of_the_corrected_axes() -> None:
-    """The direction that a measurement determines accurately is fixed in space, not in the body."""
+    """A direction that a measurement determines accurately is fixed in inertial space, not in the body."""
     prior, noise = 0.3**2 * np.eye(3), np.diag([1.0, 1e-4, 1e-4]) ** 2
     wide = FreeFilter(INERTIA, FreeFilterSettings(errors=NO_ERRORS))
     wide.start(IDENTITY, prior, np.zeros(3))

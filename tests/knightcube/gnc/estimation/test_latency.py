@@ -16,12 +16,12 @@ from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, S
 from tests.support.consistency_worlds import CYCLE_NS
 
 SWING = 0.14
-"""Current (A) near the coils' limit: a slew shows the age of the samples, a hold does not."""
+"""Current (A) near the coils' limit, for a slew: only motion makes the age of the samples observable."""
 ESTIMATING = replace(SETTINGS, latency_start=0.05)
 
 
 def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[AttitudeFilter, Estimate]:
-    """Give a filter samples that are stamped `late` cycles too late; return it and its last estimate."""
+    """Give a filter samples with time stamps `late` cycles too late; return it and its last estimate."""
     filter_ = AttitudeFilter(SUSPENDED, settings)
     for cycle in range(late, len(flight.samples)):
         age = filter_.latency if settings.latency_start else None
@@ -39,14 +39,17 @@ def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[At
 
 
 def sigmas(flight: Flight, last: Estimate) -> float:
-    """Return the error of the estimated rotation in its own sigmas."""
+    """Return the error of the estimated rotation in units of its claimed sigma."""
     error = angle_about_axis_y(flight.attitudes[-1]) - angle_about_axis_y(last.quaternion)
     return float(abs(error) / np.sqrt(last.covariance[1, 1]))
 
 
 @pytest.mark.parametrize("late", [0, 2, 3])
 def test_the_age_is_found_and_made_up_for(late: int) -> None:
-    """After 20 s the age is known to 12 ms, as claimed. Without it, two cycles cause ten sigma."""
+    """After 20 s the age is known to 12 ms, as claimed.
+
+    Without a correction, an age of two cycles causes errors of ten sigma.
+    """
     flight = fly(32, 800, True, SWING)
     filter_, last = follow_late(flight, late, ESTIMATING)
     sigma = float(np.sqrt(last.covariance[LATENCY, LATENCY]))
@@ -59,7 +62,7 @@ def test_the_age_is_found_and_made_up_for(late: int) -> None:
 
 
 def test_the_error_of_the_age_is_as_large_as_the_filter_says() -> None:
-    """The mean square over ten flights, in sigmas, is in the 99.9 % band of chi-square with ten degrees."""
+    """The sum of ten flights' normalised squares is in the 99.9 % band of chi-square with ten degrees."""
     squares = []
     for seed in range(20, 30):
         _, last = follow_late(fly(seed, 300, True, SWING), 1, ESTIMATING)
@@ -81,7 +84,7 @@ def test_a_rate_alone_does_not_show_the_age() -> None:
 
 
 def test_no_age_is_taken_that_is_none() -> None:
-    """Before the start the age is unknown, and an age beyond its limits is rejected."""
+    """Before the start of the filter the age is unknown, and an age beyond its limits is rejected."""
     filter_ = AttitudeFilter(SUSPENDED, ESTIMATING)
     assert filter_.latency == 0.0
     flight = fly(13, 400, True)
@@ -90,7 +93,7 @@ def test_no_age_is_taken_that_is_none() -> None:
 
 
 def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
-    """The effect is half the step of the acceleration times one sigma of the age, and zero without a step."""
+    """The noise is half the step of the acceleration times one sigma of the age, and zero without a step."""
     state = AttitudeFilter(SUSPENDED, ESTIMATING)
     flight = fly(14, 1, True)
     state.start(*flight.samples[0])

@@ -1,4 +1,4 @@
-"""Tests of the filter's derivatives against differences, and of its noise against Monte Carlo."""
+"""Tests of the filter's derivatives against finite differences, and of its noise against Monte Carlo."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ABOUT_THREAD = [1, 4, 7, 10, 12, 13, 14]
 
 
 def walks_of(bias: float, disturbance: float) -> FloatArray:
-    """Return the densities (19,) of the random walks."""
+    """Return the random-walk densities (19,) of the error states."""
     return np.repeat([0.0, bias, disturbance, 0.0], [6, 3, 3, SIZE - 12])
 
 
@@ -172,7 +172,7 @@ def test_correcting_by_an_exact_attitude_gives_that_attitude() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
-    """Accurate and useless measurements come in any order, from one radian to a microradian."""
+    """Accurate and inaccurate measurements, from a microradian to a radian, come in any order."""
     rng = np.random.default_rng(seed)
     noise = ProcessNoise(1e-7, np.zeros((3, 3)), walks_of(1e-9, 1e-9))
     state, covariance = STATE, np.diag(10.0 ** rng.uniform(-8.0, 0.0, SIZE))

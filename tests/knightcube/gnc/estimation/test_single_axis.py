@@ -33,7 +33,7 @@ def run(filter_: SingleAxisFilter, commands: list[float], measurements: list[Mea
 
 
 def test_its_errors_are_as_large_as_its_covariance_says() -> None:
-    """NEES of angle and rate over 40 runs lies in the 99.9 % band of chi-square(80)."""
+    """The summed NEES of angle and rate over 40 runs is in the 99.9 % band of chi-square(80)."""
     rng = np.random.default_rng(7)
     nees = []
     for _ in range(40):

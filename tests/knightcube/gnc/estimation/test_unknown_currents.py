@@ -1,4 +1,4 @@
-"""Tests that the filter follows its measurements while coil currents are unknown, and learns nothing."""
+"""Tests that the filter follows its measurements, but estimates no parameters, while currents are unknown."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight,
 from tests.support.consistency_worlds import CYCLE_NS
 
 STUCK, FOUND, FREE_AGAIN, END = 400, 420, 600, 800
-"""Cycles: the chip gets stuck, this is found half a second later, and the chip works again."""
+"""Cycles at which the chip gets stuck, the fault is detected (0.5 s later), the chip works again, and the
+run ends."""
 LIMIT = 0.148
 
 
@@ -46,7 +47,7 @@ def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
 
 
 def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
-    """Return the errors of angle, rate and gain over their sigmas, at the last cycle."""
+    """Return the errors of angle, rate and gain at the last cycle, in units of their sigmas."""
     estimate = filter_.at((END - 1) * CYCLE_NS)
     sigma = np.sqrt(np.diag(estimate.covariance))
     found = np.array([angle_about_axis_y(estimate.quaternion), estimate.rate[1], estimate.parameters.gain])

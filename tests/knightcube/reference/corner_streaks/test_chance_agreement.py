@@ -1,4 +1,4 @@
-"""Tests that fragments of long streaks that agree by chance give no rate."""
+"""Tests that fragments of long streaks do not give a rate if they agree only by chance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of Trajkovic and Hedley's cornerness against manual patches and an exhaustive search."""
+"""Tests of Trajkovic and Hedley's cornerness against hand-computed patches and an exhaustive search."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _by_brute_force(patch: FloatArray, neighbours: int) -> float:
 
 
 def test_a_patch_computed_by_hand() -> None:
-    """The centre is 5; right 1, left 3, below 8, above 6: r_A = 16 + 4, r_B = 9 + 1.
+    """The centre is 5, with 1 right, 3 left, 8 below and 6 above, so r_A = 16 + 4 and r_B = 9 + 1.
 
     B1 = (8-1)(1-5) + (6-3)(3-5) = -34, B2 = (8-3)(3-5) + (6-1)(1-5) = -30; B = -34, C = 20, A = 10 - 20 + 68
     = 58, A + B = 24 > 0: R = 20 - 34^2/58 = 2/29.
@@ -72,7 +72,7 @@ def test_where_no_direction_between_is_lower_the_simple_response_stands() -> Non
 
 
 def test_eight_neighbours_by_hand() -> None:
-    """The ring is 0 except f = i = 5, around 5: along that diagonal the intensity does not change."""
+    """The ring around 5 is 0 except f = i = 5, so the intensity does not change along that diagonal."""
     patch = _patch([[5, 0, 0], [0, 5, 0], [0, 0, 5]])
     assert simple_response(patch, 4)[1, 1] == 50.0
     assert simple_response(patch, 8)[1, 1] == 0.0
@@ -87,7 +87,10 @@ def test_with_four_neighbours_it_is_the_corrected_equations() -> None:
 
 
 def test_the_printed_b1_would_not_be_the_least_change() -> None:
-    """Equation 3.12 as printed mixes two diameters; the corrected one agrees with an exhaustive search."""
+    """Equation 3.12 as printed mixes two diameters.
+
+    The corrected equation agrees with an exhaustive search.
+    """
     patch = _patch([[0, 6, 0], [3, 5, 1], [0, 8, 0]])
     printed = (8 - 1) * (1 - 5) + (6 - 1) * (3 - 5)
     assert printed != -34
@@ -212,7 +215,10 @@ def test_without_its_constant_each_detector_is_biased_inward_by_it(detector: Det
 
 @pytest.mark.parametrize("detector", DETECTOR_NAMES)
 def test_a_crossing_of_two_streaks_has_not_two_corners(detector: DetectorName) -> None:
-    """There are four ends; Trajkovic-4, whose response grows with brightness, sees only the crossing."""
+    """Two crossing streaks have four ends.
+
+    Trajkovic-4, whose response grows with brightness, finds only the crossing.
+    """
     crossing = _streak(0.0)[0] + _streak(0.5 * np.pi)[0]
     assert len(_corners(crossing, StreakSettings.of(detector))) != 2
 
@@ -223,7 +229,7 @@ def test_trajkovic_4_refuses_a_streak_near_a_diagonal(roll: float) -> None:
 
 
 def test_the_centre_of_intensity_of_the_image_lies_far_inside_the_streak() -> None:
-    """The thesis uses this localisation: streaks.md states 2.2 px for 7 x 7 pixels."""
+    """The thesis uses this localisation, for which streaks.md states an error of 2.2 px with 7 x 7 pixels."""
     image, truth = _streak(0.0)
     found = np.linalg.norm(np.diff(_corners(image, StreakSettings(centre_of="image")), axis=0))
     assert 1.5 < 0.5 * (np.linalg.norm(truth[1] - truth[0]) - found) < 2.5

@@ -68,7 +68,7 @@ def test_the_rate_vector_is_within_a_percent(theta_deg: float, length: float) ->
     result = _estimate(star_frame(_WHOLE, rate, 1.0, 1, faintest=6.5), _WHOLE, rate)
     error = _rate_of(result) - rate
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(rate)
-    # The magnitude is known better than the direction: 0.25 % is 0.06 px of 25 px.
+    # The magnitude is more accurate than the direction; 0.25 % is 0.06 px of 25 px.
     assert np.linalg.norm(_rate_of(result)) == pytest.approx(np.linalg.norm(rate), rel=0.0025)
 
 
@@ -90,10 +90,11 @@ def test_the_covariance_is_that_of_the_errors_over_many_frames() -> None:
         error = _rate_of(result) - rate
         assert result.covariance is not None
         nees.append(float(error @ np.linalg.solve(result.covariance, error)))
-    # The mean of 40 chi-squares of 3 degrees of freedom is 3 +- 0.39. The scale from some 15 streaks per
-    # frame and the detector's bias, constant to 0.02 px, widen that: 3 sigma down, 4.5 up.
+    # The mean of 40 chi-squares of 3 degrees of freedom is 3 +- 0.39. The band is 3 sigma downwards and 4.5
+    # sigma upwards, because the error scale comes from some 15 streaks per frame, and the detector's bias is
+    # constant only to 0.02 px.
     assert 1.83 < np.mean(nees) < 4.75
-    # One frame in a thousand exceeds 16.3.
+    # The normalised square exceeds 16.3 in one of a thousand frames.
     assert np.count_nonzero(np.array(nees) > 16.3) <= 2
 
 
@@ -141,7 +142,7 @@ def test_below_twenty_pixels_it_says_too_short(length: float) -> None:
     assert result.status is StreakStatus.TOO_SHORT
     assert result.rate is None
     assert result.covariance is None
-    # Moments give the length of a blob to a few pixels.
+    # The moments of a region give its length only to a few pixels.
     assert result.length == pytest.approx(length, abs=4.0)
 
 
@@ -282,7 +283,7 @@ def test_ends_are_grouped_for_an_axis_normal_to_and_along_the_boresight(theta_de
     swap = np.random.default_rng(seed + 100).uniform(size=30) < 0.5
     first = np.where(swap[:, None], ends, starts)
     second = np.where(swap[:, None], starts, ends)
-    # Three streaks have another motion.
+    # Three streaks are outliers with another motion.
     second[[4, 11, 20]] = np.roll(second[[4, 11, 20]], 1, axis=0)
     star = np.ones(30, dtype=np.bool_)
     star[[4, 11, 20]] = False
@@ -290,7 +291,7 @@ def test_ends_are_grouped_for_an_axis_normal_to_and_along_the_boresight(theta_de
     axis, agree = rotation_axis(first, second, 1.0 / _PINHOLE.focal_length / length)
     assert np.count_nonzero(agree & star) >= 25
     order = rotation_angles(first, second, axis)[star] < 0.0
-    # All or none are reversed; one frame does not show which.
+    # Either all streaks or none are reversed, because one frame does not show the direction of time.
     reversed_order = order ^ swap[star]
     assert reversed_order.all() or not reversed_order.any()
     assert abs(axis @ true_axis) > np.cos(np.deg2rad(6.0))
@@ -315,7 +316,7 @@ _CAMERA = star_camera()
 _FIELD = np.deg2rad(20.0)
 
 
-# Table 3.1: rate at 10 % of the field.
+# Rate errors (%) of Table 3.1 for a rotation of 10 % of the field.
 _THESIS: dict[DetectorName, float] = {
     "harris": 0.0069,
     "minimum-eigenvalue": 0.0120,
@@ -376,7 +377,7 @@ def test_the_thesiss_mean_threshold_serves_a_frame_without_noise_and_no_other() 
     assert result.status is StreakStatus.RATE
     assert result.rate is not None
     assert np.linalg.norm(result.rate) == pytest.approx(np.linalg.norm(rate), rel=0.01)
-    # Faint stars hardly raise the mean, so half of all pixels exceed it and are connected.
+    # Faint stars hardly raise the mean of the image, so half of all pixels exceed it and are connected.
     noisy = np.rint(0.02 * clean + rng.normal(150.0, 12.0, clean.shape)).astype(np.uint16)
     assert segment_frame(noisy, settings).regions.area.max() > 0.2 * noisy.size
     assert estimate_rate(noisy, camera.pinhole, 1.0, settings, rate, 1e-3).rate is None

@@ -55,7 +55,7 @@ def _error(solution: FrameSolution, truth: FloatArray) -> FloatArray:
 def test_the_streaks_of_every_detector_are_identified_and_both_ends_give_the_rate(
     detector: DetectorName,
 ) -> None:
-    """The attitude is correct to a third of a pixel (15"), and the rate to 2 %, the thesis's figure."""
+    """The attitude is correct to a third of a pixel (15"), and the rate to 2 %, as the thesis states."""
     frame = _frame(0)
     solution, found = _solve(_streaks(frame, detector))
     assert solution.status is SolveStatus.SOLVED
@@ -66,7 +66,7 @@ def test_the_streaks_of_every_detector_are_identified_and_both_ends_give_the_rat
 
 
 def test_the_errors_of_attitude_and_rate_are_of_the_size_that_they_are_said_to_be() -> None:
-    """Ten frames are within the 1e-5 quantiles of chi-square, widened twofold."""
+    """The squared errors of ten frames are within twice the 1e-5 quantiles of chi-square."""
     attitude, rate = 0.0, 0.0
     for seed in range(10):
         frame = _frame(seed)
@@ -83,7 +83,10 @@ def test_the_errors_of_attitude_and_rate_are_of_the_size_that_they_are_said_to_b
 
 
 def test_a_wrong_direction_of_time_leaves_the_attitude_at_mid_exposure_and_turns_the_rate() -> None:
-    """A frame does not show which end was first: the middle is the same, and the rate the opposite."""
+    """A frame does not show which end was first.
+
+    Both orders give the same middle attitude and opposite rates.
+    """
     frame = _frame(1)
     streaks = _streaks(frame)
     turned = replace(streaks, endpoints=streaks.endpoints[:, ::-1])
@@ -142,13 +145,13 @@ def test_exact_endpoints_give_back_the_rate_its_angle_and_axis(theta_deg: float,
         found.rotation_vector / np.linalg.norm(found.rotation_vector), rate / np.linalg.norm(rate), atol=1e-8
     )
     assert field_fraction(found.rate, exposure, _FIELD) == pytest.approx(fraction, rel=1e-8)
-    # Half the rotation in either direction from mid-exposure, whose axes the stars are given in.
+    # The ends are half the rotation before and after mid-exposure, in whose axes the stars are given.
     for fix, sign in ((found.start, -0.5), (found.end, 0.5)):
         assert angle_between(fix.quaternion, from_rotation_vector(sign * rate * exposure)) < 1e-11
 
 
 def test_the_sign_is_that_of_a_star_fixed_in_the_sky() -> None:
-    """A camera that rotates about +y sees stars move to -x: v' = (-omega_y, omega_x) at v = z."""
+    """In a camera that rotates about +y, stars move to -x: v' = (-omega_y, omega_x) at v = z."""
     stars = _field(2)
     ends = _CAMERA.pinhole.project(stars)[:, None] + np.array([[4.0, 0.0], [-4.0, 0.0]])
     found = attitudes_of_ends(ends, stars, np.full(len(stars), 0.1), _CAMERA.pinhole, 1.0)
@@ -216,7 +219,7 @@ def test_a_turn_about_the_boresight_does_not_count_as_an_error_across_it() -> No
 
 
 def test_a_frame_with_its_stars_known_gives_both_attitudes_to_a_fifth_of_a_pixel() -> None:
-    """Harris with streaks of 10 % and the true identifications; the thesis states 0.10 px."""
+    """With Harris's corners, streaks of 10 % and true identifications, the thesis states 0.10 px."""
     rng = np.random.default_rng(7)
     rate = rate_at(np.deg2rad(60.0), 0.1 * _FIELD, 0.4)
     stars, magnitudes = random_stars(rng, _CAMERA.pinhole, 0.05, 6.0)

@@ -1,4 +1,4 @@
-"""Tests of image files of each supported kind: from Pillow, from the test, or stored by the vision worker."""
+"""Tests of image files of each supported kind, written by Pillow, by the test, or by the vision worker."""
 
 from __future__ import annotations
 
@@ -412,10 +412,11 @@ def test_a_full_disk_loses_only_the_stored_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tiff"])
 def test_a_photograph_is_rotated_as_its_metadata_state(tmp_path: Path, name: str, orientation: int) -> None:
-    """The marks are at the top left; from orientation 5 on, the long side of the stored image is vertical."""
+    """The marks are at the top left; for orientations from 5 on, the stored image's long side is vertical."""
     pixels = np.zeros((32, 48), dtype=np.uint8)
     pixels[:8, :24], pixels[16:24, 8:16] = 200, 100
-    # Each orientation says where row 0 and column 0 of the stored image belong (EXIF 2.3, section 4.6.4).
+    # Each orientation states the sides to which row 0 and column 0 of the stored image belong (EXIF 2.3,
+    # section 4.6.4).
     stored = {
         1: pixels,
         2: pixels[:, ::-1],

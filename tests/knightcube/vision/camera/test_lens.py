@@ -60,7 +60,7 @@ def test_unit_vectors_undo_the_projection_to_a_nanopixel(
 
 @given(k1=st.floats(-2.0, 2.0), k2=st.floats(-2.0, 2.0))
 def test_a_lens_is_refused_exactly_when_its_image_folds_within_the_detector(k1: float, k2: float) -> None:
-    """A lens is valid if the distorted tangent grows up to the corner of the image."""
+    """A lens is valid if the distorted tangent increases up to the corner of the image."""
     corner = np.hypot(512.0, 512.0) / 512.0
     tangent = np.linspace(0.0, 6.0, 60_001)
     stretched = tangent * (1.0 + k1 * tangent**2 + k2 * tangent**4)
@@ -78,7 +78,7 @@ def test_a_direction_beyond_the_fold_is_not_imaged() -> None:
     lens = Lens(200, 200, 1000.0, (99.5, 99.5), -0.5)
     tangents = np.array([0.1, 0.8, 1.0, 1.4])
     points = lens.project(np.stack([tangents, 0.0 * tangents, np.ones(4)], axis=-1))
-    # The distorted tangent decreases beyond 1/sqrt(1.5) = 0.816. At 1.4 it would give pixel 127.
+    # The distorted tangent decreases beyond 1/sqrt(1.5) = 0.816. A tangent of 1.4 would give pixel 127.
     assert np.isfinite(points[:2]).all()
     assert np.isnan(points[2:]).all()
     assert np.isnan(lens.unit_vectors(np.array([[99.5 + 545.0, 99.5]]))).all()
@@ -141,9 +141,9 @@ def test_the_boresight_falls_between_the_middle_pixels() -> None:
 
 
 def test_the_field_of_view_ends_at_the_outer_edge_of_the_outermost_pixel() -> None:
-    """Sease, section 2.4: half the field of view is half the columns.
+    """By Sease, section 2.4, half the field of view corresponds to half the columns.
 
-    Pixel 0 is a pixel centre, so that its edge is at -0.5.
+    Coordinate 0 is the centre of a pixel, whose edge is at -0.5.
     """
     edge = np.radians(10.0)
     points = CAMERA.project(np.array([[np.sin(edge), 0.0, np.cos(edge)], [-np.sin(edge), 0.0, np.cos(edge)]]))

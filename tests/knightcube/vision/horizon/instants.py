@@ -1,4 +1,4 @@
-"""Satellites above 53 deg north with the rendered frames of their horizon cameras."""
+"""Satellites above a latitude of 53 deg north, with rendered frames of their horizon cameras."""
 
 from __future__ import annotations
 

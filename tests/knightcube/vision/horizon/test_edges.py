@@ -104,7 +104,7 @@ def test_levels_are_those_of_a_dark_and_a_bright_half_and_the_noise_of_the_dark(
     assert lines.levels.noise == pytest.approx(3.0, rel=0.08)
     assert lines.pixels == 16 * SIZE
     assert lines.space == SIZE / 8
-    # A small disc of the Sun changes neither the span nor the median.
+    # A small disc of the Sun changes neither the brightness span nor the median.
     sun = step(128.0) + noise
     sun[14:20, 14:20] = 4000.0
     assert find_edges(sun, FEW)[1].levels.bright == pytest.approx(110.0, abs=2.0)
@@ -135,7 +135,7 @@ def test_pixels_above_three_tenths_of_the_span_are_bright(grey: float, place: fl
 
 @pytest.mark.parametrize(("sigmas", "lit"), [(5.5, False), (6.5, True)])
 def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, lit: bool) -> None:
-    """The span is that of a quarter of the image at 100 sigma, and 1 % of the span is below the noise."""
+    """A quarter of the image at 100 sigma determines the brightness span, of which 1 % is below the noise."""
     noise = np.random.default_rng(3).normal(0.0, 1.0, (SIZE, SIZE))
     image = bars(0.0, sigmas, 0.0, 100.0) + noise
     low = EdgeSettings(lines=8, threshold=0.01, run=1)
@@ -144,7 +144,7 @@ def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, 
 
 
 def test_of_too_many_edges_those_with_the_darkest_side_are_kept() -> None:
-    """In eight bars on a rising background, each of 8 rows has 4 rising edges, of which two are kept."""
+    """With eight bars on a rising background, each of 8 rows has 4 rising edges, of which two are kept."""
     image = bars(0.0, 100.0, 4.0, 100.0, 8.0, 100.0, 12.0, 100.0)
     settings = EdgeSettings(lines=8, most=2)
     edges, _ = find_edges(image, settings)

@@ -21,7 +21,7 @@ PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hal
 
 
 def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> None:
-    """A column crosses the part of the circle that is less oblique than 0.3, which is 0.954 of the radius."""
+    """Columns count only where the circle is less oblique than 0.3, which is up to 0.954 of its radius."""
     angle = np.linspace(0.0, 2.0 * np.pi, 7200, endpoint=False)
     circle = 256.0 + 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inside = np.ones(len(angle), dtype=bool)
@@ -36,7 +36,7 @@ def test_edges_along_a_whole_limb_are_significant_and_a_tenth_of_them_are_not() 
     others = generator.uniform(-200.0, 200.0, 100)
     assert log10_chance(limb, generator.normal(0.0, 0.1, 40), others, CAMERA, 2) < -50.0
     assert log10_chance(limb, generator.uniform(-2.0, 2.0, 4), others, CAMERA, 2) > 0.0
-    # An unknown altitude and other edges beside the limb increase the probability of a chance horizon.
+    # An unknown altitude and edges that are not on the limb increase the probability of a chance horizon.
     good = generator.normal(0.0, 0.3, 25)
     known, unknown = (log10_chance(limb, good, others, CAMERA, n) for n in (2, 3))
     crowded = log10_chance(limb, good, generator.uniform(-20.0, 20.0, 200), CAMERA, 2)

@@ -1,4 +1,4 @@
-"""Tests of images that contradict a known attitude, and of sound images that must never do so."""
+"""Tests that false images contradict a known attitude, and that correct images never do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PINHOLE = Pinhole.from_field_of_view(128, 128, math.radians(80.0))
 CAMERA = MountedCamera(PINHOLE, np.array([0.0, 0.0, 0.0, 1.0]))
 AWAY = 1.496e11
 ERROR = math.radians(0.3)
-"""Error (rad per axis) of the attitude that judges the images."""
+"""Error (rad per axis) of the attitude by which images are tested."""
 
 
 def _samples(rays: FloatArray, bright: bool) -> Samples:
@@ -65,7 +65,7 @@ def test_no_sound_image_is_judged_false() -> None:
     ("fault", "least"), [("black", 6), ("saturated", 30), ("blinded", 30), ("garbage", 30)]
 )
 def test_images_of_a_broken_camera_are_judged_false(fault: str, least: int) -> None:
-    """Many of the 60 views show the night side or space beside the Sun."""
+    """Many of the 60 views show only the night side, or space near the Sun."""
     views = [view(seed) for seed in range(60)]
     false = [bool(judged(np.asarray(SPOILT[fault](one[0], 1)), *one[1:])) for one in views]
     assert sum(false) >= least
@@ -162,7 +162,7 @@ def test_stray_light_of_the_sun_excuses_a_bright_sky(apart_deg: float, false: bo
 def test_samples_are_compared_by_day_by_night_and_above_the_air(
     angle: float, elevation_deg: float, dark: int, lit: int
 ) -> None:
-    """The atmosphere extends 60 km above a limb at a distance of 2,575 km, which is 0.0233 rad."""
+    """The atmosphere extends 60 km above a limb at a distance of 2,575 km, or by an angle of 0.0233 rad."""
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     sun = sun_at(math.radians(elevation_deg), min(angle, LIMB - 1e-9))
     for bright in (True, False):
@@ -183,7 +183,7 @@ def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: i
 def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_are(
     spread_deg: float, stray: bool
 ) -> None:
-    """Twelve bright samples in a dark sky of 400 samples lie close together or far apart."""
+    """Twelve bright samples among 400 samples of a dark sky are close together or far apart."""
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     draw = np.random.default_rng(4)
     sky = normalise(at(2.2) + 0.8 * draw.standard_normal((400, 3)))
@@ -219,7 +219,7 @@ def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> 
     assert found is not None
     error = math.acos(min(1.0, float(found.direction @ nadir)))
     assert math.degrees(error) < 2.0
-    # Directions 4.5 deg apart have a rounding error of 4.5 / sqrt(12) deg on each axis.
+    # A grid of directions 4.5 deg apart has a rounding error of 4.5 / sqrt(12) deg per axis.
     assert found.sigma > math.radians(4.5 / math.sqrt(12.0))
     assert error < 2.0 * found.sigma < math.radians(6.0)
     assert found.covariance @ found.direction == pytest.approx(np.zeros(3), abs=1e-6)

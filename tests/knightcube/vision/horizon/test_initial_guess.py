@@ -38,7 +38,7 @@ COSINE = math.cos(math.radians(65.0))
 
 
 def ring(nadir: FloatArray, half_angle: float, count: int, off: float = 0.0) -> EdgeRays:
-    """Return edges on a cone about `nadir` (3,), bright inside, each `off` px outside of the cone."""
+    """Return edges about `nadir` (3,), bright inside, each displaced by `off` px outwards from a cone."""
     turn = shortest_turn(NADIR, nadir)
     azimuth = np.arange(count) * (2.0 * np.pi / count)
     angle = half_angle + off * PIXEL
@@ -121,7 +121,7 @@ def test_two_edges_determine_a_known_cone_and_three_an_unknown_one() -> None:
 
 
 def test_few_trials_are_spread_over_all_pairs() -> None:
-    """The first third of the edges is on no common cone with the others, and its pairs are tried first."""
+    """The first third of the edges has no cone in common with the others, and its pairs are tried first."""
     draw = np.random.default_rng(1)
     good = ring(NADIR, math.acos(COSINE), 30)
     stray = EdgeRays(
@@ -168,7 +168,7 @@ def test_one_direction_gives_the_rotation_about_nadir_with_the_error_of_its_leve
 
 
 def test_the_more_accurate_direction_decides_and_the_average_is_weighted() -> None:
-    """Two directions with errors of 0.01 and 0.02 rad, which are 0.03 rad apart, have weights of 4 to 1."""
+    """Two measurements with errors of 0.01 and 0.02 rad, which differ by 0.03 rad, have weights of 4 to 1."""
     quaternion, nadir, down = true_attitude()
     level = across(down, 0.5 * math.pi)
     pair = sensed(level, 0.01), sensed(level, 0.02, 0.03 * nadir)
@@ -189,7 +189,10 @@ def test_a_direction_along_nadir_gives_no_rotation(lever: float, known: bool) ->
 def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
     off_deg: float, accepted: bool
 ) -> None:
-    """An initial nadir guess is wrong by up to 0.3 deg in flight, and four times 0.2 deg are tolerated."""
+    """In flight, initial guesses of nadir are wrong by up to 0.3 deg.
+
+    A deviation of four times 0.2 deg is accepted.
+    """
     _, nadir, down = true_attitude()
     level = across(down, 0.5 * math.pi)
     axis = normalise(np.cross(nadir, sensed(level, 1.0).camera))
@@ -288,7 +291,7 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
 
 @pytest.mark.parametrize("altitude", [250e3, 700e3, 1900e3])
 def test_the_errors_of_the_spherical_model_are_those_of_limbs_of_the_ellipsoid(altitude: float) -> None:
-    """The truth is the circular cone through the limb of the ellipsoid, from places all over a sphere."""
+    """The truth is the circular cone through the limb of the ellipsoid, from positions all over a sphere."""
     count = 300
     height = (2.0 * np.arange(count) + 1.0) / count - 1.0
     radii, tilts = np.zeros(count), np.zeros((count, 2))

@@ -1,4 +1,4 @@
-"""Tests of the limb: tangents by another method, gradients by differences, covariance by many fits."""
+"""Tests of the limb model: tangents by another method, gradients by differences, covariance by many fits."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _arc(view: LimbView, generator: np.random.Generator, sigma: float) -> FloatA
 
 
 def test_the_fits_covariance_is_that_of_its_errors() -> None:
-    """The summed NEES of 200 fits is a chi-square of 400 degrees of freedom.
+    """The summed NEES of 200 fits is a chi-square with 400 degrees of freedom.
 
     The 99.9 % limits of the sum are 310 and 497.
     """
@@ -188,7 +188,7 @@ def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_residuals_beyond_the_sigmas_increase_the_covariance(share: float) -> None:
-    """A part of the points, or all points, have four times the errors that their sigmas state."""
+    """Some or all of the points have errors of four times their stated sigmas."""
     generator = np.random.default_rng(12)
     view = _view(generator)
     prior, sizes = Prior(1.0, 10.0, 10.0), []

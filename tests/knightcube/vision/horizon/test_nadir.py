@@ -1,6 +1,6 @@
 """Tests of the nadir from rendered frames: in daylight, at the terminator, and without a limb.
 
-With several cameras: a joint fit of the limb, and a coarse nadir without a limb in view.
+With several cameras, a joint fit of the limb and a coarse nadir without a limb in view are tested.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def test_a_horizon_with_bright_sky_is_refused(day: tuple[EarthScene, Image]) -> 
 def test_a_horizon_of_few_edges_is_read_more_closely_where_it_runs() -> None:
     """The first pass reads 14 lines in each direction, the second pass 42 lines near the limb only.
 
-    Fewer pixels are read, and the result is more accurate.
+    The second pass reads fewer pixels, and its result is more accurate.
     """
     generator = np.random.default_rng((3, 0, 1))
     scene = random_scene(generator, MODEL, "sunlit", (400e3, 700e3))
@@ -298,7 +298,7 @@ def test_invalid_settings_are_refused() -> None:
 
 JOINT_SETTINGS = finder_settings(WIDE_MODEL)
 EARTHLIGHT = 30.0
-"""Counts of a flux of 0.025 in the logarithmic camera."""
+"""Counts of the logarithmic camera at an intensity of 0.025."""
 
 
 def error_deg(found: JointNadir, truth: FloatArray) -> float:
@@ -353,7 +353,7 @@ def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three
 
 
 def test_two_cameras_that_disagree_leave_the_nadir_ambiguous(level: Instant) -> None:
-    """The images of two cameras are exchanged, and neither a third camera nor an attitude decides."""
+    """The images of two cameras are swapped, and neither a third camera nor an attitude decides."""
     frames = {0: level.frames[0], 1: np.ascontiguousarray(level.frames[1][::-1])}
     found = nadir_of_cameras(frames, UW, HorizonKnowledge(position=level.position), JOINT_SETTINGS)
     assert found.nadir is None
@@ -369,7 +369,7 @@ def test_two_cameras_outvote_a_third(level: Instant) -> None:
 
 
 def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_cameras() -> None:
-    """Either rim of the band in the third image may be the limb, and the other cameras decide."""
+    """Either edge of the band in the third image may be the limb, and the other cameras decide."""
     tilted = instant(UW, np.array([-0.22, -0.38, 1.0]), np.array([0.8, 0.5, 0.3]), 12)
     frames = {**tilted.frames, 2: np.minimum(tilted.frames[2], tilted.frames[2][::-1])}
     knowledge = HorizonKnowledge(position=tilted.position)
@@ -385,7 +385,7 @@ def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_camera
 def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
     """The limb is 68 deg from nadir.
 
-    The Earth therefore fills a field of 33 deg half width up to 25 deg off nadir.
+    The Earth therefore fills a field of 33 deg half width whose centre is up to 25 deg from nadir.
     """
     boresight = VT[0].in_body(np.array([0.0, 0.0, 1.0]))
     aside = tangent_basis(boresight)
@@ -410,7 +410,7 @@ def test_dark_images_give_no_coarse_nadir() -> None:
 
 
 def _changed(changes: Callable[[Hypothesis], Hypothesis]) -> Callable[..., Hypothesis | None]:
-    """Return `examine` with a modification of every hypothesis."""
+    """Return a version of `examine` that modifies every hypothesis."""
 
     def examined(*arguments: Any) -> Hypothesis | None:
         found = examine(*arguments)
@@ -487,7 +487,8 @@ def test_a_measurement_states_its_altitude_points_and_tangent_covariance(
     assert found.nadir.sigma == pytest.approx(np.sqrt(0.5 * np.trace(tangent)), rel=1e-6)
     assert found.nadir.covariance @ found.nadir.direction == pytest.approx(np.zeros(3), abs=1e-12)
     assert found.nadir.direction == pytest.approx(found.view.nadir)
-    # An altitude above the mean sphere is wrong by the flattening of the Earth, and the limb improves it.
+    # An altitude above the mean sphere is wrong because of the Earth's flattening, and the limb fit improves
+    # it.
     sphere = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
     assert sphere.nadir is not None
     assert 2e3 < sphere.nadir.altitude_sigma < limb_radius_sigma(600e3)

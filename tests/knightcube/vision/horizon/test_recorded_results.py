@@ -24,7 +24,7 @@ SETTINGS = finder_settings(MODEL)
 
 
 def scene(sun: tuple[float, float, float], texture: int) -> tuple[EarthScene, Image]:
-    """Return a limb across the image centre with the Sun in a direction."""
+    """Return a scene with the limb across the image centre and the Sun in a given direction."""
     found = limb_scene(zenith=np.array([1.0, 0.2, 1.0]), sun=np.array(sun), texture=texture)
     return found, render(MODEL, found, np.random.default_rng(texture))
 
@@ -40,7 +40,7 @@ def dusk() -> tuple[EarthScene, Image]:
 
 
 def known(one: EarthScene) -> HorizonKnowledge:
-    """Return the prior knowledge of a GPS receiver."""
+    """Return the prior knowledge that a GPS receiver gives."""
     return HorizonKnowledge(position=one.position, sun=one.sun, pole=one.pole)
 
 

@@ -18,7 +18,7 @@ SIZE = 128
 
 
 def test_a_polygon_hides_the_pixels_inside_it_and_no_others() -> None:
-    """A triangle of 20 x 10 px has 100 px; a pixel counts by its centre."""
+    """A triangle of 20 x 10 px has 100 px; a pixel is inside if its centre is."""
     mask = polygon_mask(40, 60, [[(9.5, 4.5), (29.5, 4.5), (9.5, 14.5)]])
     assert abs(int(mask.sum()) - 100) <= 5
     rows, columns = np.nonzero(mask)
@@ -63,17 +63,17 @@ def test_a_limb_that_does_not_move_teaches_nothing() -> None:
 
 
 def test_a_mask_that_becomes_wrong_is_discarded_at_once() -> None:
-    """The structure is folded away: the first frame without it is searched without a mask."""
+    """The structure is folded away, and the first frame without it is searched without a mask."""
     known = learned(BOOM)
     gone = known.after(frame(64.0))
     assert gone.mask is None or np.mean(gone.mask[BOOM]) < 0.1
-    # A map in which half of the image stands still is not a structure but a limb that moves little.
+    # If half of the image does not change, the cause is not a structure but a limb that moves little.
     large = learned(polygon_mask(SIZE, SIZE, [[(-1.0, -1.0), (128.0, -1.0), (128.0, 80.0), (-1.0, 80.0)]]))
     assert large.mask is None
 
 
 def test_configured_structure_stays_hidden() -> None:
-    """Blocks that the polygon touches are hidden, whatever their brightness does."""
+    """Blocks that the polygon touches are hidden, however their brightness changes."""
     known = StructureMap.of(BOOM)
     for edge in EDGES:
         known = known.after(frame(edge))

@@ -16,8 +16,8 @@ def object_path(
 ) -> FloatArray:
     """Return the pixels (801, 2) of an object that rotates by `motion` (3,) rad relative to the stars.
 
-    `direction` (3,) is the object's direction at mid-exposure. An object with the motion of the camera's
-    `rotation` (3,) stays in place.
+    `direction` (3,) is the object's direction at mid-exposure. An object whose motion equals the camera's
+    `rotation` (3,) stays at one pixel.
     """
     time = np.linspace(-0.5, 0.5, _STEPS)[:, None]
     among_stars = np.swapaxes(attitude_matrix(from_rotation_vector(time * motion)), 1, 2) @ direction

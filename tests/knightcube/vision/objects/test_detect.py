@@ -1,7 +1,8 @@
 """Tests of the detection of objects.
 
-The indicators are tested by hand, for stars at every angle, and for objects. Frames test detections, false
-alarms, overlaps with stars, objects that cross, and the attitude from a crowded sky at rest.
+The indicators are tested against hand-computed values, for stars at every angle, and for objects. Frames test
+detections, false alarms, overlaps with stars, objects that cross, and the attitude from a crowded sky at
+rest.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def test_exact_stars_have_no_deviations_for_any_axis(theta_deg: float) -> None:
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg: float) -> None:
-    """Along and across a streak, end differences have unit variance, and the residual includes both."""
+    """Differences of end points along and across a streak have unit variance; the residual includes both."""
     rng = np.random.default_rng(3)
     ends, turn = _stars(theta_deg, n=14)
     long = lengths(ends) > 25.0
@@ -239,7 +240,7 @@ def test_a_tracked_object_is_a_point_that_moves_among_the_stars(theta_deg: float
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.3)
     assert set(found.fired) == {"displacement", "residual"}
-    # Stars move by -omega x v, and the object moves in the opposite direction at the camera's rate.
+    # Stars move by -omega x v, and the object moves oppositely at the camera's rate.
     star = -np.cross(rotation, _PLACE)
     assert found.relative_rate == pytest.approx(np.linalg.norm(star), rel=0.02)
     np.testing.assert_allclose(found.direction, -star[:2] / np.linalg.norm(star[:2]), atol=0.05)
@@ -255,7 +256,7 @@ def test_time_reversal_reverses_all_motions() -> None:
     path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)
     pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
     forward, backward = _only(_detect(pixels, _ROTATION)), _only(_detect(pixels, -_ROTATION))
-    # The fit of the ends stops at a part of their uncertainty.
+    # The fit of the ends stops when the steps are a fraction of their uncertainty.
     tenth = 0.1 * float(forward.sigma.min())
     np.testing.assert_allclose(backward.endpoints, forward.endpoints[::-1], atol=tenth)
     np.testing.assert_allclose(backward.direction, -forward.direction, atol=1e-4)
@@ -272,7 +273,8 @@ def test_frames_without_an_object_have_none() -> None:
         assert report.verdicts.count(Verdict.STAR) >= 4
 
 
-# Offset (px) of a second star along and across the 55 px long streak of the first star, and its magnitude.
+# Offset (px) of a second star along and across the first star's streak of 55 px, and the second star's
+# magnitude.
 @pytest.mark.parametrize(
     ("along", "across", "magnitude"),
     [
@@ -345,7 +347,7 @@ def test_a_bright_star_whose_core_is_saturated_is_not_reported_as_an_object() ->
 
 
 def test_a_piece_of_a_faint_star_is_not_reported_as_an_object() -> None:
-    """At the segmentation threshold, a streak breaks into segments with the total flux of a star."""
+    """At the segmentation threshold, a streak breaks into segments that together have the flux of a star."""
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, 5.5)
     faint = np.concatenate([directions, _PLACE[None]])
     for seed in range(3):
@@ -410,7 +412,7 @@ def test_pixels_that_cannot_be_solved_for_leave_the_streak_unclear(monkeypatch: 
 
 HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 MEETING = np.array([251.3, 262.8])
-"""Position (px) of both objects after 7 s."""
+"""Position (px) at which both objects meet after 7 s."""
 MOTIONS = np.array([[8.0, 2.0], [5.0, -5.5]])
 """Image motions (px/s), which are 0.33 and 0.30 deg/s."""
 MAGNITUDE = 4.5
@@ -425,7 +427,7 @@ def _looking_at(right_ascension_deg: float, declination_deg: float) -> FloatArra
 
 
 def _places(since: FloatArray) -> FloatArray:
-    """Return the positions (k, 2, 2) px of both objects at times (k,) s after they meet."""
+    """Return the positions (k, 2, 2), px, of both objects at times (k,), s, relative to their meeting."""
     return np.asarray(MEETING + since[:, None, None] * MOTIONS)
 
 
@@ -485,7 +487,7 @@ def test_a_star_is_explained_as_well_without_an_object_as_with_one() -> None:
 
 
 def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
-    """Two star streaks in line overlap by a fifth of their length."""
+    """Two star streaks on one line overlap by a fifth of their length."""
     pinhole = _FRAME_CAMERA.pinhole
     image = np.zeros((512, 512))
     first, second = (star_path(_PLACE, _ROTATION, start, pinhole) for start in (0.5, -0.3))

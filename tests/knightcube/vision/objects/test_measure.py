@@ -1,4 +1,4 @@
-"""Tests of the vision job with satellites beside stars and brighter than stars."""
+"""Tests of the image-processing job, with satellites beside stars and brighter than stars."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ TURN: FloatArray = rate_at(1.2, 0.04, 0.7)
 def shot(
     place: tuple[float, float], motion: tuple[float, float], magnitude: float, turn: float = 0.0
 ) -> FrameFound:
-    """Return the result of the vision job for a satellite among stars."""
+    """Return the result of the image-processing job for a satellite among stars."""
     return Shot(np.array(place), np.array(motion), magnitude, np.array([0.0, turn, 0.0])).found()
 
 
@@ -50,7 +50,7 @@ def test_two_satellites_are_as_recorded() -> None:
 
 
 def streaked() -> Image:
-    """Return a frame of streaked stars with an object that moves otherwise."""
+    """Return a frame of star streaks with an object that has a different motion."""
     direction = SMALL.pinhole.unit_vectors(np.array([[170.0, 230.0]]))[0]
     path = object_path(SMALL, direction, motion_across(direction, 0.03, 0.4), TURN)
     return frame_with(SMALL, TURN, 1.0, 7, [(path, 2.0)], 5.5)

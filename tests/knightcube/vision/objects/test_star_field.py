@@ -38,7 +38,10 @@ def seen(stars: FloatArray, attitude: FloatArray, rng: np.random.Generator) -> F
 
 
 def flown(rate: FloatArray, error: float, frames: int) -> list[tuple[FloatArray, LocatedFrame, FieldPoints]]:
-    """Return true attitudes, results and points of frames a second apart; the last point is the object."""
+    """Return true attitudes, results and points of frames a second apart.
+
+    The last point of a frame is the object.
+    """
     rng = np.random.default_rng(4)
     stars, field, rows = sky(rng, 4000), StarField(), []
     start = from_rotation_vector(np.array([0.3, -0.2, 0.9]))

@@ -69,7 +69,7 @@ def test_a_point_on_a_star_remains_and_is_measured() -> None:
 
 
 def test_a_line_across_a_star_remains_with_its_ends() -> None:
-    """The star covers the middle of the line, and the ends are located by all of its light."""
+    """The star covers the middle of the line, and the ends are located by all of the line's light."""
     ends = np.array([[230.2, 226.4], [255.7, 253.1]])
     middle = _CAMERA.pinhole.unit_vectors(np.array([[240.3, 238.7]]))[0]
     image = np.zeros((512, 512))
@@ -155,7 +155,7 @@ def test_the_ends_of_a_streak_follow_its_light(beyond: float, gap: float) -> Non
 
 
 def test_a_hidden_end_has_a_large_claim() -> None:
-    """The last 20 px of a streak lie in pixels that are saturated, so that its end is not known to 2 px."""
+    """The last 20 px of a streak are in saturated pixels, so that its end cannot be located to 2 px."""
     ends = np.array([[200.0, 210.0], [280.0, 270.0]])
     image = np.zeros((512, 512))
     deposit(image, ends[0] + np.linspace(0.0, 1.0, 2001)[:, None] * np.diff(ends, axis=0), 60_000.0, 1.0)

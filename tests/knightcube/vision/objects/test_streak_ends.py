@@ -52,7 +52,7 @@ def test_a_lines_length_comes_from_its_moments_whatever_its_width() -> None:
     signal = np.zeros((60, 120), dtype=np.float32)
     signal[20:25, 10:91] = 3.0
     regions = find_regions(signal > 0, signal, least_area=2)
-    # For whole pixels, the difference of the moments is (81^2 - 1 - (5^2 - 1))/12.
+    # For whole pixels, the difference of the two second moments is (81^2 - 1 - (5^2 - 1))/12.
     assert regions.length[0] == pytest.approx(np.sqrt(81.0**2 - 5.0**2))
     assert regions.flux[0] == pytest.approx(3.0 * 5 * 81)
 
@@ -65,7 +65,8 @@ def test_an_empty_mask_has_no_regions() -> None:
 def test_the_local_threshold_passes_normal_noise_at_its_own_rate() -> None:
     signal = np.random.default_rng(4).normal(0.0, 5.0, (700, 700)).astype(np.float32)
     passed = threshold_local(signal, np.full_like(signal, 5.0), 2.0).mean()
-    # A normal variable exceeds 2 sigma with 2.275 %. About 54,000 of the correlated sums are independent.
+    # A normal variable exceeds 2 sigma with a probability of 2.275 %. About 54,000 of the correlated sums are
+    # independent.
     assert passed == pytest.approx(0.02275, abs=5.0 * np.sqrt(0.02275 / 54_000))
 
 

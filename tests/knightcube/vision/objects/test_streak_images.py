@@ -73,7 +73,7 @@ def test_paths_of_stars_rotate_with_the_sky() -> None:
 
 
 def _arcs(length: float, count: int, draw: np.random.Generator) -> FloatArray:
-    """Return paths (4, count, 2), px, of the given chord length with increasing bend."""
+    """Return paths (4, count, 2), px, of the given chord length with increasing curvature."""
     along = draw.normal(size=2)
     along /= np.linalg.norm(along)
     part = np.linspace(-0.5, 0.5, count)[:, None]
@@ -107,7 +107,7 @@ def test_all_forms_return_the_same_paths_of_stars() -> None:
 
 @pytest.mark.parametrize("backward", [False, True])
 def test_all_forms_return_the_same_path_among_the_stars(backward: bool) -> None:
-    """The path begins at the first end, also if the slower motion begins at the second."""
+    """The path begins at the first end even if the slower motion begins at the second end."""
     ends = np.array([[200.0, 250.0], [290.0, 262.0]])[:: -1 if backward else 1]
     view = float(_CAMERA.pinhole.focal_length), *_CAMERA.pinhole.centre
     for rotation in (0.0 * _ROTATION, _ROTATION, -_ROTATION):

@@ -31,7 +31,7 @@ def newer() -> StepPlan:
 
 @pytest.fixture
 def guidance(good: StepPlan) -> PathGuidance:
-    """Return guidance that follows `good` from 100 s on."""
+    """Return guidance that follows the plan `good` from 100 s on."""
     guidance = PathGuidance(KNIGHTCUBE, RULES)
     guidance.aim(TARGET)
     assert guidance.offer(good, 100 * SECOND, 100 * SECOND, START, 0.0).accepted
@@ -103,7 +103,7 @@ def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer:
     count = 41
     columns = np.zeros((count, 3))
     columns[-len(newer.path.series) :] = newer.path.series
-    columns[0, 2] = 0.02  # in q2'' only, like a planner's error between nodes
+    columns[0, 2] = 0.02  # in q2'' only, like an error of a planner between nodes
     rippled = replace(newer.path, series=tuple((a, b, c) for a, b, c in columns.tolist()))
     assert "limit is 0.148 A" in refused(guidance, replace(newer, path=rippled), 101, 101, START, 0.004)
 
@@ -206,7 +206,7 @@ def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: PathGuidance)
 
 
 def test_the_limit_is_judged_under_the_disturbance_that_the_plan_allowed_for() -> None:
-    """With a disturbance of 0.03 rad/s^2, which takes 108 mA to compensate, the path is within the limit."""
+    """With a disturbance of 0.03 rad/s^2, whose compensation takes 108 mA, the path is within the limit."""
     pushed = replace(KNIGHTCUBE, disturbance=0.03)
     helped = plan(pushed, 0.1, 0.0, 0.2, 0.0, 5.5)
     guidance = PathGuidance(KNIGHTCUBE, RULES)

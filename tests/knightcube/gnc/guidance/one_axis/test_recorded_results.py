@@ -26,7 +26,7 @@ def plant(current_limit: float | None = None) -> SingleAxisPlant:
 
 
 _ROUNDING = 1e-10
-"""Largest coefficient of a path that rounding leaves of an exact zero."""
+"""Largest value that rounding gives to a path coefficient that should be exactly zero."""
 
 
 def without_counts(found: StepPlan) -> StepPlan:

@@ -1,4 +1,4 @@
-"""Tests that paths are optimal over the planning horizon, and of the horizon, start and limits of a path."""
+"""Tests that paths are optimal for their duration, and of duration, start and limits of a path."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def flown_energy(problem: Problem, found: StepPlan) -> float:
 
 @pytest.mark.parametrize("problem", [*STEPS, THESIS], ids=lambda p: f"{p.start_q2}->{p.end_q2}")
 def test_the_cost_is_within_half_a_percent_of_the_oracle_at_the_same_horizon(problem: Problem) -> None:
-    """The problems are the steps in 10 s, and the thesis's slew over the planner's horizon."""
+    """The problems are the steps in 10 s, and the thesis's slew in the duration that the planner chooses."""
     found = problem.planned()
     optimum = solve(problem.slew(found.horizon), intervals=800)
     assert optimum is not None
@@ -73,7 +73,10 @@ def test_a_step_of_a_tenth_is_optimal_within_ten_seconds(problem: Problem) -> No
 
 
 def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
-    """The median is within 0.1 % and the worst within 1 %; horizons are 1.1 times the shortest or more."""
+    """The median cost is within 0.1 % of the optimum, and the worst within 1 %.
+
+    Durations are at least 1.1 times the shortest.
+    """
     ratios = []
     for known in known_optima():
         found = known.problem.planned()
@@ -94,7 +97,7 @@ def bang_bang_time(problem: Problem) -> float:
     pull = problem.plant.torque_constant * problem.plant.current_limit / problem.plant.inertia
     start, end = angle_of(problem.start_q2), angle_of(problem.end_q2)
     sign = math.copysign(1.0, end - start)
-    # A rate against the slew is removed first: the torque moves the body outwards to the point of rest.
+    # If the initial rate is against the slew, the body first moves outwards until the torque has stopped it.
     sine = math.sin(start) - sign * problem.start_rate**2 / (2.0 * pull)
     rest = math.asin(sine)
     switch = math.asin(0.5 * (sine + math.sin(end)))
@@ -161,7 +164,7 @@ def test_the_boundary_states_are_met_exactly(problem: Problem) -> None:
 
 
 def test_nodes_follow_the_prey_through_the_path_control_parameters() -> None:
-    """q2_i = q_r + v_i (q_p,i - q_r) (5.10), v one at both ends."""
+    """The nodes are q2_i = q_r + v_i (q_p,i - q_r) (5.10), with v = 1 at both ends."""
     found = plan(KNIGHTCUBE, 0.1, 0.01, -0.2, 0.0, 12.0, nodes=16, reference=2.0)
     prey = BoundaryStates(0.1, 0.5 * 0.01 * math.sqrt(1 - 0.01), -0.2, 0.0).prey(12.0).q2(found.node_times)
     assert found.nu.shape == (16,)
@@ -227,7 +230,10 @@ def test_staying_where_one_is_costs_nothing() -> None:
 
 
 def test_q2_is_kept_within_its_bound_where_the_optimum_would_pass_it() -> None:
-    """The free optimum moves outwards to 0.48; with the bound 0.465 it reverses earlier at a higher cost."""
+    """The unbounded optimum moves outwards to 0.48.
+
+    With a bound of 0.465 the path reverses earlier, at a higher cost.
+    """
 
     def largest_q2(found: StepPlan) -> float:
         angle, *_ = found.path.motion(np.linspace(0.0, found.horizon, 999))
@@ -302,7 +308,7 @@ CARRIED = replace(KNIGHTCUBE, stiffness=2e-5, damping=2e-6, disturbance=-3e-3)
 
 
 def test_the_shortest_times_are_the_published_ones() -> None:
-    """For twenty problems solved by another collocation, the shooting method of the tests agrees to 1e-3."""
+    """For twenty problems, the tests' shooting method agrees with another collocation to 1e-3."""
     for known in known_optima():
         assert shortest_time(known.problem.slew(1.0)) == pytest.approx(known.shortest, rel=1e-3)
 
@@ -331,7 +337,10 @@ def test_a_horizon_just_long_enough_is_kept_or_stretched_by_less_than_a_percent(
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1e-3, 2e-2), st.floats(2e-5, 2e-3))
 def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price: float) -> None:
-    """With cos(theta) = 1 the minimum energy is 12 R (a/g)^2 / T^3; the cost of time equals its slope."""
+    """With cos(theta) = 1 the minimum energy is 12 R (a/g)^2 / T^3.
+
+    At the optimum the time cost equals its slope.
+    """
     gain = KNIGHTCUBE.torque_constant / KNIGHTCUBE.inertia
     expected = (36.0 * KNIGHTCUBE.resistance * (angle / gain) ** 2 / price) ** 0.25
     found = plan(KNIGHTCUBE, 0.0, 0.0, q2_of(angle), 0.0, 10.0, time_cost=price)
@@ -341,7 +350,7 @@ def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price
 
 
 def test_no_horizon_nearby_is_better_at_the_price() -> None:
-    """Compare with the sum of energy and time cost of the collocation oracle at other horizons."""
+    """Compare with the collocation oracle's sum of energy and time cost for other durations."""
     price = 0.2
     for problem, _ in feasible_problems(10, seed=3):
         found = problem.planned(time_cost=price)
@@ -405,7 +414,7 @@ def test_a_last_path_that_does_not_fit_does_no_harm() -> None:
 
 
 def test_the_planned_current_flies_the_body_under_thread_and_disturbance_to_its_moving_end() -> None:
-    """Without feedback, the path's current in the equation of motion ends where the plan ends."""
+    """Without feedback, the equation of motion with the path's current ends at the end point of the plan."""
     found = plan(CARRIED, 0.1, 0.01, -0.2, 0.015, 11.0)
     count = 2200
     step = found.horizon / count

@@ -1,4 +1,4 @@
-"""Tests that targets which define an attitude are accepted, others refused, and each has a text."""
+"""Tests that targets that define an attitude are accepted, all others refused, and that each has a text."""
 
 from __future__ import annotations
 

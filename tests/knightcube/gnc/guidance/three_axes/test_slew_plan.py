@@ -1,4 +1,4 @@
-"""Tests of slews by coils alone against optima of another method and an independent integrator."""
+"""Tests of slews by coils alone, against another method's optima and an independent integrator."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 
 @pytest.mark.parametrize(("seed", "case"), [(43, 18), (43, 40), (44, 44)])
 def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
-    """Rotations about the field lead all guesses of the first two slews through cones, which are refused."""
+    """In the first two slews, rotations about the field lead all initial guesses through cones."""
     *_, (_, task) = slews(case + 1, seed, True)
     plan = plan_task(task)
     assert plan.peak <= 1.001
@@ -180,7 +180,7 @@ def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() 
     tilted = plan_order(replace(order, craft=turned, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert tilted.energy == pytest.approx(along.energy, rel=1e-4)
     assert tilted.path.heat(turned.weights) == pytest.approx(tilted.energy, rel=1e-3)
-    # A plan with the heat of each body axis alone gives another path with more heat.
+    # A plan that ignores the off-diagonal terms of the heat gives another path with more heat.
     alone = replace(turned, weights=np.diag(turned.weights))
     careless = plan_order(replace(order, craft=alone, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert careless.path.heat(turned.weights) > 1.02 * along.energy
