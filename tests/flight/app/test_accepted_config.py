@@ -1,4 +1,4 @@
-"""Tests that a configuration with a wrong checksum is not used, but the last accepted one or none."""
+"""Tests that instead of a configuration with a wrong checksum, the last accepted one is used, or none."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TEXT = TESTBED.read_text(encoding="utf-8")
 
 
 def accept(path: Path) -> None:
-    """Write the checksum as install.sh does."""
+    """Write the checksum of a configuration as install.sh does."""
     line = f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n"
     sum_file(path).write_text(line, encoding="ascii")
 

@@ -26,7 +26,7 @@ def test_time_without_power_does_not_count_and_a_restart_begins_nothing_again(tm
         clock.advance(30 * SECOND)
         assert left(inhibit, tmp_path / "state") == expected
         clock.advance(500 * SECOND)  # this time is not counted, because the power fails before the next check
-    clock = ManualClock()  # years later
+    clock = ManualClock()  # the next start, years later
     assert left(SeparationInhibit(clock), tmp_path / "state") == 0.0
 
 

@@ -23,7 +23,7 @@ MS = 1_000_000
 
 
 def loop(said: list[str]) -> Any:
-    """Return a loop that stores the reasons of its stops."""
+    """Return a test double of the loop that stores the reasons for which it is stopped."""
     return cast(Any, SimpleNamespace(stop=said.append))
 
 
@@ -155,7 +155,7 @@ def test_garbage_is_collected_from_the_second_call_on(monkeypatch: pytest.Monkey
 
 
 class Bench:
-    """A supervision with test doubles of guardian and service manager."""
+    """The flight's supervision with test doubles of guardian and service manager."""
 
     def __init__(self) -> None:
         self.now = 1_000 * MS

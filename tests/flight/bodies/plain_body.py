@@ -17,11 +17,11 @@ from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.estimate import Estimate
 
 STIFFNESS, DAMPING = 4e-4, 1e-3
-"""N m/rad and N m s/rad."""
+"""Stiffness (N m/rad) and damping (N m s/rad) of the PD controller."""
 
 
 class PlainTracker:
-    """The torque opposes rotation and rate about three axes, made by a dipole normal to the field."""
+    """PD control about three axes, whose torque is caused by a dipole normal to the field."""
 
     def __init__(self, field: FloatArray, limit: float, dipole_per_ampere: float) -> None:
         self._field, self._limit, self._dipole_per_ampere = field, limit, dipole_per_ampere

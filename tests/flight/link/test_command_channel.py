@@ -1,4 +1,4 @@
-"""Tests of commands over real sockets: clients that flood, vanish or send garbage do no harm."""
+"""Tests of commands over real sockets, with clients that flood, vanish or send garbage."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def place(tmp_path: Path) -> Path:
 def answer_once(
     channel: Channel, taken: list[Command], obeyed: bool = True, mode: int = Mode.HOLD
 ) -> threading.Thread:
-    """Answer the next command, as the flight would, in a thread."""
+    """Reply to the next command in a thread, as the flight software would."""
 
     def serve() -> None:
         deadline = time.monotonic() + 5.0
@@ -225,7 +225,7 @@ def test_the_socket_is_for_owner_and_group_only(place: Path) -> None:
 
 @pytest.mark.skipif(not os.access("/run", os.W_OK), reason="/run may not be written to: be root")
 def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
-    """The service has a private /tmp and does not see files in the /tmp of the test."""
+    """The service has a private /tmp, in which files of the test's /tmp are not visible."""
     with tempfile.TemporaryDirectory(dir="/run", prefix="knightcube-test-") as folder:
         channel = open_unix(Path(folder) / "commands")
         senders: list[str] = []
@@ -244,7 +244,7 @@ def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
 
 
 def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(place: Path) -> None:
-    open_unix(place)._socket.close()  # killed: the file is left
+    open_unix(place)._socket.close()  # as after a kill: the socket file remains
     second = open_unix(place)
     with pytest.raises(UsageError, match="another flight listens there"):
         open_unix(place)

@@ -80,7 +80,10 @@ def test_any_flipped_bit_is_found(command: Command, draw: st.DataObject) -> None
 
 
 def test_a_command_is_a_ccsds_telecommand_and_no_telemetry() -> None:
-    """CCSDS 133.0-B-2, 4.1.3.3: packet type 1, secondary header flag 1, no APID of telemetry's."""
+    """By CCSDS 133.0-B-2, 4.1.3.3, packet type and secondary header flag are 1.
+
+    The APID is not one of telemetry.
+    """
     data = CommandPacker().pack(Slew(0.25), 77)
     word = int.from_bytes(data[:2], "big")
     assert (word >> 13, word >> 12 & 1, word >> 11 & 1, word & 0x7FF) == (0, 1, 1, 0x204)

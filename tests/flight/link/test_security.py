@@ -51,7 +51,7 @@ def cause(entrance: Gate, frame: bytes) -> Refusal:
 
 
 def test_the_frame_is_that_of_the_standard_byte_by_byte(ground: Vault) -> None:
-    """Header 5 | SPI 2 | IV 12 | ciphertext | MAC 16 | CRC 2, the MAC over VCID, SPI and data."""
+    """The bytes are header 5, SPI 2, IV 12, ciphertext, MAC 16 (over VCID, SPI and data) and CRC 2."""
     maker = Ground(ground)
     maker.frame(b"first")
     frame = maker.frame(b"second")
@@ -85,7 +85,7 @@ def gmac(key: bytes, nonce: bytes, data: bytes) -> bytes:
 def test_a_frame_that_is_only_authenticated_has_readable_data_and_the_mac_of_the_standard(
     ground: Vault,
 ) -> None:
-    """The first tag is a vector of NIST (gcmEncryptExtIV256, no plaintext, 128 bits of data)."""
+    """The first tag is a test vector of NIST (gcmEncryptExtIV256, no plaintext, 128 bits of data)."""
     key = bytes.fromhex("78dc4e0aaf52d935c3c01eea57428f00ca1fd475f5da86a49c8dd73d68c8e223")
     data = bytes.fromhex("b96baa8c1c75a671bfb2d08d06be5f36")
     assert (
@@ -108,7 +108,8 @@ def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vau
     third = maker.frame(b"three")
     assert cause(entrance, third[:-1] + bytes([third[-1] ^ 1])) is Refusal.CRC
     assert cause(entrance, close_frame(third[:20] + bytes([third[20] ^ 1]) + third[21:-2])) is Refusal.MAC
-    assert cause(entrance, close_frame(third[:6] + b"\2" + third[7:-2])) is Refusal.MAC  # another SPI
+    # A frame with another SPI.
+    assert cause(entrance, close_frame(third[:6] + b"\2" + third[7:-2])) is Refusal.MAC
     assert cause(entrance, close_frame(third[:6] + b"\7" + third[7:-2])) is Refusal.SPI
     assert cause(entrance, close_frame(third[:2] + bytes([third[2] ^ 4]) + third[3:-2])) is Refusal.MAC
     assert cause(entrance, close_frame(b"\x25" + third[1:-2])) is Refusal.HEADER
@@ -143,7 +144,7 @@ def test_a_restart_lets_nothing_in_again_and_one_copy_is_enough(
         torn.write_bytes(torn.read_bytes()[:30])
         assert sky.copies(1) == 1
         assert cause(gate(sky), frame) is Refusal.REPEATED
-        assert sky.copies(1) == 2  # made again from the other
+        assert sky.copies(1) == 2  # one copy was written again from the other
 
 
 def test_both_copies_lost_refuse_that_spi_and_its_reserve_changes_the_key(

@@ -1,4 +1,4 @@
-"""Tests of the PID controller: poles, bumpless start, and integral under saturation."""
+"""Tests of the PID and the adaptive controller: poles, reference model, start, saturation, refusals."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limit
 
 
 def test_noisy_stars_give_the_attitude_of_the_q_method_within_its_uncertainty() -> None:
-    """The plane gives stars at the edge of 20 deg up to 1.06 times the weight that the sphere gives."""
+    """In the image plane, stars at the edge of a 20 deg field have up to 1.06 times their weight."""
     for seed in range(10):
         observed, reference, _ = _stars(100 + seed, SIGMA)
         optimal = SOLVERS["davenport"](observed, reference, np.full(15, SIGMA))

@@ -81,7 +81,7 @@ def test_the_stars_of_a_clean_list_are_all_found(name: str) -> None:
 
 
 def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None:
-    """Michalski, eq. 31: equal to 1 % for pairs 30 errors apart or more, wider for blended stars."""
+    """Michalski's eq. 31 agrees to 1 % for pairs 30 sigma apart or more, and is wider for blended stars."""
     drawn = _drawn(_kind(noise_px=0.3), 6)[0]
     view = next(views(drawn.field(), DEFAULT))
     one, other = (np.array(index) for index in zip(*combinations(range(view.stars), 2), strict=True))
@@ -194,7 +194,7 @@ def test_the_triangle_tables_hold_only_triangles_that_the_field_can_show() -> No
 
 
 def _motion(drawn: StarList, seed: int) -> tuple[StarMotion, FloatArray]:
-    """Return velocities of at most 1 deg/s, random ones for false points, and the rate."""
+    """Return velocities of at most 1 deg/s, which are random for false points, and the rate."""
     rng = np.random.default_rng(seed)
     field = drawn.field()
     rate = np.deg2rad([0.6, -0.7, 0.4])
@@ -225,7 +225,7 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
 
 
 def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
-    """By v' = -w x v: the direction after a small rotation of the body, from its attitude matrix."""
+    """The direction after a small body rotation, by the attitude matrix, agrees with v' = -w x v."""
     rate, step = np.array([0.02, -0.01, 0.03]), 1e-4
     before = np.array([0.1, 0.2, 1.0]) / np.linalg.norm([0.1, 0.2, 1.0])
     after = attitude_matrix(from_rotation_vector(rate * step)) @ before

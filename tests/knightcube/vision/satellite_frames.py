@@ -1,4 +1,4 @@
-"""Frames of the real sky with satellites, as jobs of the vision worker."""
+"""Frames of the real sky with satellites, as jobs of the image-processing worker."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TIMES = np.linspace(-0.1, 0.1, 9)
 def frame_job(
     held: FloatArray, turn: FloatArray, satellites: Sequence[SourceTrack], knows: bool = True, seed: int = 11
 ) -> FrameJob:
-    """Return the job for a frame with attitude `held` (4,) at mid-exposure and rate `turn` (3,) rad/s.
+    """Return the job for a frame with attitude `held` (4,) at mid-exposure, and rate `turn` (3,), rad/s.
 
     `knows` states whether attitude and rate are known in advance, to 1e-4.
     """
@@ -58,7 +58,7 @@ HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 
 @dataclass(frozen=True)
 class Shot:
-    """A satellite at `place` (2,) px at mid-exposure that moves by `motion` (2,) px; `turn` (3,) rad/s."""
+    """A satellite at `place` (2,), px, at mid-exposure, with motion (2,), px, and camera rate `turn` (3,)."""
 
     place: FloatArray
     motion: FloatArray
@@ -67,7 +67,7 @@ class Shot:
     knows: bool = True
 
     def found(self) -> FrameFound:
-        """Return the result of the vision job."""
+        """Return the result of the image-processing job."""
         ways = self.place + np.outer(TIMES / EXPOSURE, self.motion)
         seen = CAMERA.pinhole.unit_vectors(ways) @ attitude_matrix(HELD)
         return run(frame_job(HELD, self.turn, [SourceTrack(TIMES, seen, self.magnitude)], self.knows))

@@ -1,4 +1,4 @@
-"""Tests of the attitude from rendered frames: horizon and Sun of four cameras, with correct covariances."""
+"""Tests of the attitude from horizon and Sun in rendered frames of four cameras, and of its covariance."""
 
 from __future__ import annotations
 
@@ -78,8 +78,9 @@ def off(fix: AttitudeFix) -> FloatArray:
 
 
 def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, VectorObservation]) -> None:
-    """The Sun, 24 deg off the vertical, gives the rotation about it 2.5 times worse, as claimed."""
+    """The Sun is 24 deg off the vertical, so the rotation about it is 2.5 times less accurate, as claimed."""
     fix = weighted_fit(list(sights.values()))
     error = off(fix)
     assert np.max(np.abs(np.degrees(error))) < 0.15
-    assert error @ np.linalg.solve(fix.covariance, error) < 16.3  # chi-square of 3, 99.9 %
+    # 99.9 % quantile of chi-square with 3 degrees of freedom.
+    assert error @ np.linalg.solve(fix.covariance, error) < 16.3

@@ -41,7 +41,8 @@ def test_a_sloping_background_is_followed_within_its_sampling_error() -> None:
     pixels = np.rint(slope + rng.normal(0.0, 12.0, slope.shape)).astype(np.uint16)
     background = estimate_background(pixels)
     error = background.map(background.level) - slope
-    # The error is 12/16 counts for 256 samples per block. The worst of 64 blocks may have six times as much.
+    # The error is 12/16 counts for 256 samples per block. The worst of 64 blocks may have six times this
+    # error.
     assert np.abs(error[:, 32:-32]).max() < 4.5
     # The slope spans 12.8 counts within a block of 64 px, which would make the noise sqrt(12^2 + 12.8^2/12).
     assert background.stray_light
@@ -126,7 +127,7 @@ SPIRAL = (np.hypot(Y - 100, X - 75) + np.arctan2(Y - 100, X - 75) * 6.0 / np.pi)
         (X + Y) % 40 < 3,
         (X % 7 < 2) | (RNG.random((200, 150)) < 0.02),
         SPIRAL,
-        X % 149 == 0,  # regions at the ends of rows must not be joined
+        X % 149 == 0,  # regions at the end of one row and the start of the next must not be joined
     ],
 )
 def test_regions_are_scipys_numbered_by_their_first_pixels(mask: BoolArray) -> None:
@@ -287,7 +288,7 @@ def test_a_plateau_of_bright_counts_holds_more_pixels_than_the_counts_below_it()
     bright = np.concatenate([np.linspace(100.0, 900.0, 50), np.full(4, 1000.0)])
     assert saturation_of_bright(bright, frame, None) == 1000.0
     assert saturation_of_bright(bright, frame, 800.0) == 800.0
-    assert saturation_of_bright(bright[:-1], frame, None) == 65_535.0  # three pixels are too few
+    assert saturation_of_bright(bright[:-1], frame, None) == 65_535.0  # three saturated pixels are too few
     crowded = np.concatenate([bright, np.full(3, 995.0)])  # counts within 2 % of the range below the plateau
     assert saturation_of_bright(crowded, frame, None) == 65_535.0
     assert saturation_of_bright(np.zeros(0), frame, None) == 65_535.0
@@ -305,7 +306,7 @@ def test_levels_between_counts_and_beyond_the_type_compare_as_numbers_do() -> No
 @pytest.mark.parametrize("size", [1, 2, 24, 25, 64, 255])
 @pytest.mark.parametrize("sigma", [0.0, 0.4, 3.0, 500.0])
 def test_the_compiled_moments_of_blocks_equal_those_in_numpy(size: int, sigma: float) -> None:
-    """Whole counts of little noise are equal in many pixels, and a bright object is in each block."""
+    """Integer counts with little noise are equal in many pixels, and each block has a bright object."""
     draw = np.random.default_rng([size, round(10 * sigma)])
     values = np.round(draw.normal(100.0, sigma, (3, 4, size)))
     values[:, :, size // 2 :] += draw.choice([0.0, 3_000.0], (3, 4, 1))

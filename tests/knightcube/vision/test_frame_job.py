@@ -1,4 +1,4 @@
-"""Tests of the vision worker's job, which never returns a wrong rate or attitude."""
+"""Tests of the image-processing worker's job, which must never return a wrong rate or attitude."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def _lens(rng: np.random.Generator, begun: Pinhole) -> Lens:
 def _frames(
     rng: np.random.Generator, lens: Lens, count: int, stars: int, wrong: float = 0.0, noise: float = 0.1
 ) -> tuple[list[MatchedFrame], FloatArray]:
-    """Return frames at random attitudes (count, 4), with a fraction `wrong` of matches exchanged."""
+    """Return frames at random attitudes (count, 4), with a fraction `wrong` of the matches swapped."""
     frames, attitudes = [], []
     for _ in range(count):
         attitude = normalise(rng.normal(size=4))
@@ -182,7 +182,7 @@ def test_standard_deviations_that_are_too_small_increase_the_covariance() -> Non
 
 
 def test_the_derivatives_are_those_of_the_projection() -> None:
-    """A step from nearby reaches the truth with a quadratic error if all derivatives are correct."""
+    """A step of the fit from nearby has only a quadratic error if all derivatives are correct."""
     rng = np.random.default_rng(89)
     truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3, 0.02, -0.03, 0.04, 0.05)
     frames, attitudes = _frames(rng, truth, 2, 20, noise=1e-9)
@@ -219,7 +219,7 @@ def test_the_terms_that_the_stars_show_are_fitted_and_others_stay_zero(shape: di
 
 
 def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None:
-    """Left and right are exchanged in the image and in the sky."""
+    """Left and right are swapped in the image and in the sky."""
     lens = Lens(1000, 800, 1500.0, (490.0, 410.0), -0.1, 0.02, 0.01, 0.02, 0.05, -0.04)
     unused = (np.ones(9, dtype=bool),)
     found = Calibration(lens, np.eye(9), (), np.zeros((1, 4)), unused, 1.0, 1, 0.2, 0.1)
@@ -289,7 +289,7 @@ def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, flo
 
 @pytest.mark.parametrize(("field_deg", "count", "stars"), [(20.0, 1, 40), (12.0, 1, 15), (20.0, 3, 20)])
 def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: int, stars: int) -> None:
-    """Omitted terms contribute to the accuracy: the change of the fit without them is part of the error."""
+    """Omitted terms contribute to the accuracy, because the change of the fit without them is an error."""
     rng, begun = np.random.default_rng(61), _begun(field_deg)
     ratios: dict[str, list[float]] = {"focal_length": [], "centre": [], "distortion": []}
     for _ in range(12):

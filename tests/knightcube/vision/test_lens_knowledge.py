@@ -120,8 +120,9 @@ def test_ten_frames_shrink_an_honest_covariance_of_the_lens(scale_error: float) 
         sigmas.append(known.sigma / known.spread)
     # The mean of 5 chi-squares of 5 or 6 degrees of freedom has a standard deviation of at most 1.6.
     assert 1.5 < np.mean(found) < 10.5
-    # A shift d of the axis displaces a star at a corner, 400 px from the axis, by only 0.05 d.
-    # The 250 stars of 0.05 px therefore leave at least 0.06 px of the axis, and some tenths with distortion.
+    # A shift d of the axis displaces a star at a corner, 400 px from the axis, by only 0.05 d. With 250 stars
+    # of 0.05 px, the error of the axis is therefore at least 0.06 px, and some tenths of a pixel with unknown
+    # distortion.
     shrunk = np.median(sigmas, axis=0)
     assert np.all(shrunk[[1, 2]] < 0.25)
     assert shrunk[9] < 0.01
@@ -234,14 +235,14 @@ def test_the_configured_axis_shows_the_same_direction_through_the_learned_lens()
     shown = lens.unit_vectors(np.array([DESCRIBED.centre]))[0]
     assert np.allclose(attitude_matrix(turn) @ [0.0, 0.0, 1.0], shown, atol=1e-12)
     assert abs(turn[2]) < 1e-15, "no rotation about the boresight"
-    # Two stars beside the axis: the learned lens changes their directions by the change of scale only.
+    # The two stars are near the axis, where the estimated lens changes directions only by its scale.
     pixels = np.array(DESCRIBED.centre) + np.array([[40.0, 0.0], [0.0, -40.0]])
     there = lens.unit_vectors(pixels) @ attitude_matrix(turn)
     assert np.allclose(there[:, :2] / there[:, 2:], (pixels - DESCRIBED.centre) / 1790.0, atol=2e-5)
 
 
 def test_rate_and_attitude_of_a_frame_are_in_the_axes_of_the_configured_lens() -> None:
-    """A star at the configured axis has the same direction in the body as without a learned lens."""
+    """A star at the configured axis has the same direction in the body as without an estimated lens."""
     rng = np.random.default_rng(121)
     camera = TrueCamera(Lens(640, 480, 1800.0, (324.0, 236.0)))
     known = learned(camera, LensKnowledge.of(DESCRIBED, KNOWN), rng, 12)
@@ -257,7 +258,7 @@ def test_rate_and_attitude_of_a_frame_are_in_the_axes_of_the_configured_lens() -
     assert found.solution is not None
     assert found.solution.fix is not None
     seen = attitude_matrix(found.solution.fix.quaternion) @ star
-    # The axis, known to a fraction of a pixel, is 5.7 px from its description.
+    # The axis, estimated to a fraction of a pixel, is 5.7 px from its configured position.
     assert np.allclose(seen, [0.0, 0.0, 1.0], atol=1.5 / 1800.0)
     assert found.motion.rate is not None
     turned = attitude_matrix(found.solution.fix.quaternion) @ attitude_matrix(true).T @ rate

@@ -62,7 +62,7 @@ def test_the_star_tracker_is_as_recorded() -> None:
 
 
 def check_sun(name: str) -> None:
-    """Compare the Sun in a frame of a camera with the record."""
+    """Compare the Sun direction found in a camera's frame with the record."""
     model, settings = CAMERAS[name]
     scene = random_sun_scene(np.random.default_rng(21), model)
     pixels = render(model, scene, np.random.default_rng(22))

@@ -77,9 +77,9 @@ def test_ideal_strings_obey_the_cosine_law_and_give_the_exact_direction() -> Non
 
 
 def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_the_view_factor() -> None:
-    """Close above the subsolar point of a diffuse sphere, the Earth fills (R/r)^2 of the plate's half sky.
+    """Close above the subsolar point, the Earth has a view factor of (R/r)^2 from the plate.
 
-    The mean solar cosine of the ground in view is near one, within a few per cent at 200 km.
+    The mean solar cosine of the visible ground is one to within a few per cent at 200 km.
     """
     position = np.array([EARTH_RADIUS + 200e3, 0.0, 0.0])
     model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0)
@@ -88,7 +88,7 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
     view = (EARTH_RADIUS / position[0]) ** 2
     assert currents[0] == pytest.approx(1.0, abs=1e-4)
     assert currents[3] == pytest.approx(0.3 * view, rel=0.05)
-    # A plate perpendicular to the ground receives half of that or less, equally on all four sides.
+    # A plate perpendicular to the ground receives at most half of this light, equally on all four sides.
     sides = currents[[1, 2, 4, 5]]
     assert np.ptp(sides) < 2e-3
     assert 0.2 * currents[3] < sides.mean() < 0.5 * currents[3]

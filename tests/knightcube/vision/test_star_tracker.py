@@ -60,7 +60,7 @@ print(*found.quaternion, *found.covariance.ravel(), len(found.stars))
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_path: Path) -> None:
-    """A numpy form that replaces a compiled one unnoticed loses speed; in this test it ends the program.
+    """A numpy form that silently replaces a compiled form is slow; in this test it ends the program.
 
     In a new clone the program first compiles for up to a minute of processor time.
     """
@@ -136,7 +136,7 @@ def test_a_wrong_field_of_view_is_refused_with_the_searched_fields(resting: SkyF
 
 
 def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> None:
-    """Pixels with equal colours have this value as luminance."""
+    """A pixel with three equal colour values has this value as luminance."""
     colours = np.repeat(resting.pixels[..., None], 4, axis=2)
     colours[..., 3] = 7  # transparency
     tracker = StarTracker(fov_deg=12.0)

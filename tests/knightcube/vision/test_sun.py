@@ -46,7 +46,10 @@ def _campaign(name: str) -> Outcome:
 
 @pytest.mark.parametrize(("name", "limit"), [("logarithmic", 0.005), ("linear", 0.01)])
 def test_the_sun_is_found_to_hundredths_of_a_degree_wherever_it_stands(name: str, limit: float) -> None:
-    """A pixel has 0.15 deg, and the core of the disc is saturated in both cameras. Twelve frames, seed 11."""
+    """A pixel spans 0.15 deg, and the core of the Sun's disc is saturated in both cameras.
+
+    The test uses twelve frames of seed 11.
+    """
     outcome = _campaign(name)
     assert outcome.statuses["found"] + outcome.statuses["partial"] >= 11
     assert np.degrees(np.sqrt(np.mean(np.square(outcome.errors)))) < limit
@@ -64,7 +67,7 @@ def test_the_covariance_is_honest(name: str) -> None:
 def test_no_sun_is_found_in_frames_without_the_sun(name: str) -> None:
     """The frames show limb, clouds and hot pixels, in the overexposed camera large saturated ones.
 
-    Three frames, seed 12.
+    The test uses three frames of seed 12.
     """
     outcome = frames_without_sun(name, 3, seed=12)
     assert outcome.statuses["found"] + outcome.statuses["partial"] == 0
@@ -98,7 +101,8 @@ def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_
         assert solution.sun is not None
         assert solution.sun.sigma > 1.2 * entire.sigma
         off = solution.sun.basis @ truth
-        assert off @ np.linalg.solve(solution.sun.tangent_covariance, off) < 14.0  # one in a thousand
+        # Limit that one in a thousand cases exceeds.
+        assert off @ np.linalg.solve(solution.sun.tangent_covariance, off) < 14.0
         assert np.degrees(np.hypot(*off)) < 0.06
 
 
@@ -125,9 +129,9 @@ def test_the_same_sun_is_found_in_twelve_bits() -> None:
 
 
 def test_a_sun_that_blooms_over_whole_columns_is_refused() -> None:
-    """The charge of the Sun spreads over a whole column, so that the patch has no round rim.
+    """The charge of the Sun spreads over a whole column, so that the patch is not round.
 
-    Expose for less.
+    The remedy is a shorter exposure.
     """
     blooming = replace(CAMERAS["linear"][0], blooming=True)
     frame, _ = _frame_at(300.3, 240.8, blooming)
@@ -173,7 +177,7 @@ def _disc_frame(radius: float, x: float = 256.0, y: float = 200.0) -> Image:
 
 
 def test_a_ragged_rim_increases_the_covariance() -> None:
-    """The radius of a disc varies five times around the rim, by 0 and by 0.3 px."""
+    """The radius of a disc varies with five periods around its edge, by 0 and by 0.3 px."""
     y, x = np.mgrid[0:512, 0:512] - np.array([200.0, 256.0])[:, None, None]
     around = np.sin(5.0 * np.arctan2(y, x))
     sizes = []
@@ -270,7 +274,7 @@ def test_the_solar_strings_give_the_direction_if_no_camera_finds_the_sun(
 
 
 def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthScene, Image]) -> None:
-    """The image with the Sun is from a camera whose field of view barely includes the coarse direction."""
+    """The image with the Sun is from a camera whose field of view only just includes the coarse direction."""
     scene, frame = seen
     true = MOUNTED[0].in_body(np.array([0.0, np.sin(0.5), np.cos(0.5)]))
     assert float(true @ _in_body(scene, 0)) < np.cos(0.3)
@@ -328,7 +332,7 @@ def test_a_strip_is_sampled_bilinearly_up_to_its_border() -> None:
 
 
 def test_strings_in_one_plane_leave_the_cameras_above_and_below_it_possible() -> None:
-    """Six side panels give the Sun's azimuth, and their error along the open angle is without bound."""
+    """Six side panels determine only the Sun's azimuth; the error of its elevation is unbounded."""
     direction, basis = np.array([1.0, 0.0, 0.0]), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     coarse = CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.diag([1e-4, 1e6]))
     lens = Pinhole.from_field_of_view(128, 128, np.radians(40.0))

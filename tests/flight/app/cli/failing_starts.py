@@ -1,7 +1,7 @@
-"""Starts the link repeatedly in one process; in each start, other calls of the operating system fail.
+"""Starts the link repeatedly in one process; in each start, different system calls fail.
 
 Run as `python -m tests.flight.app.cli.failing_starts FOLDER [all]`, in a process of its own: the hook that
-makes calls fail stays for the life of its process. Prints one JSON object per start.
+makes calls fail stays for the life of its process. The program prints one JSON object per start.
 
 Opening files and sockets raises audit events before the call. With `all`, each call fails with each error,
 and calls without an audit event fail too; they are replaced in the modules that contain them.
@@ -41,11 +41,11 @@ NETWORK_ERRORS = (errno.EADDRINUSE, errno.EADDRNOTAVAIL)
 
 
 class Faults:
-    """Makes calls fail while a link starts.
+    """Injector of failing calls during the starts of a link.
 
     Attributes:
-        seen: the calls of this start, each with its arguments.
-        waits: how often this start has waited.
+        seen: the calls of the present start, each with its arguments.
+        waits: number of times that the present start has waited.
     """
 
     def __init__(self) -> None:
@@ -54,11 +54,14 @@ class Faults:
         self._error_of: Callable[[str, str], int] | None = None
 
     def start(self, error_of: Callable[[str, str], int]) -> None:
-        """Begin a start; `error_of` returns the error of a call that is to fail, else 0."""
+        """Begin a start.
+
+        `error_of` returns the error number of a call that must fail, and 0 for all others.
+        """
         self.seen, self.waits, self._error_of = [], 0, error_of
 
     def end(self) -> None:
-        """Let no more call fail."""
+        """Make no further calls fail."""
         self._error_of = None
 
     def hook(self, event: str, arguments: tuple[Any, ...]) -> None:
@@ -85,7 +88,7 @@ class Faults:
 
 
 def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Callable[[str, str], int]]]:
-    """Yield the failing calls of each start and their error."""
+    """Yield the failing calls of each start, and their error."""
     for _ in range(2):  # the first start is not counted, because it imports modules
         yield "nothing", lambda *_: 0
     calls = list(faults.seen)
@@ -127,7 +130,7 @@ def run(place: Path, complete: bool = False) -> None:
         wait(self, problem, 0.0)
 
     sys.addaudithook(faults.hook)
-    # Only the start is tested, without its pauses.
+    # Only the start is tested, and its pauses are omitted.
     with ExitStack() as stack:
         stack.enter_context(patch.object(Station, "run", run_shortly))
         stack.enter_context(patch.object(StartRetry, "wait", count_waits))

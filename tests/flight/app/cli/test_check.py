@@ -68,7 +68,7 @@ def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path)
 
 
 def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
-    """The coils carry a hundredth of the configured current."""
+    """The simulated coils carry a hundredth of the configured current."""
     world = {**yaml.safe_load(DEMO.read_text())["simulation"], "truth": {"resistance": [2300.0] * 3}}
     steps = [{"at": 0.0, "q2": 0.0}]
     done = command("check", write(tmp_path, DEMO, camera="none", duration=6.0, steps=steps, simulation=world))

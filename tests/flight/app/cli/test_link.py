@@ -114,9 +114,9 @@ def test_authentic_frames_with_any_counter_end_no_process(
 ) -> None:
     """A refused frame is not stored, because its replay would end the link after every restart.
 
-    The highest numbers come first, because only four refusals a second are reported.
+    The highest counters come first, because only four refusals a second are reported.
     """
-    assert command(lines, "udp", "ping") == 0  # uses counter 0
+    assert command(lines, "udp", "ping") == 0  # this command uses counter 0
     vault = Vault(Path(lines["place"]) / "keys" / "ground")
     host, _, port = lines["udp"].partition(":")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
@@ -157,7 +157,7 @@ def test_a_key_is_changed_at_both_ends_also_when_the_answer_was_lost(
     assert new is not None
     assert old is not None
     assert new.generation == old.generation + 1
-    # Ground keys before the satellite's answer: the old key is active, the new key is the next one.
+    # Before the satellite's reply, the old key is active on the ground, and the new key is the next one.
     vault.write(new, "1-next")
     vault.write(replace(new, generation=1, key=bytes(32)))
     assert command(lines, "udp", "new-key", "1") == 0
@@ -183,7 +183,7 @@ def test_a_ground_station_without_keys_commands_by_the_gateway_and_knows_its_com
     raw[7:15], raw[-CRC_BYTES:] = (
         bytes(8),
         bytes(CRC_BYTES),
-    )  # as XTCE clients leave them
+    )  # fields as XTCE clients leave them
     reports: list[Report] = []
     came = b""
     with socket.create_connection(("127.0.0.1", gateway.port)) as station:

@@ -20,7 +20,7 @@ _LONGEST_S = 120.0
 
 
 class Service:
-    """A link process, and the service manager's end of its line."""
+    """A link process, and the service manager's end of its notification socket."""
 
     def __init__(self, place: Path, config: Path) -> None:
         self.line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -120,7 +120,7 @@ def test_a_star_attitude_that_contradicts_a_coarse_one_replaces_it_at_once() -> 
 
 
 def test_a_filter_that_began_after_a_reading_of_the_strings_is_kept() -> None:
-    """Star fixes restart the filter shortly after the reading at 15.25 s, which is checked next."""
+    """Star fixes restart the filter shortly after the reading at 15.25 s, before this reading is checked."""
     lit = Lit(1)
     lit.begin_ns = 15_400_000_000
     lit.fly(16)

@@ -20,7 +20,7 @@ FIELD = np.array([2e-5, 0.0, 3e-5])
 
 
 class Seen:
-    """The control law of Sun acquisition with its reported events."""
+    """The Sun acquisition's control law, with a record of its events."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []

@@ -1,4 +1,4 @@
-"""Tests of the predicted environment: from elements or fixes, interpolated, with false fixes refused."""
+"""Tests of the predicted environment: from elements or fixes, interpolation, refusal of false fixes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def elements() -> TwoLineElements:
 
 
 def reading(elements: TwoLineElements, time_ns: int, shift: FloatArray | None = None) -> GpsReading:
-    """Return a fix at `time_ns` of a clock that begins at `UTC_NS`."""
+    """Return a GPS fix at `time_ns` of a clock that begins at `UTC_NS`."""
     utc_ns = UTC_NS + time_ns
     date = UNIX_EPOCH + utc_ns / (DAY * SECOND_NS)
     state, turn = elements.at(date), celestial_to_terrestrial(date)
@@ -157,7 +157,7 @@ class Flight:
         return used
 
     def off(self) -> tuple[float, float]:
-        """Return the error of the present position, m, and its claimed standard deviation, m."""
+        """Return the error (m) of the present position, and its claimed standard deviation (m)."""
         state = self.environment.state(self.seconds * SECOND_NS)
         assert state is not None
         return float(np.linalg.norm(state.position - self.true.at(state.julian_date).position)), state.sigma
@@ -166,7 +166,7 @@ class Flight:
 @pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
 @pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
 def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
-    """The elements have B* 0, but the satellite has 2.5e-4 or 5e-4.
+    """The elements have B* 0, but the satellite has a B* of 2.5e-4 or 5e-4.
 
     Later fixes are compared with earlier fixes.
     """
@@ -184,7 +184,7 @@ def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(
 @pytest.mark.skipif(not INPUT.is_file(), reason="../shared/data/inputs/tle-bstar0-drag.txt is missing")
 @pytest.mark.parametrize("age", [4, 6, 30])
 def test_the_elements_of_the_report_do_not_outvote_good_fixes(age: int) -> None:
-    """The file has B* 0; the satellite has B* 5e-4 and is 226 km off after 6 days, 5,514 km after 30 days."""
+    """The file has B* 0, the satellite B* 5e-4: the error is 226 km after 6 days, 5,514 km after 30 days."""
     first, second = INPUT.read_text(encoding="ascii").splitlines()
     true = TwoLineElements(summed(first[:53] + " 50000-3" + first[61:]), second)
     flight = Flight(TwoLineElements(first, second), true, age)

@@ -27,7 +27,7 @@ DOUBLED = tuple(
 )
 """Three axes of which z has two unequal coils, in opposite directions."""
 SECONDS, BROKEN, FIELD = 20.0, 36.0, 3.0e-5
-"""Duration (s) of a flight with all its coils, and of one whose coil fails after 10 s; field (T)."""
+"""Duration (s) of a flight with healthy coils, and of a flight with a coil failure after 10 s; field (T)."""
 
 
 @pytest.mark.parametrize("name", ["orbit_2u", "orbit_6u", "orbit_12u", "orbit_1u_tilted"])
@@ -53,7 +53,7 @@ def test_an_example_detumbles_with_currents_within_the_limit_of_each_coil(name: 
 def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     windings: tuple[Winding, ...] | None, tmp_path: Path
 ) -> None:
-    """Cases: a pyramid of rods, and three axes with two different coils along one of them."""
+    """The cases are a pyramid of four rods, and three axes with two different coils along one of them."""
     path, broken = FOLDER / "orbit_6u_redundant.yaml", 3
     config = without_cameras(as_orbit(configuration.load(path)), BROKEN)
     if windings is not None:

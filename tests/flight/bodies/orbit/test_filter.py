@@ -46,7 +46,7 @@ FIELD = np.array([1e-5, 2e-5, 3e-5])
 BIAS, SPIN = np.array([4e-4, -5e-4, 3e-4]), np.array([3e-3, -2e-3, 4e-3])
 STAR = 2e-5
 DIPOLE = 0.02
-"""A m^2, about x."""
+"""Commanded dipole (A m^2) along x."""
 
 
 def around(_: int) -> FilterEnvironment:
@@ -55,7 +55,7 @@ def around(_: int) -> FilterEnvironment:
 
 
 class Flown:
-    """A simulated body with coils, integrated by some Euler steps per reading, and its filter."""
+    """A simulated body with coils, integrated by several Euler steps per reading, and its filter."""
 
     def __init__(
         self, pulses: bool = False, errors: BodyErrors | None = None, slow: SlowStates | None = None
@@ -104,7 +104,10 @@ class Flown:
             self.filter.accept(self._reading())
 
     def _acceleration(self, mx: float, my: float, mz: float) -> FloatArray:
-        """Return the angular acceleration (3,), rad/s^2, under a dipole, A m^2. Floats are fast here."""
+        """Return the angular acceleration (3,), rad/s^2, under a dipole, A m^2.
+
+        Floats are faster than arrays here.
+        """
         bx, by, bz = (attitude_matrix(self.attitude) @ FIELD).tolist()
         wx, wy, wz = self.rate.tolist()
         jx, jy, jz = MOMENTS
@@ -159,7 +162,10 @@ def test_a_propagated_estimate_can_be_replaced_copied_and_pickled(
 
 
 def acquired(pulses: bool = False) -> Flown:
-    """Return a body that began by stars 0.6 s old and saw them each 5 s; the tests share its flight."""
+    """Return a body that acquired by a star attitude 0.6 s old, with star attitudes every 5 s.
+
+    Tests share it.
+    """
     return deepcopy(_acquired(pulses))
 
 
@@ -284,7 +290,7 @@ def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
     return SlowStates(values, covariance)
 
 
-# Elements of the inertia, relative to the trace, with errors of 10 or 15 % of a moment.
+# Stored inertia errors, relative to the trace, that are wrong by 10 or 15 % of a moment.
 WRONG_INERTIA = {INERTIA_ERROR.start: (0.052, 1e-4), INERTIA_ERROR.start + 1: (-0.034, 1e-4)}
 KNOWN_COILS = {index: (0.0, 5e-3) for index in range(COILS.start, COILS.stop)}
 
@@ -346,7 +352,7 @@ def test_currents_that_may_not_have_flown_widen_the_claim() -> None:
 
 
 def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
-    """A coil fails in the middle of a step, which the gyro shows."""
+    """A coil fails in the middle of a step, which the gyro makes visible."""
     flown = acquired(pulses=True)
     flown.carries = 0.0
     flown.fly(7.5)
@@ -357,7 +363,7 @@ def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_cl
 
 
 def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim() -> None:
-    """A coil makes a third of the commanded dipole, which the gyro does not show.
+    """A coil has a third of the commanded dipole, which is not visible to the gyro.
 
     The filter must not refuse correct star fixes because of the wrong dipole.
     """
@@ -465,7 +471,7 @@ def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_les
     coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
     errors = BodyErrors(coil_gain=0.2)
     settings = replace(flown.filter._settings, coils=coils, free=FreeFilterSettings(errors=errors))
-    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # current combination that makes no dipole
+    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # currents that together have zero dipole
     linear = coils.currents(np.array([DIPOLE, 0.0, 0.0]))
     doubts = []
     for used, currents in (
@@ -481,7 +487,7 @@ def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_les
             filter_.accept(flown._reading_at(cycle * PERIOD_NS))
             filter_.command((cycle + 1) * PERIOD_NS, currents)
         doubts.append(filter_._steps[0].doubt)
-    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils with sqrt(3) m^2 (dipole moment per ampere)
+    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils with sqrt(3) A m^2 per ampere
     assert doubts == pytest.approx([0.0, expected, 0.0], abs=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Tests that learned parameters are the prior of the next boot, with a variance that grows with age."""
+"""Tests that estimated parameters are the prior of the next boot, with variances that grow with age."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def known(share: float = 0.1) -> SlowStates:
 
 
 def stored(slow: SlowStates) -> dict[str, Learned]:
-    """Return the states after storing and reading them."""
+    """Return parameters after storing and reading them."""
     return decode(encode(1, StoredState(learned=learned_of(slow, THEN)))).state.learned
 
 

@@ -1,4 +1,4 @@
-"""Tests that an object is searched for, tracked, propagated through a loss, and given up with a reason."""
+"""Tests that an object is searched for, followed, predicted while lost, and given up with a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that the rest of a slew is planned again and replaces the running plan without a jump."""
+"""Tests that the remaining slew is planned again, and replaces the current plan without a jump."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class _Fixed:
 def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less_current(
     config: TestbedConfig, direction: float
 ) -> None:
-    """The torque is also made if the field lies along body x, where coil x alone makes none."""
+    """The torque is also available if the field is along body x, where coil x alone causes none."""
     plant, dipole = plant_of(config), config.plant.coil_turns * config.plant.coil_area
     for angle in (-0.6, 0.0, 0.4):
         field = 1.1 * config.plant.field * np.array([np.sin(direction), 0.0, np.cos(direction)])

@@ -86,7 +86,7 @@ def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_
 
 @pytest.mark.parametrize("current", [0.0, 0.05])
 def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: float) -> None:
-    """Between two measurements at rest, measurements with driven coils agree, because they are inaccurate."""
+    """Between two measurements with coils off, inaccurate measurements with driven coils are accepted."""
     feed, filter_ = feed_of()
     for step in range(40):
         feed.accept(reading(step * PERIOD_NS, FIELD))
@@ -99,7 +99,7 @@ def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: 
         filter_.command((step + 2) * PERIOD_NS, np.zeros(3))
         held.append(feed.accept(reading((step + 5) * PERIOD_NS, turned)).holds)
         step += 6
-    # With driven coils only every other measurement is at rest.
+    # If coils are driven, only every other measurement is made with coils off.
     assert held.index(True) == (8 if current else 4)
     assert angle_about_axis_y(filter_.at(step * PERIOD_NS).quaternion) == pytest.approx(2.5, abs=0.1)
 

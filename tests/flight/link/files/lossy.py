@@ -19,7 +19,7 @@ def anything(_: Metadata) -> str:
 
 
 class Pair:
-    """A satellite and a ground. Each unit is lost with a probability, in either direction."""
+    """A satellite and a ground station. In both directions, data units are lost with a given probability."""
 
     def __init__(self, place: Path, loss: float, seed: int = 1) -> None:
         self.place, self.loss = place, loss

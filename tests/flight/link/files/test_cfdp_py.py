@@ -44,7 +44,7 @@ _IGNORED = tuple(
 
 
 class User(CfdpUserBase):  # type: ignore[misc]
-    """Keeps the condition with which each transfer ended."""
+    """Record of the condition with which each transfer ended."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class Ends:
         self.source = SourceHandler(local, self.user, table, Timers(), SeqCountProvider(32))
 
     def put(self, path: Path) -> None:
-        """Begin to send a file up."""
+        """Begin to uplink a file."""
         assert self.source.put_request(
             PutRequest(ByteFieldU16(SATELLITE), path, Path("up"), TransmissionMode.ACKNOWLEDGED, None)
         )
@@ -246,7 +246,7 @@ def test_a_file_goes_down_whole_to_cfdp_py(
     loss: float,
     kind: int,
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # cfdp-py writes to the name that the sender gives
+    monkeypatch.chdir(tmp_path)  # cfdp-py writes to the file name that the sender gives
     pair = ends(loss)
     pair.get(file, kind, tmp_path / "down")
     pair.until_closed()

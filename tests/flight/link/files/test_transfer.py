@@ -80,7 +80,7 @@ def test_ends_that_are_killed_go_on(tmp_path: Path, file: Path, seed: int) -> No
 def test_a_killed_end_asks_again_for_a_second_at_most(tmp_path: Path, file: Path) -> None:
     pair = Pair(tmp_path, 0.0)
     pair.send(SATELLITE, file, "down")
-    for _ in range(60):  # 1.2 s
+    for _ in range(60):  # cycles of 20 ms, 1.2 s in total
         pair.turn(units=3)
     pair.kill(GROUND)
     (progress,) = pair.ends[GROUND].transfers()
@@ -190,7 +190,7 @@ def test_what_is_wrong_with_a_file_ends_its_transfer(
 
 
 def test_bytes_beyond_the_end_that_came_before_the_metadata_are_left_out_of_the_file(tmp_path: Path) -> None:
-    """CCSDS 727.0-B-5, 4.6.1.2: a file size error, whichever came first."""
+    """By CCSDS 727.0-B-5, 4.6.1.2, this is a file size error, whichever data unit came first."""
     pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
     end = pair.ends[SATELLITE]
     checksum = zlib.crc32(b"abc")
@@ -350,7 +350,7 @@ def test_without_an_end_missing_data_are_requested_ten_seconds_after_the_last_da
 
 
 def _sliced(missing: set[int]) -> list[tuple[int, int]]:
-    """Return the first gap, limited to 25, and the last gap, cut at 7."""
+    """Return the first gap, limited to 25, and the last gap that ends above 7, with its start cut at 7."""
     edges = [n for n in range(26) if (n in missing) != (n - 1 in missing)]
     gaps = list(zip(edges[::2], edges[1::2], strict=True))
     return gaps[:1] + [(max(begin, 7), end) for begin, end in gaps if end > 7][-1:]

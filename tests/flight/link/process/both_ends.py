@@ -161,7 +161,7 @@ class BothEnds:
         return self.packer.pack(MODE, self.clock.now_ns(), fields)
 
     def turn(self, seconds: float = 0.5, answer: Callable[[bytes], bool] | None = None) -> None:
-        """Advance the clock; the flight executes received commands or answers with `answer`."""
+        """Advance the clock; the flight executes received commands, or replies with `answer`."""
         until = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < until:
             self.station.turn()
@@ -188,7 +188,7 @@ class BothEnds:
         return [report_of(packet) for packet in self.of(VERIFICATION.name)]
 
     def of(self, name: str) -> list[bytes]:
-        """Return the received packets with a name."""
+        """Return the received packets of one name."""
         identifier = LAYOUTS[name].identifier.to_bytes(2, "big")
         return [packet for _, packet in self.packets if packet[:2] == identifier]
 

@@ -84,5 +84,5 @@ class FiledEnds(BothEnds):
         return failed(reports) or reports[-1].stage.name.lower()
 
     def _left(self, frames: list[bytes]) -> list[bytes]:
-        """Return the frames that are not lost."""
+        """Return those of the given frames that are not lost."""
         return [frame for frame in frames if self.draw.random() >= self.loss]

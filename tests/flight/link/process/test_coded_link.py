@@ -106,7 +106,8 @@ def test_telemetry_can_be_readable_for_everybody_and_still_cannot_be_forged(
     link.turn(1.5)
     seen = list(link.wire.down)
     packets = [packet for _, packet in link.terminal.take()]
-    # Sixteen bytes are compared, because two bytes occur by chance in one of a hundred encrypted downlinks.
+    # Sixteen bytes are compared, because two equal bytes occur by chance in one of a hundred encrypted
+    # downlinks.
     starts = [
         packet[:16] for packet in packets if packet[:2] == LAYOUTS[LINK.name].identifier.to_bytes(2, "big")
     ]

@@ -60,7 +60,7 @@ def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
             stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
         )
         stranger.bind(("127.0.0.2", 0))
-        for _ in range(10_000):  # much larger than the buffer
+        for _ in range(10_000):  # together much larger than the receive buffer
             stranger.sendto(FRAME, ("127.0.0.1", line.port))
         peer.sendto(FRAME, ("127.0.0.1", line.port))
         assert [frame for frame, _ in line.receive()] == [FRAME]
@@ -131,7 +131,7 @@ def test_a_connection_that_does_not_read_is_closed() -> None:
         ((frame, sender),) = received_by(line)
         assert frame == FRAME
         line.trust(sender, 0)
-        for _ in range(300):  # much larger than the socket buffers
+        for _ in range(300):  # together much larger than the socket buffers
             line.send([bytes(1 << 16)], 0)
         assert sender not in line._connections
         assert len(line._connections) == 1

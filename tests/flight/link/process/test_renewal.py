@@ -1,4 +1,4 @@
-"""Tests that the link passes renewals to the privileged program and reports its results."""
+"""Tests that the link passes requests for updates to the privileged program, and reports its results."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
 
     def until_killed(path: Path, data: bytes) -> bool:
         if next(left, None) is None:
-            path.write_bytes(data[:10])  # torn
+            path.write_bytes(data[:10])  # a truncated copy
             raise KeyboardInterrupt
         return overwrite(path, data)
 
@@ -314,7 +314,7 @@ def label(link: BothEnds, utc_ns: int) -> bytes:
 
 
 def fly(link: BothEnds, seconds: int) -> None:
-    """Let a flight write a packet each second."""
+    """Make a flight write a packet each second."""
     for _ in range(seconds):
         link.record(link.mode_packet(Mode.HOLD, "again"))
         link.turn(1.0)

@@ -284,7 +284,7 @@ def test_a_slow_line_thins_what_repeats_and_loses_no_event(tmp_path: Path) -> No
 
 
 def test_a_stretch_of_the_archive_is_played_back_whole_beside_live_telemetry(link: BothEnds) -> None:
-    old = timing_packets(4000)  # several segments
+    old = timing_packets(4000)  # enough packets for several segments
     link.record(*old)
     link.turn(4.0)
     link.packets.clear()
@@ -309,7 +309,7 @@ def test_a_new_key_makes_the_old_one_worthless(link: BothEnds) -> None:
     stale = link.terminal.send(directives.pack(NewKey(2, 7, key), 1))
     link.turn()
     assert link.stages(change) == ["accepted", "completed"]
-    assert link.stages(stale) == []  # came under the old key
+    assert link.stages(stale) == []  # the command was protected with the old key
     assert link.status()["refused_mac"] == 1
     late = link.terminal.send(directives.pack(NewKey(2, 7, key), 1), spi=2)
     link.turn()

@@ -15,7 +15,7 @@ def content(folder: Path, stem: str = "flight") -> bytes:
 
 
 class SmallDisk:
-    """Opens segments on a disk of `room` bytes. The write that fills the disk is cut; later writes fail."""
+    """A disk of `room` bytes that opens segments. The write that fills it is cut; later writes fail."""
 
     def __init__(self, room: int) -> None:
         self.room = room
@@ -35,7 +35,7 @@ class SmallDiskFile:
         self._file = file
 
     def write(self, data: bytes, /) -> int | None:
-        """Take what fits."""
+        """Write as many bytes as fit on the disk."""
         if self._disk.room == 0 and data:
             self._disk.refusals += 1
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -44,7 +44,7 @@ class SmallDiskFile:
         return self._file.write(fits)
 
     def truncate(self, size: int, /) -> int:
-        """Cut the file."""
+        """Truncate the file."""
         return self._file.truncate(size)
 
     def fileno(self) -> int:

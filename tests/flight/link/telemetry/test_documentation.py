@@ -43,7 +43,7 @@ def test_every_field_of_every_packet_is_documented() -> None:
 
 
 def test_the_ground_database_is_enough_to_read_a_packet() -> None:
-    """Reads a field at the offset in the database, without code of the project."""
+    """Read a field at the offset that the database states, without code of the project."""
     ground = json.loads(json.dumps(database()))
     (control,) = (packet for packet in ground["packets"] if packet["name"] == "control")
     raw = Packer().pack(

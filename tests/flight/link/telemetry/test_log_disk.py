@@ -23,7 +23,7 @@ SECOND = 1_000_000_000
 
 @pytest.mark.parametrize("room", [0, 1, 500, 777])
 def test_a_full_disk_stops_the_log_in_order(tmp_path: Path, room: int) -> None:
-    """Packets that fit are kept whole; the rest is counted and reported."""
+    """Packets that fit are stored completely; all others are counted and reported."""
     clock, disk = ManualClock(0), SmallDisk(room)
     packets = timing_packets(50)
     log = FlightLog(tmp_path, clock=clock, segment_bytes=10 * len(packets[0]), opener=disk.open)

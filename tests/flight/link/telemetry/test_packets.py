@@ -158,7 +158,7 @@ def test_a_table_that_cannot_work_is_refused() -> None:
 
 
 def test_packing_costs_less_than_ten_times_the_bare_struct() -> None:
-    """Both durations are of the same run, so that a busy machine slows both.
+    """Both durations are measured in the same run, so that a busy machine affects both.
 
     The ratio was 4 on 2026-11-23.
     """

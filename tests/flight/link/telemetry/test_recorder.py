@@ -9,7 +9,7 @@ from ground.telemetry import decode
 
 
 class Memory:
-    """A log in memory."""
+    """A test double of a log that keeps packets in memory."""
 
     def __init__(self) -> None:
         self.packets: list[bytes] = []

@@ -54,7 +54,7 @@ def test_power_lost_at_every_byte_of_the_last_four_kibibytes_costs_the_packet_it
 
 
 def test_blocks_that_power_loss_left_as_zeros_cost_only_what_they_cover(run: Path) -> None:
-    """A file system shows zeros if a file's length was stored but its last blocks were not."""
+    """A file contains zeros if the file system stored its length but not its last blocks."""
     data = find_segments(run, "flight")[0].read_bytes()[:8192]
     packets = packets_of(data[: packets_of_prefix(data)])
     for start in range(0, 8192, 512):
@@ -91,7 +91,10 @@ def test_random_damage_costs_the_packets_it_touches_and_invents_none(run: Path, 
 
 
 def test_a_packet_of_a_segment_or_of_a_sequence_is_none_of_ours() -> None:
-    """Both sequence flags of a complete packet are set. Other flags are refused even with a correct CRC."""
+    """In a complete packet both sequence flags are set.
+
+    Packets with other flags are refused even with a correct CRC.
+    """
     body = bytearray(LAYOUTS["cycle_timing"].length - 2)
     body[:2] = LAYOUTS["cycle_timing"].identifier.to_bytes(2, "big")
     body[4:6] = (len(body) + 2 - 7).to_bytes(2, "big")

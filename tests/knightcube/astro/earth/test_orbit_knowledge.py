@@ -26,7 +26,7 @@ SECOND = "2 00005  34.2682 348.7242 1859667 331.7664  19.3264 10.82419157413667"
 
 
 def test_two_line_elements_give_the_published_state() -> None:
-    """At epoch (2000 June 27, 18:50:19.733568 UTC), TEME, km and km/s: SGP4-VER's first line of 00005."""
+    """The expected TEME state (km, km/s) at the epoch is SGP4-VER's first line of satellite 00005."""
     epoch = 2_451_722.5 + 0.78495062
     state = TwoLineElements(FIRST, SECOND).at(epoch)
     to_teme = mean_equator_to_celestial(epoch).T

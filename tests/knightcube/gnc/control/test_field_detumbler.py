@@ -227,7 +227,7 @@ def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
 
 @pytest.mark.parametrize("gyro", [True, False])
 def test_the_coils_act_soon_after_the_begin_by_a_rate_that_is_bounded(gyro: bool) -> None:
-    """With the coils off, a gyro shows the rate at the first sample, and the field within a second."""
+    """With the coils off, a gyro gives the rate at the first sample, the field within a second."""
     law, rate, rng = detumbler(), np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
     law.begin(0)
     for now_ns in range(0, 2_000_000_000, 25_000_000):
@@ -315,7 +315,7 @@ def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
 
 
 def least_time(momentum: FloatArray, field: FloatArray) -> float:
-    """Return a lower bound: for any p, dipoles at the limit reduce p . h at most by their integral."""
+    """Return a lower bound (s): for any p, dipoles at the limit reduce p . h by at most their integral."""
     directions = np.random.default_rng(1).standard_normal((3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     most = (
@@ -350,7 +350,7 @@ def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
 
 
 def test_what_the_rest_allows_is_not_waited_for() -> None:
-    """A tenth of the momentum is along the field, which rotates more slowly than the rest is removed."""
+    """A tenth of the momentum is along the field, which rotates slowly; the remainder is removed faster."""
     momentum = np.array([1e-4, 0.0, 1e-5])
     exact, allowed = (
         momentum_plan(momentum, FIELD_AHEAD, TIMES, DIPOLE_LIMIT, rest) for rest in (1e-7, 1.2e-5)

@@ -78,7 +78,7 @@ def test_near_the_path_the_law_is_that_of_the_thesis_with_the_disturbance_subtra
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float) -> None:
-    """At the rate sqrt(2 a e - r^2), a = 0.8 of the torque and r = a K_e' / K_e, no torque is demanded."""
+    """No torque is demanded at the rate sqrt(2 a e - r^2), with a = 0.8 of the torque, r = a K_e' / K_e."""
     tracker = LqTracker(PLANT, 20.0, 1.0)
     error = 0.5
     braking = 0.8 * STRENGTH * math.cos(error)

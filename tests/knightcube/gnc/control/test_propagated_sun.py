@@ -62,7 +62,7 @@ def test_a_sun_is_forgotten_after_the_longest_eclipse() -> None:
 
 
 def test_while_nobody_carries_it_no_bias_is_learned_and_an_old_direction_is_not_taken_up() -> None:
-    """In modes other than SAFE, the strings are read but the rotation is not passed on."""
+    """In modes other than SAFE, the solar strings are read, but rotations are not propagated."""
     propagated = PropagatedSun()
     for second in range(100):
         propagated.measure(second * SECOND_NS, attitude_matrix(from_rotation_vector(second * BIAS)) @ SUN)

@@ -167,7 +167,7 @@ def mean_rate(start: FloatArray, end: FloatArray, span: float) -> FloatArray:
 def seen_from(
     axes: FloatArray, sigmas: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a random error (3,) and its covariance, with `sigmas` (3,) along the columns of `axes`."""
+    """Return a random error (3,) and its covariance; `sigmas` (3,) are those along columns of `axes`."""
     return axes @ (sigmas * rng.standard_normal(3)), (axes * sigmas**2) @ axes.T
 
 

@@ -199,7 +199,7 @@ def test_the_gate_knows_its_degrees_of_freedom() -> None:
 
 
 def test_when_attitudes_disagree_for_a_second_the_filter_restarts() -> None:
-    """Attitudes and rates are counted separately, so an agreeing gyro does not matter."""
+    """Refusals of attitudes and rates are counted separately, so an agreeing gyro has no effect."""
     flight = fly(10, 100, False)
     filter_ = begin(flight, False)
     follow(filter_, flight, 1, 50)

@@ -54,7 +54,7 @@ def test_variances_that_are_claimed_too_small_are_found_out() -> None:
 
 
 def test_variances_that_are_claimed_too_large_are_found_out() -> None:
-    """The claimed noise of the IMU is twice its true noise, which the innovations show before the errors."""
+    """The filter assumes twice the IMU's true noise, which innovations show before errors do."""
     facts = consistency.scene_facts(fly("testbed", 4, claimed=4.0))
     assert facts["nees_mean"] < 0.9
     assert facts["nis"]["gyro"]["mean"] < 0.5

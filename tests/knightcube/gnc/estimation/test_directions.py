@@ -154,7 +154,7 @@ def test_a_wrong_direction_does_not_pass_the_gate_and_a_right_one_does() -> None
 
 
 def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> None:
-    """100 readings of a tumbling body with 20 nT of noise give 300 nT of hard iron to 2 nT, as claimed."""
+    """From 100 readings with 20 nT of noise, 300 nT of hard iron are found to 2 nT, as claimed."""
     rng = np.random.default_rng(6)
     flight = fly(4, 400, False)
     filter_ = AttitudeFilter(FREE, replace(SETTINGS, field_bias_start=5e-7))

@@ -49,7 +49,7 @@ def around(time: float) -> FilterEnvironment:
 def fly(
     seconds: int, seed: int, age: float = 0.0, settings: FreeFilterSettings | None = None
 ) -> tuple[FreeFilter, FloatArray, FloatArray]:
-    """Return the filter and the true attitude and rate after `seconds` of drift, with stars every 10 s."""
+    """Return filter, true attitude and rate after `seconds` without control, with stars every 10 s."""
     rng = np.random.default_rng(seed)
     found = FreeFilter(INERTIA, settings or FreeFilterSettings())
     q, w = IDENTITY, np.array([1e-3, -5e-4, 8e-4])

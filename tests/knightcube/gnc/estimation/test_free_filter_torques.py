@@ -244,7 +244,7 @@ def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
 
 
 def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_size() -> None:
-    """In dense air a constant random walk is too small, and the filter would reject stars in the end."""
+    """With strong drag, a constant random walk is too small; the filter would finally reject stars."""
     settings = FreeFilterSettings(errors=NO_ERRORS)
     prior = settings.error_state(INERTIA).prior[SLOW, SLOW]
     first, seconds = TORQUES.start - SLOW.start + AIR.start, 100

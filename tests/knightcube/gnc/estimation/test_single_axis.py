@@ -80,7 +80,7 @@ def test_a_late_measurement_gives_what_it_would_have_given_in_time() -> None:
 
 
 def test_mean_rates_over_an_exposure_keep_it_consistent_while_the_body_accelerates() -> None:
-    """NEES with one mean rate a second, delivered 0.25 s late: 40 runs, the 99.9 % band of chi-square(80)."""
+    """With a mean rate each second, 0.25 s late, the NEES of 40 runs is in the 99.9 % chi-square band."""
     rng = np.random.default_rng(11)
     nees, used, plain_sigma = [], 0, 0.0
     for _ in range(40):

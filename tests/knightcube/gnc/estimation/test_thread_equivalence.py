@@ -88,7 +88,7 @@ def test_adrift_the_two_filters_agree_to_rounding() -> None:
 
 
 def test_driven_they_differ_by_what_the_single_axis_leaves_out() -> None:
-    """The single-axis filter includes the change of torque with angle in the state only: 0.5 %."""
+    """The single-axis filter's covariance ignores the change of torque with angle: 0.5 %."""
     states, covariances = largest_difference(driven=True)
     assert states < 5e-3
     assert covariances < 5e-3

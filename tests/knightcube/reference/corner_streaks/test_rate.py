@@ -62,7 +62,7 @@ def _small_frame(seed: int, length: float = 50.0, theta: float = 0.5 * np.pi) ->
 @pytest.mark.parametrize("theta_deg", [90.0, 60.0, 30.0])
 @pytest.mark.parametrize("length", [25.0, 60.0, 200.0])
 def test_the_rate_vector_is_within_a_percent(theta_deg: float, length: float) -> None:
-    """The thesis states 0.69 % of the rate's magnitude at 102 px (Table 3.1), and 2 % in its abstract."""
+    """The thesis states a magnitude error of 0.69 % at 102 px (Table 3.1), and 2 % in its abstract."""
     theta = np.deg2rad(theta_deg)
     rate = rate_at(theta, length / _FOCAL / np.sin(theta), 0.3)
     result = _estimate(star_frame(_WHOLE, rate, 1.0, 1, faintest=6.5), _WHOLE, rate)
@@ -81,7 +81,7 @@ def test_curved_streaks_about_an_axis_near_the_boresight_are_measured(theta_deg:
 
 
 def test_the_covariance_is_that_of_the_errors_over_many_frames() -> None:
-    """The normalised squared errors over 40 frames are in the band of chi-square, apart from the bias."""
+    """The normalised squared errors of 40 frames are in the chi-square band, widened for the bias."""
     settings = dataclasses.replace(StreakSettings(), endpoint_bias_sigma=0.0)
     nees = []
     for seed in range(40):

@@ -90,7 +90,7 @@ def test_samples_outside_the_image_are_missing_from_a_profile() -> None:
 
 @pytest.mark.parametrize(("place", "count"), [(3.4, 0), (4.6, 8), (250.4, 8), (251.6, 0)])
 def test_edges_within_four_pixels_of_the_border_are_ignored(place: float, count: int) -> None:
-    """The image ends at 0 and 255 px, so that the distances are 3.4, 4.6, 4.6 and 3.4 px."""
+    """The image ends at 0 and 255 px, so the edges are 3.4, 4.6, 4.6 and 3.4 px from the border."""
     line = border(place) if place < 128 else border(255.0 - place)[:, ::-1]
     edges, _ = find_edges(line, FEW)
     assert np.count_nonzero(np.abs(edges.points[:, 0] - place) < 1.0) == count

@@ -128,7 +128,7 @@ def test_without_the_flattenings_direction_the_allowance_covers_the_error(
 
 
 def test_the_fitted_altitude_stays_within_the_given_range(day: tuple[EarthScene, Image]) -> None:
-    """The range begins two sigmas above the best fit, and nadir moves as with an altitude above the fit."""
+    """The range begins two sigmas above the best fit; nadir changes as with a known higher altitude."""
     frame = day[1]
     free = find_nadir(frame, MODEL.lens, HorizonKnowledge(), SETTINGS).nadir
     assert free is not None
@@ -220,7 +220,7 @@ def test_sky_alone_and_noise_alone_show_no_horizon(level: float) -> None:
 
 
 def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_reported() -> None:
-    """The image shows the uniqueness problem of the paper (Fig. 14): either rim may be the limb."""
+    """The image shows the paper's uniqueness problem (Fig. 14): either edge of the band may be the limb."""
     scene = limb_scene(1000e3, zenith=np.array([1.0, 0.2, 0.3]), sun=np.array([1.0, 0.3, 0.2]), dip=0.25)
     frame = render(MODEL, scene, np.random.default_rng(4))
     band = np.minimum(frame, frame[::-1])
@@ -326,7 +326,7 @@ def test_all_cameras_together_are_more_accurate_than_each_camera(level: Instant)
 
 
 def test_an_exactly_known_sun_does_not_reject_a_true_limb(level: Instant) -> None:
-    """A cone through the edges is 0.1 to 0.3 deg off nadir before the limb fit, and the Sun is exact."""
+    """Before the limb fit, a cone through the edges is wrong by 0.1 to 0.3 deg; the Sun is exact."""
     rough = level.knowledge()
     for sigma in (np.radians(0.005), np.radians(1.0)):
         seen = replace(rough, sensed=(SensedDirection(level.sun_in_body, level.sun, sigma),))
@@ -438,7 +438,7 @@ def test_a_horizon_counts_up_to_the_limit_of_each_evidence(
     wrong: float,
     status: HorizonStatus,
 ) -> None:
-    """The tested evidence is on both sides of its documented limit, and all else is as in a sunlit frame."""
+    """The tested evidence is on either side of its documented limit; all else is as in a sunlit frame."""
     scene, frame = day
     for value, expected in ((sound, HorizonStatus.FOUND), (wrong, status)):
         changed = _changed(lambda one, value=value: replace(one, **{evidence: value}))  # type: ignore[misc]

@@ -58,7 +58,7 @@ def frame_with(
     objects: list[tuple[FloatArray, float]],
     faintest: float = 7.0,
 ) -> Image:
-    """Return a random star field with objects (path, magnitude), which depends only on the seed."""
+    """Return a frame of a star field, which depends only on the seed, with objects (path, magnitude)."""
     image = expose(camera, *star_field(camera, seed, faintest), rotation, exposure)
     for path, magnitude in objects:
         add_object(image, camera, path, magnitude, exposure)

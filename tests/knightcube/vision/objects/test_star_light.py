@@ -137,7 +137,7 @@ def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) ->
     ("beyond", "gap"), [(0.0, 0.0), (12.0, 0.0), (30.0, 0.0), (-40.0, 0.0), (-40.0, 8.0)]
 )
 def test_the_ends_of_a_streak_follow_its_light(beyond: float, gap: float) -> None:
-    """An end of a streak of 100 px is `beyond` px too far, and some pixels before the end are saturated."""
+    """The assumed end of a 100 px streak is `beyond` px too far; some pixels before it are saturated."""
     ends = np.array([[200.0, 210.0], [280.0, 270.0]])
     image = np.zeros((512, 512))
     deposit(image, ends[0] + np.linspace(0.0, 1.0, 2001)[:, None] * np.diff(ends, axis=0), 60_000.0, 1.0)

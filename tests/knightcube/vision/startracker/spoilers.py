@@ -1,7 +1,7 @@
 """Foregrounds and defects that are added to a frame of stars, as in photographs or from a worn sensor.
 
 Each function takes pixels (rows, columns) as floats, the brightness range of the stars in counts, and a
-generator.
+random generator.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of the attitude from positions with different errors along and across: accuracy and covariance."""
+"""Tests of the attitude from positions with elongated errors: accuracy and covariance."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_stars_in_one_direction_do_not_determine_an_attitude() -> None:
 
 
 def test_stars_from_different_parts_of_the_sky_do_not_give_an_attitude() -> None:
-    """Two stars at a right angle are imaged side by side, which no attitude explains."""
+    """Two stars that are 90 deg apart are imaged side by side, which no attitude explains."""
     points = np.array([[500.0, 500.0], [520.0, 500.0]])
     reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     with pytest.raises(AttitudeError):
@@ -199,7 +199,7 @@ def test_an_unspecified_shutter_is_fitted_and_included_in_the_covariance() -> No
 
 @pytest.mark.parametrize("scatter", [False, True])
 def test_equal_errors_of_bright_and_faint_stars_are_in_the_covariance(scatter: bool) -> None:
-    """In 200 fields, all positions err by 0.05 px, which is ten times the noise of the brightest stars."""
+    """In 200 fields, all positions have errors of 0.05 px, ten times the noise of the brightest stars."""
     rng = np.random.default_rng(7)
     known, off, ideal = 0.0, 0.0, 0.0
     for _ in range(_TRIALS):

@@ -132,9 +132,9 @@ def test_random_points_are_refused(known_deg: float | None) -> None:
 
 
 def test_a_refusal_takes_limited_time() -> None:
-    """The refusal takes at most 20 ms in `tests.studies.bench starid` on an idle machine.
+    """On an idle machine, a refusal takes at most 20 ms in `tests.studies.bench starid`.
 
-    The test allows ten times as much.
+    The test allows ten times this duration.
     """
     drawn = draw_random(ListKind(known_deg=None), 40, np.random.default_rng(99))
     field = drawn.field()
@@ -236,13 +236,13 @@ def test_repeated_points_in_one_direction_are_not_identified() -> None:
 def test_the_triangles_of_neighbours_join_a_star_with_two_of_its_five_nearest() -> None:
     """The stars lie on a great circle at increasing distances.
 
-    The nearest stars of each can be counted by hand.
+    The nearest stars of each star can therefore be counted by hand.
     """
     angle = np.cumsum(np.arange(1, 46)) * 1e-4
     direction = np.stack([np.sin(angle), np.zeros(45), np.cos(angle)], axis=1)
     field = StarField(direction, np.full(45, 1e-5), (0.2, 0.2))
     expected = set()
-    # Only the 40 brightest stars are used as centres.
+    # Only the 40 brightest stars are used as centres of triangles.
     for centre in range(40):
         near = sorted(range(45), key=lambda other: abs(angle[other] - angle[centre]))[1:6]
         expected |= {tuple(sorted((centre, a, b))) for a in near for b in near if a < b}

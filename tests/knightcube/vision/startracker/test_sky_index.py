@@ -45,7 +45,10 @@ def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> 
 
 
 def test_only_a_reach_below_the_useful_one_is_left_out() -> None:
-    """Half of the stars are random, and half are close together where bright stars are many or few."""
+    """Half of the stars are random.
+
+    The others are close together in regions with many or few bright stars.
+    """
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(2000, 2)
     both = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(2000)])
     direction = np.random.default_rng(3).permutation(both)
@@ -93,9 +96,9 @@ def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() 
 
 
 def test_a_rotated_sky_has_the_same_triangles() -> None:
-    """The range of a star is the distance of a neighbour.
+    """The range of a star is the distance to a neighbour.
 
-    Rounding must not affect the choice of triangles.
+    Rounding errors of this distance must not affect the choice of triangles.
     """
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])

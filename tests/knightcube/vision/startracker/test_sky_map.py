@@ -69,7 +69,7 @@ def test_an_impossible_velocity_is_refused() -> None:
 
 
 def test_the_earths_velocity_is_the_published_one() -> None:
-    """The value is ERFA's own test of epv00 (barycentric, au per day) at MJD 53411.52501161."""
+    """The expected value is that of ERFA's test of epv00 (barycentric, au per day) at MJD 53411.52501161."""
     published = np.array([-0.01091874268116823295, -0.01246525461732861538, -0.005404773180966231279])
     found = earth_velocity(2_453_412.02501161) * DAY / ASTRONOMICAL_UNIT
     np.testing.assert_allclose(found, published, atol=1e-11)

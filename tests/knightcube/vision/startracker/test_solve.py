@@ -1,4 +1,4 @@
-"""Tests of the attitude from frames with points, streaks, priors, no stars, and uneven motion."""
+"""Tests of the attitude from frames with points, streaks, priors, uneven motion, or without stars."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_a_streaked_frame_gives_the_rate_and_a_frame_at_rest_does_not() -> None:
 
 
 def test_the_attitudes_of_many_frames_scatter_as_their_covariances_say() -> None:
-    """Twelve frames have 36 degrees of freedom, and the limits are the quantiles of chi-square at 1e-4."""
+    """The limits are quantiles of chi-square at 1e-4, for the 36 degrees of freedom of twelve frames."""
     frames = [sky_frame(np.random.default_rng([13, number]), 0.0, 0.1) for number in range(12)]
     total = sum(_mismatch(_solve(frame, scale=_KNOWN_TO_A_PERCENT), frame.attitude) for frame in frames)
     assert 11.9 < total < 76.4
@@ -126,7 +126,7 @@ def test_a_wrong_prior_does_not_change_the_solution() -> None:
 
 
 def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
-    """The brightest position is 1.2 px off.
+    """The position of the brightest star is wrong by 1.2 px.
 
     Four stars agree on a roll that differs from the prior by 30 sigmas.
     """
@@ -174,7 +174,7 @@ def test_points_that_contradict_their_uncertainties_give_no_attitude_unless_most
 
 
 def test_stars_seen_as_two_points_each_widen_the_attitude_by_their_distance() -> None:
-    """Each star appears 4 px beside its true position, and again as far on the other side."""
+    """Each star appears twice, 4 px on either side of its true position."""
     kind = ListKind(field_deg=20.0, faintest=5.5, noise_px=0.1, false_stars=0, known_deg=0.0)
     part = np.array([3.2, -2.4])
     single: list[FloatArray] = []
@@ -198,7 +198,8 @@ def test_stars_seen_as_two_points_each_widen_the_attitude_by_their_distance() ->
     assert np.max(np.trace(single, axis1=1, axis2=2)) < 1.0
     turn = np.array([-part[1], part[0]])  # a shift of the image along x is a rotation about y
     for covariance in double:
-        np.testing.assert_allclose(covariance, np.outer(turn, turn), rtol=0.05)  # others are near by chance
+        # Other points are near by chance.
+        np.testing.assert_allclose(covariance, np.outer(turn, turn), rtol=0.05)
 
 
 def test_noise_alone_shows_no_star() -> None:
@@ -210,7 +211,7 @@ def test_noise_alone_shows_no_star() -> None:
 
 
 def test_points_that_are_not_stars_are_refused_with_the_reason() -> None:
-    """The points of a real frame are moved at random, which keeps their flux but shows no real sky."""
+    """The points of a real frame are moved at random; they keep their flux, but match no part of the sky."""
     rng = np.random.default_rng(17)
     pixels = rng.normal(100.0, 10.0, (1024, 1024))
     rows, columns = np.mgrid[-4:5, -4:5]
@@ -281,7 +282,7 @@ def test_the_attitude_error_by_a_steady_acceleration_is_its_integral(
 ) -> None:
     """For a rotation a t^2 / 2, the mean over T is a T^2 / 24.
 
-    The ends are at a T^2 / 8, and the middle of a fitted parabola is zero.
+    The mean of the two ends is a T^2 / 8, and the middle of a fitted parabola is zero.
     """
     acceleration = 0.3
     off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), np.zeros((3, 3)), _EXPOSURE)
@@ -338,7 +339,10 @@ def test_the_kind_of_motion_determines_the_time_weighting() -> None:
 def test_a_distorted_photograph_is_solved_within_its_claim_or_refused(
     name: str, aspect: float, shear: float, tangential: float
 ) -> None:
-    """The truth is the solution of the photograph itself; the distortion leaves the image centre in place."""
+    """The truth is the solution of the original photograph.
+
+    The distortion does not displace the image centre.
+    """
     pixels = read_image(_PHOTOGRAPHS / name)
     rows, columns = pixels.shape
     y, x = np.mgrid[:rows, :columns].astype(float)

@@ -1,4 +1,4 @@
-"""Simulated stars through lenses of which the star tracker only knows the field of view."""
+"""Simulated stars imaged by lenses of which the star tracker knows only the field of view."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def of_the_middle(lens: Lens, attitude: FloatArray) -> FloatArray:
         lens.unit_vectors(middle + np.array([0.0, 1.0]))[0]
         - lens.unit_vectors(middle - np.array([0.0, 1.0]))[0]
     )
-    # The departure of the two image axes from a right angle is divided equally, as in a fit.
+    # The deviation of the two image axes from a right angle is divided equally between them, as in a fit.
     one, other = (side - z * (side @ z) for side in (right, down))
     x = one / np.linalg.norm(one) + np.cross(other / np.linalg.norm(other), z)
     x /= np.linalg.norm(x)

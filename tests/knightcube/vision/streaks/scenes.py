@@ -77,7 +77,7 @@ def taken(
     camera: StarCameraModel = CAMERA,
     faintest: float = 8.5,
 ) -> Scene:
-    """Return a random field for the rate turn + growth t, where `growth` must be parallel to `turn`.
+    """Return a frame of a random field for a rate of turn + growth t, where `growth` is parallel to `turn`.
 
     With a rolling shutter, the motion continues until all rows are read.
     """

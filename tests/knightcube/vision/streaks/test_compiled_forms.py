@@ -47,7 +47,8 @@ _FUNCTIONS = (
     (coupled_stars, "solution", 1e-4),
 )
 _SMALL = replace(CAMERA, columns=300, rows=260)
-# Length (px) and relative change of the rate: crossing streaks, a motion from rest, and streaks without ends.
+# Streak length (px) and relative change of the rate of each frame: crossing streaks, a motion from rest, and
+# streaks without ends.
 _FRAMES = ((60.0, 0.0), (60.0, 1.95), (220.0, 0.0))
 _MOST_CALLS = 30
 

@@ -42,7 +42,7 @@ def _squared(error: FloatArray, covariance: FloatArray) -> float:
     [(0.0, 51.0), (0.0, 205.0), (10.0, 102.0), (45.0, 51.0), (45.0, 205.0), (90.0, 102.0), (90.0, 205.0)],
 )
 def test_the_rate_is_within_what_its_covariance_and_the_bound_allow(theta: float, length: float) -> None:
-    """A chi-square of 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
+    """A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
     scene = real_sky(int(theta) + int(length), np.radians(theta), length, 0.2)
     found = _estimated(scene)
     assert found.status is StreakStatus.RATE
@@ -60,7 +60,7 @@ def test_stars_have_their_true_positions_at_mid_exposure() -> None:
     off = found.stars[found.used] - scene.stars[nearest]
     squares = [_squared(o, c) for o, c in zip(off, found.star_covariance[found.used], strict=True)]
     assert np.median(squares) < 4.0
-    # The faintest of the used stars are accurate to a few tenths of a pixel only.
+    # The faintest of the used stars are accurate only to a few tenths of a pixel.
     assert np.median(np.abs(off[:8])) < 0.1
 
 
@@ -204,7 +204,10 @@ def test_a_rotation_that_reverses_within_the_exposure_is_rejected() -> None:
 
 
 def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
-    """The regions have wrong lengths. A scan along the circles about the rotation axis finds the angle."""
+    """The bright regions have wrong lengths.
+
+    A scan along the circles about the rotation axis finds the angle.
+    """
     scene = real_sky(26, np.radians(75.0), 512.0, 0.2)
     found = _estimated(scene)
     assert found.rate is not None
@@ -317,7 +320,7 @@ def test_the_light_of_the_whole_frame_gives_the_angle_about_an_approximate_axis(
 
 @pytest.mark.parametrize("width", [5, 485, 534])
 def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
-    """A frame with the best box at 534 of 1,081 samples once raised an error."""
+    """A frame whose best box is at 534 of 1,081 samples must not raise an error."""
     widths = sharper_widths(width, 1081 // 2)
     assert width in widths
     assert widths[-1] <= 1081 // 2
@@ -385,7 +388,7 @@ def _assert_right_or_refused(camera: StarCameraModel, scene: Drawn) -> None:
 def test_the_covariance_is_that_of_the_errors() -> None:
     """A chi-square with 36 degrees of freedom lies between 19 and 62 in 99 % of cases.
 
-    The lower limit is halved.
+    The tested lower limit is half of the lower quantile.
     """
     total = 0.0
     for seed in range(12):

@@ -83,14 +83,14 @@ def test_binning_keeps_light_and_saturation() -> None:
     sums, top = Binning.suited(Pinhole(8, 8, 10.0), 2.0).frame(pixels, 1000.0)
     assert sums.shape == (4, 4)
     assert sums[0, 0] == 16 * (0 + 1 + 8 + 9)
-    # The last sum contains a pixel of 1008, and the one before it at most 976.
+    # The last sum contains a pixel of 1008 counts, and the previous sum at most 976.
     assert top == 4 * 1008
     assert (sums >= top).sum() == 1
     assert np.all(sums % 16 == 0)
 
 
 def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> None:
-    """A chi-square of 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
+    """A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
     camera = replace(CAMERA, psf_sigma=3.0)
     scene = real_sky(2, 1.0, 90.0, 0.5, camera)
     settings = LikelihoodSettings(saturation=SATURATION, psf_sigma=3.0)
@@ -117,7 +117,7 @@ def test_the_line_time_of_binned_rows_is_a_multiple_whether_stated_or_not() -> N
     assert binning.settings(stated).line_time_sigma == 0.0
 
 
-# Chi-square with 3 degrees of freedom that one frame in a thousand exceeds by chance.
+# Chi-square with 3 degrees of freedom that one of a thousand frames exceeds by chance.
 _HONEST = 16.3
 
 

@@ -50,7 +50,7 @@ def test_a_motion_of_wrong_length_is_corrected(theta: float, length: float, turn
 
 
 def test_stars_with_one_correct_end_are_moved_between_their_ends() -> None:
-    """The rotation is 4 % too long and the first ends are correct, so that the centres are off by 6 px."""
+    """The rotation is 4 % too large and the first ends are correct, so that the centres are wrong by 6 px."""
     camera, scene, true = _seen(90.0, 300.0, 1.0)
     ahead = positions(camera.pinhole, true, scene.stars, np.full(_STARS, 0.02))
     off = replace(scene, motion=CameraMotion.steady(1.04 * true.rate), stars=ahead)
@@ -66,7 +66,7 @@ _ROOM = 20
 
 
 def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
-    """Return a frame and its brightest stars at their true positions, of which the first are trusted."""
+    """Return a frame and its brightest stars at true positions; the first of them are trusted."""
     sky = real_sky(7, np.radians(theta), length, 1.0)
     frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
@@ -89,7 +89,7 @@ def test_the_number_of_pixels_of_windows_is_predicted(theta: float, length: floa
 
 
 def test_the_brightest_stars_are_fitted_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The result does not depend on the order of the stars, and the rate agrees with its covariance."""
+    """The result does not depend on the stars' order, and the rate error agrees with its covariance."""
     camera, scene = _taken(60.0, 300.0)
     room = float(window_areas(camera.pinhole, scene, camera.settings.reach)[:_ROOM].sum())
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", room * 1.001)

@@ -1,4 +1,4 @@
-"""Tests of the scatter of the stars' equations with randomly drawn noise."""
+"""Tests of the scatter of the stars' normal equations with randomly drawn noise."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ _KEPT = np.array([0, 1, 2, 6])
 
 
 def _drawn(noise: float, blind: bool = False) -> StarEquations:
-    """Return equations of stars with very different fluxes.
+    """Return normal equations of stars with very different fluxes.
 
-    Their scores scatter by `noise` times the noise.
-
-    If `blind`, each star has no information in two random directions.
+    Their right-hand sides scatter by `noise` times the noise. If `blind`, each star has no information in two
+    random directions.
     """
     rng = np.random.default_rng(3)
     change = rng.normal(size=(_STARS, 4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (_STARS, 1, 1))

@@ -43,7 +43,7 @@ def _brute(motion: CameraMotion, star: FloatArray, sigma: float) -> FloatArray:
 def _modelled(
     motion: CameraMotion, star: FloatArray, sigma: float
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return covered pixels, modelled counts, and derivatives (9, ...) by geometry (8) and width."""
+    """Return covered pixels, modelled counts, and derivatives (9, ...) by geometry (8) and PSF width."""
     stars, width = star[None], float(np.sqrt(sigma**2 + 1.0 / 12.0))
     strips = cut_strips(_PINHOLE, motion, stars, np.array([[-0.5, 0.5]]), 5.0 * width)
     images = streak_model.images(_PINHOLE, motion, Shutter(), stars, width, strips).astype(float)
@@ -105,7 +105,7 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
 
 
 def test_strips_extend_beyond_both_ends_for_any_times() -> None:
-    """With a rolling shutter, the times have arbitrary values, but both ends have equally many pixels."""
+    """With a rolling shutter, the times are arbitrary, but both ends have the same number of pixels."""
     motion, star = CameraMotion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
     rng = np.random.default_rng(11)
     for begin, end in np.sort(rng.uniform(-0.55, 0.55, (200, 2)), axis=1):
@@ -132,7 +132,7 @@ def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: fl
         np.minimum(apart, np.hypot(column - x, row - y), out=apart)
     assert times.max() == 1
     assert np.count_nonzero(times[apart <= width - 0.1]) > 0.995 * np.count_nonzero(apart <= width - 0.1)
-    # At 45 deg, a line is longer by the square root of two, and even more oblique lines occur near the ends.
+    # At 45 deg a line is longer by the square root of two; near the ends, lines are even more oblique.
     assert strips.index.shape[2] <= 2.0 * np.sqrt(2.0) * width + 4.0
 
 

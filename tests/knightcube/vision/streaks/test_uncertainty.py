@@ -31,7 +31,7 @@ _TURN = np.array([0.02, 0.03, 0.0])
 
 
 def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[FloatArray, FloatArray]:
-    """Return each star's apparent rotation (n, 3, m), and its information (n, 3, 3) if only ends count."""
+    """Return each star's apparent rotation (n, 3, m), and the information (n, 3, 3) of its ends alone."""
     x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
     stars = np.stack([x.ravel(), y.ravel()], axis=1)
     ones = np.ones(len(stars))
@@ -47,7 +47,7 @@ def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[Floa
 
 
 def _together(seeming: FloatArray, information: FloatArray) -> FloatArray:
-    """Return the apparent rotation (3, m) by all stars together for each calibration error."""
+    """Return the apparent rotation (3, m) of all stars together for each of m calibration errors."""
     return np.asarray(np.linalg.solve(information.sum(axis=0), np.sum(information @ seeming, axis=0)))
 
 
@@ -99,7 +99,7 @@ def test_a_shutter_counts_as_unstated_unless_line_time_or_accuracy_is_given() ->
 
 
 def test_significant_calibration_errors_are_corrected_and_others_widen_the_covariance() -> None:
-    """A distortion of 1 % exceeds the noise by a factor of 100, whereas a chance error is not corrected."""
+    """A distortion of 1 %, a hundred times the noise, is corrected, and a chance error is not."""
     seeming, information = _seeming(replace(EXACT, distortion=0.01))
     precise = 1e4 * information
     score = np.einsum("nij,njk->ni", precise, seeming)
@@ -138,7 +138,7 @@ def test_an_uncertain_camera_widens_the_covariance_and_keeps_the_rate() -> None:
 def test_scatter_of_the_stars_beyond_their_noise_increases_the_rates_covariance(
     measure: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Differences between the stars of five times their noise increase all variances from noise by 25."""
+    """If the stars differ by five times their noise, all variances that come from noise increase 25-fold."""
     scene = real_sky(12, np.radians(70.0), 102.0, 0.2)
     settings = LikelihoodSettings(saturation=SATURATION, knowledge=EXACT)
     sizes = []

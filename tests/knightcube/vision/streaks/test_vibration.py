@@ -62,7 +62,7 @@ def _frame(cycles: float, amplitude: float, seed: int) -> _Frame:
 
 
 def _sigmas(frame: _Frame, found: MotionResult) -> float:
-    """Return the error of the rate in its standard deviations."""
+    """Return the error of the rate in units of its standard deviations."""
     assert found.rate is not None
     assert found.covariance is not None
     error = found.rate - frame.rate
@@ -91,7 +91,7 @@ def test_a_motion_with_a_vibration_has_an_exact_time_reversal() -> None:
 
 @pytest.mark.parametrize(("cycles", "amplitude"), [(1.6, 0.8), (4.3, 0.6)])
 def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitude: float) -> None:
-    """Without the vibration in the model, the frame is refused."""
+    """Without a vibration in its model, the estimator refuses the frame."""
     frame = _frame(cycles, amplitude, 0)
     found = frame.motion()
     assert found.status is StreakStatus.RATE
@@ -101,9 +101,9 @@ def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitu
 
 
 def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() -> None:
-    """The streaks look like those of a slightly wider point spread, but their ends have moved.
+    """The streaks look like those of a slightly wider point spread, but with displaced ends.
 
-    A tolerance of 5 % of the variance of the point spread left the rate of the seed 5 wrong by 5.7 sigma.
+    A tolerance of 5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
     """
     for seed in (2, 5, 6):
         frame = _frame(41.0, 0.45, seed)

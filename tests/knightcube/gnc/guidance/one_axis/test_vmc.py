@@ -376,7 +376,7 @@ def test_an_impossible_price_is_refused(price: float) -> None:
 
 
 def rest_of(problem: Problem, found: StepPlan, share: float) -> tuple[Problem, int]:
-    """Return the path after the fraction `share`, from slightly off it, and the elapsed time (ns)."""
+    """Return the problem after a fraction `share` of a path, slightly off it, and the elapsed time (ns)."""
     elapsed_ns = round(share * found.horizon * 1e9)
     at = found.path.sample(elapsed_ns)
     left = Problem(

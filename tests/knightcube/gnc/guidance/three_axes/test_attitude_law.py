@@ -50,7 +50,7 @@ def test_nadir_along_the_flight_turns_once_an_orbit_about_the_pitch_axis() -> No
 
 
 def test_rate_and_acceleration_carry_the_attitude_on() -> None:
-    """The target is on the ground at 3 km/s and more, where rate and acceleration change all the time."""
+    """The ground target passes at 3 km/s or more, so rate and acceleration change continuously."""
     beneath = celestial_to_terrestrial(JULIAN_DATE) @ ORBIT.position_at(np.array([300.0]))[0]
     longitude, latitude, _ = (float(part) for part in geodetic(beneath))
     law = AttitudeLaw(Z, ground(latitude, longitude), X, velocity)

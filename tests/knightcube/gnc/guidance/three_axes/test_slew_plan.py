@@ -161,7 +161,7 @@ def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
 
 
 def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() -> None:
-    """In body axes that are rotated from the coils, the heat is a full matrix, with the same optimum."""
+    """In axes rotated from the coils' axes, the heat has a full matrix, and the optimum is the same."""
     orbit, heat, inertia = circular(3_000.0), np.array([3.0, 30.0, 12.0]), np.array([0.0066, 0.0333, 0.0300])
     turn = attitude_matrix(from_rotation_vector(np.array([0.5, -0.7, 0.3])))
     order = SlewOrder(

@@ -1,6 +1,6 @@
 """Tests of detection: simulated stars are found, measured to the bound, and distinguished from other points.
 
-Further tests are detection near predicted positions, and the brightest detections of real photographs.
+Further tests concern detection near predicted positions, and the brightest detections in photographs.
 """
 
 from __future__ import annotations
@@ -323,7 +323,7 @@ def test_trailed_stars_are_measured_at_mid_exposure() -> None:
         off = found.points - TRAILED[found.prediction]
         squares += np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance), off).tolist()
         claims += found.sigma.tolist()
-    assert 0.7 < np.median(squares) < 2.3  # median 1.39 for two degrees of freedom
+    assert 0.7 < np.median(squares) < 2.3  # the median of chi-square with two degrees of freedom is 1.39
     assert np.median(claims) < 0.03
 
 

@@ -12,7 +12,7 @@ from knightcube.vision.startracker.detection.psf_fit import cut, light
 PLACES = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.4]])
 WIDTH = 0.9
 SKY = 4.0
-"""Variance of a pixel."""
+"""Variance (counts^2) of each pixel."""
 
 
 def _stars(flux: float) -> FloatArray:
@@ -47,7 +47,8 @@ def test_the_slopes_are_those_of_finite_differences(method: str) -> None:
             changed[:, row, column] += sign * step
             moved.append(METHODS[method](changed, variance, start, WIDTH)[0])
         numeric = (moved[0] - moved[1]) / (2.0 * step)
-        # The parabola's weights are held fixed, although they depend on the pixels in second order.
+        # The derivatives assume constant weights of the parabola, although they depend on the pixels in
+        # second order.
         assert slopes[:, :, row, column] == pytest.approx(numeric, rel=0.15, abs=2e-8)
 
 

@@ -53,7 +53,7 @@ def test_smoothing_spreads_a_point_as_one_two_one_on_both_axes() -> None:
 def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
     photon: float, mismatch: float
 ) -> None:
-    """The residuals have the variance s^2 + p m + q^2 m^2, of which the fit has absorbed a fifth."""
+    """The residuals have the variance s^2 + p m + q^2 m^2, which the fit has reduced by a fifth."""
     draw = np.random.default_rng(1)
     noise = draw.uniform(2.0, 4.0, 300)
     light = draw.uniform(0.0, 1.0, (300, 7, 7)) ** 3 * draw.uniform(50.0, 3000.0, (300, 1, 1))

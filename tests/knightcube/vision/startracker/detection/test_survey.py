@@ -1,4 +1,4 @@
-"""Tests of the steps of the survey against independent computations, and on frames with defects."""
+"""Tests of the steps of the frame survey against independent computations, and on frames with defects."""
 
 from __future__ import annotations
 
