@@ -2,9 +2,9 @@
 
 `make slow-list` measures and writes both lists. A test is slow if all its cases together take more than
 `LIMIT_S` of processor time, fixtures included. `make quick` leaves slow tests out; a listed test that was
-renamed is not slow until the list is made again. Files that last longer than `LONG_S` come first, in falling
-order: then the workers that share the files of `make test` finish at nearly the same time. A file that waits
-for processes or sockets lasts longer than its processor time.
+renamed is not slow until the list is made again. Files that last longer than `LONG_S` come first, in order of
+falling duration, so that the workers of `make test` finish at nearly the same time. The duration of a file
+that waits for processes or sockets exceeds its processor time.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# `python -m flight` sets the same value: OpenBLAS's waiting threads would take a third of the processor time.
-# No test imports numpy before this file is read, and started programs inherit the setting.
+# `python -m flight` sets the same value: otherwise OpenBLAS's waiting threads would take a third of the
+# processor time. No test imports numpy before this file is read, and started programs inherit the setting.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # The tests compare the numpy forms with their requirements, and the compiled forms with the numpy forms:
-# recorded results stay the same bytes, and no started program loads numba.
+# recorded results stay the same byte for byte, and started programs do not load numba.
 os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 
 # No test may fail because the machine is busy, or because hypothesis draws a rare example in one of many
-# runs.
-# Each run has the same examples, so more of them would cost time in each run and find nothing.
+# runs. Each run has the same examples, so more examples would take time in each run without new findings.
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("explore", deadline=None, max_examples=100)
 settings.load_profile("repeatable")

@@ -1,4 +1,4 @@
-"""A clock for tests of parts without a world, which stands still until it is advanced."""
+"""A clock that stands still until a test advances it, for tests without a simulated world."""
 
 from __future__ import annotations
 

@@ -15,11 +15,11 @@ Result = TypeVar("Result")
 _warm: set[str] = set()
 """Names of the calls that this process has made."""
 ORDINARY_PACE_S = 4.5e-4
-"""Processor time of `pace_s` on the two-core machines that the limits are meant for."""
+"""Processor time (s) that `pace_s` returns on the two-core machines for which the limits are meant."""
 
 
 def pace_s() -> float:
-    """Return the processor time of 1,000 additions of short vectors, s."""
+    """Return the processor time (s) of 1,000 additions of short vectors."""
     vector = np.ones(3)
     begun = time.process_time()
     for _ in range(1_000):

@@ -67,7 +67,7 @@ def frames_with_rate(run: Run) -> PacketArray:
 
 
 def coil_currents(bus: RemoteI2cBus) -> list[float]:
-    """Return the currents (A) of the emulated coils, which a busy machine may answer late."""
+    """Return the currents (A) of the emulated coils, also if a busy machine responds late."""
     for _ in range(100):
         with suppress(TimeoutError):
             found: list[float] = bus.call("currents")

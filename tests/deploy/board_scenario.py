@@ -1,4 +1,4 @@
-"""Flights of the boards' configurations in the container: accepted, started by systemd in the unit's sandbox.
+"""Flights of the boards' configurations in the container, accepted and started by systemd in the sandbox.
 
 `tests.deploy.scenario` calls `fly_board` for each configuration, after the steps of the simulated flight.
 """

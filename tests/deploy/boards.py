@@ -1,8 +1,8 @@
 """Files of a board whose releases are built in a second, because its Python makes empty environments.
 
-The installer gets a script as its Python. The script makes virtual environments with itself as Python,
-"installs" by writing one file, and prints its release instead of starting a flight. All other programs, such
-as the installer's own modules, are run by the real Python.
+The installer receives a script instead of its Python. The script makes virtual environments with itself as
+Python, "installs" by writing one file, and prints its release instead of starting a flight. All other
+programs, such as the installer's own modules, are run by the real Python.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class FakeBoard:
         return self.root / "opt/knightcube"
 
     def python(self, label: str) -> Path:
-        """Return a Python whose environments fly as `label`."""
+        """Return a script that acts as a Python whose environments contain the release `label`."""
         home = self.root.parent / f"python-{label}"
         path = home / "bin/python"
         if not path.exists():
@@ -89,7 +89,7 @@ class FakeBoard:
         return done.stdout
 
     def unit_words(self, unit: str, setting: str = "ExecStart") -> list[str]:
-        """Return the command of a unit up to the program of the launcher, on the files of this board."""
+        """Return a unit's command up to the launcher's program, with the file paths of this board."""
         text = (DEPLOY / unit).read_text(encoding="utf-8").replace("\\\n", "")
         (line,) = re.findall(rf"^{setting}=-?(/bin/sh -c '.*)$", text, re.MULTILINE)
         return shlex.split(line.replace("$$", "$").replace("/opt/knightcube", str(self.prefix)))[:4]
@@ -97,8 +97,8 @@ class FakeBoard:
     def fly(self, *program: str) -> tuple[str, str]:
         """Start the flight, and return the label of the started release ("" for none) and the error output.
 
-        The line that reports an ordinary start of the current release is left out. By default, the first copy
-        of the launcher starts the flight; `program` gives another command line, such as a unit's.
+        The error output omits the line that reports an ordinary start of the current release. By default, the
+        first copy of the launcher starts the flight; `program` gives another command line, such as a unit's.
         """
         state = self.root / "state"
         state.mkdir(exist_ok=True)

@@ -22,12 +22,12 @@ from tests.hal.guardian.live_flight import ROOT, write_config
 LIMIT_S = 1500.0
 """Longest time (s) of a scenario in the container, on a busy machine."""
 SERVICES, RENEWALS = "tests.deploy.scenario", "tests.deploy.renewal_scenario"
-"""Modules of the scenarios: faults of the services, and renewals by the ground over the link."""
+"""Modules of the scenarios: faults of the services, and updates by the ground over the link."""
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"
 COMMANDS = "/run/knightcube/commands"
-"""Where the service listens."""
+"""Path of the socket on which the service receives commands."""
 LINK, KEYS = "127.0.0.1:5010", "/var/lib/knightcube-link/keys"
 """Address of the link, and its keys on board, of the scenario `RENEWALS`."""
 
@@ -35,7 +35,7 @@ _OPENED = f"""[Service]
 ProtectHome=no
 ReadWritePaths={_SHARE}/result.txt
 Environment=PATH={_SHARE}/bin:/usr/bin PYTHONPATH={ROOT}"""
-"""What the sandbox must let through here: an interpreter in a home, and the stand-in for i2cset."""
+"""Paths that the sandbox must permit here: an interpreter in a home folder, and the test double of i2cset."""
 
 _HIDDEN = tuple(map(Path, ("/tmp", "/run", "/mnt", "/dev", "/proc", "/sys")))
 """Folders where the container has its own mounts, which hide the machine's files."""
@@ -84,7 +84,7 @@ def _mounted() -> list[Path]:
 
 
 def boot(folder: Path, scenario: str = SERVICES) -> dict[str, Any]:
-    """Boot, run a scenario and return its observations. Raises AssertionError with the log."""
+    """Boot, run a scenario and return its observations. Raises AssertionError with the log on a failure."""
     words = ["unshare", "--mount", "--propagation", "private", sys.executable, "-m", "tests.deploy.container"]
     done = subprocess.run(
         [*words, str(folder), scenario],
@@ -104,7 +104,7 @@ def boot(folder: Path, scenario: str = SERVICES) -> dict[str, Any]:
 
 
 def main(folder: Path, scenario: str) -> None:
-    """Build the machine, boot it, leave nothing."""
+    """Build and boot the machine, and remove everything afterwards."""
     root = _overlay()
     _furnish(root, folder, scenario)
     home = _enter_cgroup()
@@ -133,7 +133,7 @@ def main(folder: Path, scenario: str) -> None:
         )
     finally:
         _leave_cgroup(home)
-    (root / _UNITS / "knightcube-devices.service").unlink()  # the test's own
+    (root / _UNITS / "knightcube-devices.service").unlink()  # this unit belongs to the test
     _do("chroot", str(root), str(ROOT / "deploy/install.sh"), "--uninstall", "--purge")
     kept = subprocess.run(
         [
@@ -172,7 +172,7 @@ def _overlay() -> Path:
 
 
 def _furnish(root: Path, folder: Path, scenario: str) -> None:
-    """Install the service as anybody would, and put the emulated devices and the scenario beside it."""
+    """Install the service as a user would, and add the emulated devices and the scenario."""
     (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", encoding="ascii")
     config = write_config(folder)
     with config.open("a", encoding="utf-8") as file:
@@ -181,7 +181,7 @@ def _furnish(root: Path, folder: Path, scenario: str) -> None:
             file.write(f"link: {{keys: {KEYS}, spacecraft: 0x1A5, udp: {LINK}, rate: 100000}}\n")
     installer = ["chroot", str(root), str(ROOT / "deploy/install.sh")]
     options = ["--config", str(config)]
-    if scenario == RENEWALS:  # a release can be renewed from its own packages only
+    if scenario == RENEWALS:  # a release can only be updated from its own packages
         options += ["--python", f"{sys.base_prefix}/bin/python3"]
         _make_keys(root, folder)
     else:
@@ -241,7 +241,7 @@ ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl -
 
 
 def _make_keys(root: Path, folder: Path) -> None:
-    """Make the keys of the link and of the renewals, and give the board its halves."""
+    """Make the keys of the link and of the updates, and copy the board's part of them to the board."""
     for words in (["keys", "keys"], ["renewal", "keys", "signing"]):
         subprocess.run(
             [sys.executable, "-m", "flight", *words], cwd=folder, check=True, stdout=subprocess.DEVNULL
@@ -287,7 +287,7 @@ with open("/share/result.txt", "a") as result:
 
 
 def _enter_cgroup() -> Path:
-    """Move into a cgroup of our own, in a pure cgroup2 hierarchy as systemd wants it; return the old one."""
+    """Move into a new cgroup, in the pure cgroup2 hierarchy that systemd needs; return the former one."""
     _do("umount", "--recursive", "/sys/fs/cgroup")
     _do("mount", "-t", "cgroup2", "cgroup2", "/sys/fs/cgroup")
     before = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()

@@ -4,7 +4,7 @@
 the section `simulation` of WORLD describes. The device files of serial devices in CONFIG become links to
 pseudo-terminals. With the printed environment, programs open the I2C bus by its device file, by the preload
 library of `sim_hal emulate i2c`. Frames come through `tests.deploy.emulated_video`. The true state is logged
-in FOLDER. The program prints one JSON object when the devices answer, and ends at SIGTERM.
+in FOLDER. The program prints one JSON object when the devices respond, and ends at SIGTERM.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def serve(path: Path, world: Path, folder: Path) -> None:
     bus = I2cServer(server.hardware.wires.i2c(), bus_socket)
     try:
         for name, line in server.lines.items():
-            Path(name).resolve().symlink_to(line)  # it may be a link
+            Path(name).resolve().symlink_to(line)  # the device file may itself be a link
         server.attend(bus.fileno(), partial(bus.serve, 0.0))
         facts: dict[str, Any] = {
             "socket": str(server.socket_path),

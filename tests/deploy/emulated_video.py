@@ -2,8 +2,8 @@
 
 `python -m tests.deploy.emulated_video CONFIG SOCKET WORDS... [-- WORDS...]` runs `knightcube WORDS...`, and
 after a success the next command. The cameras of CONFIG are those of the device server at SOCKET, numbered in
-the order of CONFIG. Only the kernel's side of /dev/videoN is replaced, which answers the ioctls of the
-driver; the memory maps of the driver are real.
+the order of CONFIG. Only the kernel's side of /dev/videoN, which performs the driver's ioctls, is replaced;
+the memory maps of the driver are real.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STAR_INTERVAL_NS, WIDE_INTERVAL_NS = 500_000_000, 1_000_000_000
 Each frame is rendered, even if the driver selects a later frame.
 """
 PATIENCE_NS = 3_000_000_000
-"""Time (ns) after an exposure at which a frame that has not arrived is given up."""
+"""Time (ns) after an exposure at which a frame that has not arrived counts as lost."""
 
 
 class ServedVideo(IoctlCamera):

@@ -1,4 +1,4 @@
-"""Renewals of a board over the link, under systemd; `tests.deploy.container` runs the module."""
+"""Updates of a board over the link, under systemd; `tests.deploy.container` runs this module."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VERSION = re.compile(r'(?m)^version = "(\d+\.\d+)\.(\d+)"')
 
 
 class Ground:
-    """The ground: its keys, the address of the link, and the commands of the pages."""
+    """The ground station: its keys, the address of the link, and the commands of the documentation."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -48,7 +48,7 @@ class Ground:
         return self.run(*command.split(), *self._satellite, *words)
 
     def renew(self, kind: str, artefact: Path, version: int) -> dict[str, Any]:
-        """Sign, send up, activate and confirm an artefact; return exit statuses, outputs and the time, s."""
+        """Sign, uplink, activate and confirm an artefact; return exit statuses, outputs and the time (s)."""
         begun = time.monotonic()
         bundle = f"{kind}-{version}.renewal"
         steps = {
@@ -100,12 +100,12 @@ def sources(folder: Path, step: int) -> Path:
 
 
 def play(folder: Path, facts: Path) -> dict[str, Any]:
-    """Renew configuration and release of a flying board, and return the observations."""
+    """Update configuration and release of a board in flight, and return the observations."""
     systemctl("start", "knightcube-devices.service")
     wait(facts.exists, 20.0)
     systemctl("start", SERVICE, LINK_SERVICE, "knightcube-renewal.timer")
     wait(_are_up, 60.0)
-    wait(STATUS.exists, 60.0)  # the link refuses renewals until the privileged part has run once
+    wait(STATUS.exists, 60.0)  # the link refuses updates until the privileged program has run once
     ground = Ground(folder)
     seen: dict[str, Any] = {
         "first": flown_release(),

@@ -1,4 +1,4 @@
-"""A board with the privileged part of the renewal, signing keys, bundles and services that are files."""
+"""A board with the privileged update program, signing keys, bundles, and files that represent services."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class _Board(_SCRIPT_BOARD):  # type: ignore[misc]  # the script is imported wit
 class RenewedBoard:
     """A board with the release `old`, and the ground that signs for it.
 
-    The root part of the renewal runs in this process, because most of the time of a process would be imports.
-    With `processes` it runs as on a board.
+    The privileged program runs in this process, because a separate process would spend most of its time on
+    imports. With `processes` it runs as on a board.
     """
 
     processes = False
@@ -109,7 +109,7 @@ class RenewedBoard:
         path.touch() if active else path.unlink(missing_ok=True)
 
     def environment(self) -> dict[str, str]:
-        """Return the environment of the root part."""
+        """Return the environment of the privileged program."""
         path = f"{self.place / 'bin'}:{os.environ['PATH']}"
         return {**os.environ, "PATH": path, "BOARD": str(self.place)}
 
@@ -124,7 +124,7 @@ class RenewedBoard:
         return self.run()
 
     def run(self, *options: str) -> str:
-        """Run the root part with options; return its complaints."""
+        """Run the privileged program with options; return its error messages."""
         words = [*self.words(), *options]
         if self.processes:
             done = subprocess.run(words, env=self.environment(), capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""A renewed board, its link and its ground in one process, with services that start as on a board."""
+"""An updated board, its link and its ground in one process, with services that start as on a board."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def linked_text() -> str:
 
 
 class RenewedEnds(FiledEnds):
-    """Satellite and ground.
+    """A satellite that can be updated, and its ground.
 
     Attributes:
         board: files of the satellite.

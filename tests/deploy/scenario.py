@@ -46,7 +46,7 @@ class Service:
         raise TimeoutError("the emulated devices do not answer")
 
     def hurt(self, act: Callable[[int], None]) -> dict[str, Any]:
-        """Disturb the running service, and return the times of zero current and of the next start."""
+        """Disturb the running service, and return the times to zero current and to the next start."""
         wait(self.driven, 20.0)
         old = self.pid()
         begun = time.monotonic()
@@ -125,7 +125,7 @@ def _flight(*words: str) -> str:
 
 
 def _renewal(service: Service) -> dict[str, Any]:
-    """Return whether the privileged part of the renewal runs in its sandbox, and restarts the flight."""
+    """Return whether the privileged update program runs in its sandbox, and restarts the flight."""
     own, unit, old = Path("/var/lib/knightcube-renewal"), "knightcube-renewal.service", service.pid()
     systemctl("start", unit)
     before = service.pid() == old
@@ -143,7 +143,10 @@ def _renewal(service: Service) -> dict[str, Any]:
 
 
 def _damaged(service: Service) -> dict[str, Any]:
-    """Flip one bit of the configuration, with no copy of one that flew: it waits until the file is whole."""
+    """Flip one bit of the configuration without an accepted copy.
+
+    The service waits until the file is intact.
+    """
     systemctl("reset-failed", SERVICE)
     shutil.rmtree("/var/lib/knightcube/flown", ignore_errors=True)
     config = Path("/etc/knightcube/flight.yaml")
@@ -195,7 +198,7 @@ def _broken(service: Service) -> dict[str, Any]:
 
 
 def void(_: object) -> None:
-    """Return nothing."""
+    """Do nothing."""
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ class Board:
     def install(self) -> None:
         """Install with the dependencies of the interpreter that runs the tests."""
         python = self.folder / "python"
-        # A line in a .pth file adds the folder, but not the folders of its own .pth files, such as this
+        # A line in a .pth file adds a folder, but not the folders of .pth files within it, such as this
         # checkout.
         python.write_text(
             f"""#!/bin/sh

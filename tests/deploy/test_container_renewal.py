@@ -1,4 +1,4 @@
-"""A board under systemd is renewed by the ground's commands over the link, with a real release."""
+"""Tests that the ground updates a board under systemd over the link, with a real release."""
 
 from __future__ import annotations
 

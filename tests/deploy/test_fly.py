@@ -81,7 +81,7 @@ def _text(content: str) -> Callable[[Path], None]:
 
 
 def void(_: object) -> None:
-    """Return nothing."""
+    """Do nothing."""
 
 
 CHOOSERS: dict[str, Callable[[Path], None]] = {
@@ -202,7 +202,7 @@ def test_a_release_that_cannot_start_gives_way_to_the_other(
 
 
 def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
-    """Starts of an accepted release are not counted."""
+    """Starts of an accepted release are not counted, but a failed start must also lead to another release."""
     (board.root / "state" / TRIALS).write_bytes(starts_record({}, SECOND))
     PYTHONS["cannot import the flight"](_python(board, "current"))
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4

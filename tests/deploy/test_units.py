@@ -28,7 +28,7 @@ from tests.support.flights import CONFIG
 
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"
-"""In addition to the network, a line that is built in or not plugged in."""
+"""Link sections: in addition to the network, a serial line that is built in or not plugged in."""
 CAMERA = "{device: {driver: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
@@ -146,7 +146,7 @@ def test_the_watchdog_leaves_room_for_four_meals() -> None:
 
 
 def test_the_link_is_watched_restarted_and_does_not_wait_for_the_flight() -> None:
-    """A flight that waits at its start is not active, so that a link ordered after it would not start."""
+    """A flight that waits at its start is not active, so a link that is ordered after it would not start."""
     text = (DEPLOY / "knightcube-link.service").read_text(encoding="utf-8")
     for line in ("Type=notify", "NotifyAccess=main", "Restart=always"):
         assert f"{line}\n" in text
@@ -255,7 +255,7 @@ def test_the_coils_bus_may_have_a_lasting_name_everywhere(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("bus", ["-1", "knightcube-i2c", "/dev/a b", "/dev/100%", "true", "1.5", "'1'"])
 def test_a_bus_that_is_neither_number_nor_path_is_refused(tmp_path: Path, bus: str) -> None:
-    """A path goes into units and into a note of ASCII words: one with blanks or % would be read otherwise."""
+    """A path is written into units and into a note of ASCII words, where blanks or % have other meanings."""
     with pytest.raises(ConfigError, match=r"`coils\.bus`"):
         dropin(changed_testbed(tmp_path, coils_bus=bus))
 

@@ -29,7 +29,7 @@ class Block:
 
     @property
     def commands(self) -> list[str]:
-        """Commands without prompts, comments and continuations; empty for a block of another language."""
+        """Commands of a block, without prompts, comments and continuations; empty for another language."""
         if self.language not in {"sh", "console"}:
             return []
         lines = self.text.replace("\\\n", " ").splitlines()

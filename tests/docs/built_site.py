@@ -95,7 +95,7 @@ def _served(site: Path) -> Iterator[str]:
 
 
 def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> list[str]:
-    """Return a line for each search whose first result is not the right page. Needs Chromium.
+    """Return a line for each search whose first result is not the expected page. Needs Chromium.
 
     All words are searched on a page that is opened as a file, and the first three on a page from a server.
     """
@@ -110,7 +110,7 @@ def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> 
                 page.click(".md-search__input")
                 # All words are entered at once. Otherwise the results of the first letters would remain.
                 page.fill(".md-search__input", words)
-                page.keyboard.press("End")  # the page reads the words when a key is released
+                page.keyboard.press("End")  # the page reads the search words when a key is released
                 page.wait_for_selector(item)
                 first = str(page.get_attribute(item, "href")).partition("?")[0]
                 if not first.endswith(f"/{right}"):

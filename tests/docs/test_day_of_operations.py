@@ -27,7 +27,7 @@ ENVIRONMENT = {
 }
 READY_S = 100.0
 FIXES_S = 45.0
-"""Mission time (s) after which the log has enough fixes for elements; a person takes longer to get there."""
+"""Mission time (s) after which the log has enough fixes for elements; a reader reaches this step later."""
 
 
 @contextlib.contextmanager

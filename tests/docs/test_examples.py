@@ -53,7 +53,7 @@ def files_of(name: str) -> list[str]:
 
 @cache
 def printed_by(script: str) -> str:
-    """Return what an example that needs no other tree prints."""
+    """Return the output of an example that needs no other tree."""
     return run([str(EXAMPLES / f"{script}.py")], ROOT).stdout
 
 
@@ -63,7 +63,7 @@ def test_an_extension_changes_few_files(name: str, most: int) -> None:
 
 
 def test_the_star_tracker_solves_the_image_of_its_example() -> None:
-    """Alnilam, HIP 26311, V 1.69, is near the centre of the field that the script renders."""
+    """The star Alnilam (HIP 26311, V 1.69) is near the centre of the field that the script renders."""
     script = str(EXAMPLES / "star_tracker.py")
     printed = run([script], ROOT).stdout.splitlines()
     assert printed[0] == "right ascension  84.050 deg"
@@ -148,7 +148,7 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> None:
-    """Feedback alone leaves the angle by which the thread deflects the body: k theta / (J w^2)."""
+    """With feedback alone, the thread deflects the body by the angle k theta / (J w^2)."""
     printed = run([str(EXAMPLES / "pointing_body.py")], ROOT).stdout
     found = re.search(r"pointing error ([\d.]+) deg", printed)
     assert found is not None

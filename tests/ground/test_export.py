@@ -119,7 +119,7 @@ def test_readers_of_other_authors_need_no_options(
     voltage = [math.nan if value is None else value for value in column("housekeeping", "coil_voltage")]
     np.testing.assert_array_equal(voltage, [5.0, math.nan, math.nan])
     assert column("run", "config_name") == ["é"]
-    if form == "parquet":  # pyarrow reads integers of 64 bits without a sign in CSV files as floating numbers
+    if form == "parquet":  # pyarrow reads unsigned 64-bit integers in CSV files as floating-point numbers
         assert column("run", "seed") == [2**64 - 1]
 
 

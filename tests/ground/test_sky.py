@@ -14,7 +14,8 @@ from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.startracker.sky_map import Pointing, SkyMap
 from tests.support.scenes import catalogue
 
-# Julian date TT of the great conjunction, 2020 December 21, 18:20 UTC: 6.1' apart, by the almanacs.
+# Julian date TT of the great conjunction, 2020 December 21, 18:20 UTC, with a separation of 6.1' by the
+# almanacs.
 _CONJUNCTION = 2_459_205.264
 # The total eclipse of 2024 April 8 is greatest at 18:17 UTC, with a gamma of 0.3431 Earth radii.
 _ECLIPSE = 2_460_409.263
@@ -51,7 +52,7 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")
 wcs = pytest.importorskip("astropy.wcs", reason="astropy is of the extra `test`")
 
-# A FITS header without an image, as some solvers write it.
+# The warning is for a FITS header without an image, as some solvers write it.
 pytestmark = pytest.mark.filterwarnings("ignore:The WCS transformation has more axes")
 
 _LENS = Lens(1280, 960, 4000.0, (655.0, 470.0), k1=-0.3, k2=0.4)
@@ -99,7 +100,7 @@ def test_a_lens_told_without_its_distortion_is_noticed() -> None:
 
 @pytest.mark.parametrize(("mirrored", "reversed_rows"), [(True, False), (False, True), (True, True)])
 def test_the_header_is_of_the_pixels_of_the_file(mirrored: bool, reversed_rows: bool) -> None:
-    """The CD matrix of a mirrored image has a determinant of the opposite sign."""
+    """For a mirrored image, the determinant of the CD matrix has the opposite sign."""
     plain = _sky(2)
     radec, place = _stars(plain)
     if mirrored:

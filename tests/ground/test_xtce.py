@@ -54,7 +54,8 @@ XML_SCHEMA = (
     '<schema xmlns="http://www.w3.org/2001/XMLSchema" targetNamespace="http://www.w3.org/XML/1998/namespace">'
     '<attribute name="base" type="anyURI"/></schema>'
 )
-"""The only declaration of the schema `xml.xsd` that XTCE needs. The original schema is on a web server."""
+"""Replacement of the schema `xml.xsd` with the only declaration that XTCE needs; the original is on a web
+server."""
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,7 @@ def test_each_form_of_point_takes_degrees_and_is_the_command_in_words(
 
 
 def test_the_states_of_the_table_are_those_of_the_code() -> None:
-    """Names of states that the link cannot import, because the loop and the bodies define them."""
+    """The test covers state names that the link cannot import, because loop and bodies define them."""
     assert tuple((int(state), state.name.lower()) for state in SteeringState) == definitions.STEERING
     streams = tuple((int(state), state.name.lower().replace("_", "-")) for state in StreamState)
     assert streams == definitions.STREAMS

@@ -54,7 +54,7 @@ def test_it_weighs_nothing_and_its_noise_is_the_data_sheets() -> None:
 
 def test_its_attitude_has_no_meaning_in_orbit_and_a_meaning_on_the_thread() -> None:
     def errors(world: str) -> FloatArray:
-        """Return the rotations (n, 4) from the body's to the IMU's attitude."""
+        """Return the rotations (n, 4) from the body's attitude to the attitude that the IMU measures."""
         pairs = zip(*measured(ImuNoise(), 20.0, world), strict=True)
         more = [quaternion.multiply(quaternion.conjugate(t.quaternion), m.quaternion) for m, t in pairs]
         return np.array(more)

@@ -21,7 +21,7 @@ EXPOSURE_NS, READOUT_NS, SCAN_NS = 100 * MS, 50 * MS, 20 * MS
 
 
 class Bench:
-    """A camera on a manual clock. Frame n has the value n in its first row and 10 n below."""
+    """A camera on a manual clock. Frame n has the value n in its first row, and 10 n in all other rows."""
 
     def __init__(self) -> None:
         self.now_ns = 1000 * MS
@@ -51,7 +51,7 @@ class Bench:
         return self.camera.poll()
 
     def wait(self, span_ns: int) -> None:
-        """Let time pass."""
+        """Advance the clock."""
         self.now_ns += span_ns
         self.camera.advance(self.now_ns)
 

@@ -87,7 +87,7 @@ def test_utc_is_the_label_of_the_start_plus_the_time_since() -> None:
 
 @pytest.mark.parametrize("clock", [SimClock(), SystemClock()])
 def test_a_job_that_raises_is_kept_as_an_error_and_runs_again(clock: SimClock | SystemClock) -> None:
-    """If a thread ended by an exception, its device, such as the coils, would keep its last state."""
+    """If a job's exception ended its thread, the device, such as the coils, would keep its last state."""
     runs = list[int]()
 
     def job() -> None:

@@ -28,7 +28,7 @@ PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
         ((0, 1024), FULL_OFF, FULL / 4),
         ((0, 2048), (1024, 3072), 0.0),  # states of the bridge: driven +, braking, driven -
         ((0, 2048), (0, 1024), FULL / 4),  # both inputs high: braking
-        ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # across the period's end
+        ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # a pulse across the end of the period
     ],
 )
 def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current: float) -> None:
@@ -39,7 +39,7 @@ def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current
 
 
 def test_the_uncertainty_is_uniform_within_its_bound_and_drawn_at_each_command() -> None:
-    """Mean 0, standard deviation 3.5e-3/sqrt(3); 2000 draws leave 2.3 % (5 sigma 8 %) on the deviation."""
+    """The standard deviation is 3.5e-3/sqrt(3), which 2000 draws give to 2.3 % (5 sigma: 8 %)."""
     rig = Rig(uncertainty=3.5e-3)
     rig.coils.start()
     errors = []
@@ -123,7 +123,7 @@ def test_a_sleeping_or_browned_out_chip_carries_no_current() -> None:
 def test_the_chopped_charge_agrees_with_sampling_the_bridge(
     a: tuple[int, int], b: tuple[int, int], begin: int, span: int
 ) -> None:
-    """Sampled in the middle of 20,000 slices; each edge of a period may miss by one slice."""
+    """The reference samples the middle of 20,000 slices; each edge may be wrong by one slice."""
     period = 20_000_000.0
     chopping = Chopping(0, 0, period, ((Bridge(a, b), 0.148),))
     count = 20_000
@@ -153,7 +153,7 @@ def test_the_supply_is_chopped_and_its_mean_over_whole_periods_is_the_sum_of_mag
 
 
 def test_a_single_conversion_of_the_chopped_current_is_off_by_up_to_18_percent() -> None:
-    """68.1 ms are 3.4 periods: 4 of 20 ms at most where the mean has 3.4 (`hal.drivers.ina219`)."""
+    """A conversion of 68.1 ms includes up to 4 pulses, and 3.4 on average (`hal.drivers.ina219`)."""
     rig = Rig()
     rig.coils.start()
     rig.command(0.05, 0.0, 0.0)

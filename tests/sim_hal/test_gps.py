@@ -32,7 +32,7 @@ def test_the_walk_of_the_position_keeps_its_size_and_is_correlated_over_its_time
     off = []
     for second in range(1, 501):
         wrong, right = (one.gps._measure(second * SECOND_NS) for one in (wandering, exact))
-        off.append((wrong.height - right.height) * 1e-3)  # m
+        off.append((wrong.height - right.height) * 1e-3)  # height error, m
     walk = np.array(off)
     correlation = float(walk[1:] @ walk[:-1] / (walk @ walk))
     assert correlation == pytest.approx(math.exp(-1.0 / walk_time), abs=0.12)

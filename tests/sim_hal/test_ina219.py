@@ -40,7 +40,7 @@ def test_power_on_values() -> None:
 
 
 def test_the_worked_example_of_the_data_sheet() -> None:
-    """SBOS448 table "Configure/Measure/Calculate": 10 A in 2 mohm at 11.98 V, LSB 1 mA, 20 mW."""
+    """The example (SBOS448) has 10 A in 2 mohm at 11.98 V, with LSBs of 1 mA and 20 mW."""
     part = Part(11.98, 10.0, 0.002)
     part.write(0x00, 0x019F)
     part.write(0x05, 0x5000)
@@ -49,7 +49,7 @@ def test_the_worked_example_of_the_data_sheet() -> None:
     assert part.read(0x02) == 0x5D98 | 0b10  # the table of the data sheet omits the ready bit
     assert part.read(0x04) == 0x2710
     assert part.read(0x03) == 0x1766
-    assert part.read(0x02) == 0x5D98  # reading Power has cleared it
+    assert part.read(0x02) == 0x5D98  # reading the Power register has cleared the ready bit
 
 
 def test_current_and_power_are_zero_while_calibration_is_void() -> None:
@@ -145,7 +145,7 @@ def steps(volts: float, amps: float, config: int, shunt_ohm: float = 0.1) -> tup
 
 @pytest.mark.parametrize(("bits", "step"), [(0, 8), (1, 4), (2, 2), (3, 1)])
 def test_shunt_and_bus_have_the_resolution_of_their_own_code(bits: int, step: int) -> None:
-    """SBOS448 Table 5: 9, 10, 11 and 12 bits; BADC is bits 7 to 10, SADC bits 3 to 6."""
+    """By SBOS448 Table 5, codes give 9 to 12 bits; BADC is bits 7 to 10, SADC bits 3 to 6."""
     volts, amps = 1003 * 4e-3, 1003 * 10e-6 / 0.1
     coarse = round(1003 / step) * step
     assert steps(volts, amps, 0x3800 | bits << 7 | 0b0011 << 3 | 0b111) == (1003, coarse)
@@ -162,7 +162,7 @@ def test_averaged_conversions_have_12_bits() -> None:
     (0x399F, 33.0, 8000), (0x199F, -1.0, 0),
 ])  # fmt: skip
 def test_the_bus_range_is_16_or_32_v(config: int, volts: float, word: int) -> None:
-    """SBOS448 bit 13, BRNG: full scale 16 V or 32 V in steps of 4 mV."""
+    """Bit 13 (BRNG, SBOS448) selects a full scale of 16 V or 32 V, in steps of 4 mV."""
     assert steps(volts, 0.0, config)[1] == word
 
 
@@ -170,7 +170,7 @@ def test_the_bus_range_is_16_or_32_v(config: int, volts: float, word: int) -> No
     ("mode", "spent_ns"), [(0b101, 276_000), (0b110, 8_510_000), (0b111, 276_000 + 8_510_000)]
 )
 def test_a_cycle_converts_what_the_mode_names(mode: int, spent_ns: int) -> None:
-    """Shunt with code 2, 276 us, and bus with code 12, 8.51 ms; the other register keeps its content."""
+    """The shunt has code 2 (276 us), the bus code 12 (8.51 ms); the other register keeps its content."""
     part = Part(4.0, 0.1, 0.1)
     part.write(0x00, 0x1800 | 12 << 7 | 2 << 3 | mode)
     part.clock.advance(spent_ns - 1)
@@ -213,7 +213,7 @@ def test_a_read_beyond_the_word_gives_the_level_of_the_idle_bus() -> None:
 
 
 def test_a_negative_current_is_shown_in_current_and_as_a_positive_power() -> None:
-    """Current is 2's complement: -0.1 A in 0.1 ohm is -1000 steps; calibration 4096 keeps the number."""
+    """Current is in two's complement: -0.1 A in 0.1 ohm is -1000 steps, also with calibration 4096."""
     part = Part(4.0, -0.1, 0.1)
     part.write(0x05, 0x1000)
     part.clock.advance(CYCLE)

@@ -84,7 +84,7 @@ def test_the_strings_are_read_over_the_coils_bus(lock: LockStep) -> None:
         lock.clock.sleep_until_ns(2 * SECOND_NS)
         reading = strings.latest()
         assert reading is not None
-        assert reading.currents.max() > 0.25  # one of six faces is within 55 deg of the Sun
+        assert reading.currents.max() > 0.25  # one of six faces is always within 55 deg of the Sun
         assert strings.error() == ""
 
 
@@ -238,7 +238,7 @@ def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironm
 PINHOLE = Pinhole.from_field_of_view(200, 200, math.radians(20.0))
 ABOVE = np.array([1.0, 0.0, 0.0])
 SIDES = np.array([0.0, -1.0, 0.0])
-"""The Sun is above the side of the Earth that the camera does not see."""
+"""Sun direction above the side of the Earth that is not visible to the camera."""
 
 
 @pytest.mark.parametrize(
@@ -310,7 +310,7 @@ def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
 def test_a_slow_start_shifts_no_device_in_time() -> None:
     """In real time the clock advances while the devices are built.
 
-    In this test by half a second per reading.
+    In this test it advances by half a second per reading.
     """
     clock = itertools.count(10 * SECOND_NS, SECOND_NS // 2)
     wires = EmulatedWires(clock.__next__, 1, orbit_config().coils.bus)

@@ -104,7 +104,7 @@ def test_all_led_registers_write_all_channels(bench: Bench) -> None:
     [
         (0x0000, 0x1000, 0.0),  # full OFF
         (0x1000, 0x0000, 1.0),  # full ON
-        (0x1000, 0x1000, 0.0),  # full OFF wins
+        (0x1000, 0x1000, 0.0),  # full OFF has precedence over full ON
         (409, 1228, 819 / 4096),  # data sheet example 1: 10 % delay, 20 % duty
         # data sheet example 2: 90 % delay, 90 % duty, beyond the end of the period
         (3685, 3275, 3686 / 4096),

@@ -10,6 +10,6 @@ from tests.support.section_defaults import defaults_of
 
 
 def test_the_defaults_are_the_published_ones() -> None:
-    """A simulation without these keys uses them, so a change changes the interface."""
+    """A simulation without these keys uses the defaults, so a changed default changes the interface."""
     published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
     assert json.loads(json.dumps(defaults_of(settings))) == published

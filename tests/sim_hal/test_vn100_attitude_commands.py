@@ -22,7 +22,7 @@ def angles(bench: Bench, register: int = 8) -> list[float]:
 
 
 def command(bench: Bench, *words: object) -> tuple[str, ...]:
-    """Send a command; return the answer's fields, the command first."""
+    """Send a command; return the fields of the response, with the command first."""
     (answer,) = bench.exchange(build(*map(str, words)))
     return answer.command, *answer.fields
 
@@ -38,7 +38,7 @@ def command(bench: Bench, *words: object) -> tuple[str, ...]:
     ],
 )
 def test_factory_settings_of_the_filters_registers(register: int, default: str) -> None:
-    """Names, lengths and defaults: VectorNav UM001 and the classes of its SDK."""
+    """Names, lengths and defaults are those of VectorNav UM001 and of the SDK's classes."""
     bench = Bench().quiet()
     assert command(bench, "RRG", register) == ("RRG", str(register), *default.split(","))
 
@@ -61,7 +61,7 @@ def test_what_is_written_is_echoed_kept_and_saved(register: int) -> None:
 
 @pytest.mark.parametrize("register", [239, 240])
 def test_linear_acceleration_has_its_registers_in_body_and_ned_axes(register: int) -> None:
-    """At rest it is zero; formats of UM001's example: degrees, m/s^2 and rad/s with 3, 3 and 6 decimals."""
+    """At rest it is zero; as in UM001's example, degrees, m/s^2 and rad/s have 3, 3 and 6 decimals."""
     bench = Bench().quiet()
     (answer,) = bench.exchange(build("RRG", register))
     assert len(answer.fields) == 1 + 9

@@ -86,7 +86,7 @@ LARGEST: dict[int, tuple[tuple[int, ...], ...]] = {
     82: ((0, 1), (0, 2), (0, 1), (0, 1), (0, 1)),
     85: ((0, 25),) * 5 + ((0, 3),) * 5,
 }
-"""Smallest and largest value of each field, as far as the range reaches without a gap."""
+"""Smallest and largest value of each field, up to the first gap in the valid range."""
 
 
 @pytest.mark.parametrize(

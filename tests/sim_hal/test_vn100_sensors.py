@@ -120,7 +120,7 @@ def test_an_ascii_output_has_the_values_of_the_manual(header: str) -> None:
 def test_a_sentence_has_the_length_that_its_formats_give(header: str, length: int) -> None:
     """`$VNxxx` has 6 bytes, `*XX` and the line end 5; a value has its width and a comma.
 
-    Widths: angles 8, quaternion 9, field 8, acceleration 7, rate 10.
+    The widths are 8 (angles, field), 9 (quaternion), 7 (acceleration) and 10 (rate).
     """
     (output,) = (output for output in REPORTS if output.header == header)
     assert output.length() == length
@@ -179,7 +179,7 @@ def test_a_binary_field_has_the_quantity_of_its_name(key: tuple[int, int]) -> No
 
 
 def test_the_profiles_have_the_figures_of_thesis_and_data_sheet() -> None:
-    """0.0035 deg/s, 140 uG and 0.14 mg per sqrt(Hz); 0.5, 0.5 and 2 deg rms."""
+    """The noise is 0.0035 deg/s, 140 uG and 0.14 mg per sqrt(Hz); angle errors are 0.5, 0.5 and 2 deg rms."""
     thesis, sheet, none = PROFILES["thesis"], PROFILES["datasheet"], PROFILES["none"]
     assert (thesis.attitude_bound, thesis.rate_bound) == (1.75e-3, 1.75e-4)
     assert (sheet.attitude_bound, sheet.rate_bound, thesis.rate_density, thesis.gyro_bias) == (0, 0, 0, 0)

@@ -1,4 +1,4 @@
-"""Tests of parts of the flight service with test doubles: signals, release, garbage and supervision."""
+"""Tests of parts of the flight service with test doubles: signals, release, memory and supervision."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def test_every_directive_has_its_published_packet() -> None:
 
 
 def test_a_command_begins_with_version_0_type_1_and_its_apid() -> None:
-    """CCSDS 133.0-B-2 4.1.3: version 000, type 1 for a telecommand, secondary header flag 1, APID."""
+    """By CCSDS 133.0-B-2 4.1.3, a telecommand has version 000, type 1, secondary header flag 1, APID."""
     for layouts in (commands.LAYOUTS, directives.LAYOUTS):
         for layout in layouts.values():
             assert layout.identifier == 0x1800 | layout.packet.apid

@@ -1,4 +1,4 @@
-"""Tests that the witness detects a restored key folder, and that no old command is accepted."""
+"""Tests that the witness folder detects a restored key folder, and that old commands are not accepted."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_restored_folder_refuses_all_commands_until_the_reserve_sets_a_key(
     old = [Ground(ground, spi).frame(b"old") for spi in (1, 1, 2, 2)]
     assert [refusal(opened(keys), frame) for frame in old] == [None] * 4
     restore(keys)
-    for _ in range(2):  # also after another start
+    for _ in range(2):  # also after a second start
         at = opened(keys)
         assert at.restored
         assert [refusal(at, frame) for frame in old] == [Refusal.LOST] * 2 + [Refusal.REPEATED] * 2

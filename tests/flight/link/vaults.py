@@ -49,7 +49,7 @@ def frame_with(at: Vault, iv: int, data: bytes, spi: int = 1) -> bytes:
 
 
 class Ground:
-    """Makes protected telecommand frames."""
+    """Ground end that makes protected telecommand frames."""
 
     def __init__(self, at: Vault, spi: int = 1) -> None:
         self._sealer = Sealer(at, spi, TELECOMMAND_MASK)

@@ -21,12 +21,12 @@ class PowerLostError(BaseException):
 @dataclass
 class _Inode:
     durable: bytes | None
-    """The content at the last sync, None for a file that was never synced."""
+    """The content at the last sync, or None for a file that was never synced."""
     cached: bytes
 
 
 class Disk(LinuxFiles):
-    """A file system: content is safe after sync, names after sync_folder, everything else is open.
+    """A file system in which only synced content and names survive a power loss.
 
     `calls` counts the calls that change something. The power fails before call number `stop_before`. If
     `failure` is an errno, that call and all later calls fail with this errno instead. `forget` names a call
@@ -78,7 +78,7 @@ class Disk(LinuxFiles):
         return len(taken)
 
     def sync(self, file: int) -> None:
-        """Make the content safe."""
+        """Make the file's content survive a power loss."""
         self._count()
         if self._forget != "sync":
             inode = self._inodes[self._open[file]]
@@ -89,7 +89,7 @@ class Disk(LinuxFiles):
         del self._open[file]
 
     def rename(self, old: Path, new: Path) -> None:
-        """Move a name."""
+        """Rename a file."""
         self._count()
         names = dict(self._names)
         names[new] = names.pop(old)
@@ -97,7 +97,7 @@ class Disk(LinuxFiles):
         self._steps.append(names)
 
     def sync_folder(self, folder: Path) -> None:
-        """Make the names safe."""
+        """Make the folder's file names survive a power loss."""
         self._count()
         assert folder.name == "state"
         if self._forget != "sync_folder":

@@ -23,7 +23,7 @@ def target(name: str) -> Any:
 
 
 class OneAngle:
-    """Targets of the body; the test sets the values of the last estimate."""
+    """Targets of a body with one angle; the test sets the values of the last estimate."""
 
     def __init__(self) -> None:
         self.rate, self.off, self.holdable = 0.0, 0.0, True
@@ -39,7 +39,7 @@ class OneAngle:
         return target(f"{wanted} as number {number}")
 
     def hold_here(self, estimate: object, now_ns: int) -> Any:
-        """Return the attitude of this time."""
+        """Return the attitude at the given time as a target."""
         return target(f"here at {now_ns}")
 
     def can_hold(self, estimate: object) -> bool:
@@ -57,7 +57,7 @@ class OneAngle:
 
 @dataclass
 class ModeBench:
-    """The mode control with records of its requests; `step` runs a cycle a second later."""
+    """The mode control with a record of its requests; `step` advances by a second and runs a cycle."""
 
     modes: frozenset[Mode] = TESTBED
     settings: Modes = field(default_factory=Modes)

@@ -13,7 +13,7 @@ def double(value: Any) -> Any:
 
 
 def fail(value: Any) -> Any:
-    """Raise."""
+    """Raise an exception."""
     raise ValueError(f"cannot do {value}")
 
 

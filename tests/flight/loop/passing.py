@@ -1,4 +1,4 @@
-"""Sends a value through a worker's message and returns the received value."""
+"""Passes a value through a worker's message, and returns the received value."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def slab() -> mmap.mmap:
 
 
 def passed(value: Any) -> Any:
-    """Return what arrives."""
+    """Return the value that arrives at the other end."""
     return unpack_values(pack_values(value, slab()), slab())

@@ -24,7 +24,7 @@ def state_of(number: int) -> StoredState:
 
 
 class Reports:
-    """Collects events."""
+    """A sink that collects events."""
 
     def __init__(self) -> None:
         self.kinds: list[EventKind] = []

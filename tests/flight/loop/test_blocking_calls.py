@@ -31,7 +31,7 @@ ALLOWED = {
     "hal/drivers/ina219.py:Ina219.error": ("_thread.", _LOCK),
     "hal/drivers/ina219.py:Ina219.latest": ("_thread.", _LOCK),
 }
-"""Functions that may wait on the control thread, the start of the call, and the reason."""
+"""Functions whose calls may wait on the control thread: start of the call's name, and reason."""
 
 
 def test_the_control_thread_waits_nowhere_else() -> None:

@@ -39,7 +39,7 @@ BOUNDS = Bounds((FULL, FULL, FULL), 3.5e-3, 0.2, 1.5e-3)
     [
         ("coil-x: open", {"OPEN", "UNCERTAIN"}, 3.5),
         ("coil-x: shorted", {"SHORTED"}, 4.0),
-        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # current beyond the range of the monitor
+        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # the current is beyond the range of the monitor
         ("bridge-x: a-low", {"A_LOW", "UNCERTAIN"}, 3.5),
         ("bridge-x: a-high", {"HIGH"}, 4.0),
         ("bridge-y: a-high", {"HIGH"}, 3.0),
@@ -150,7 +150,7 @@ def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple
 
 
 def test_coils_that_draw_their_currents_in_the_probes_are_not_isolated_for_missing_torque() -> None:
-    """No axis is judged by elimination, because the torque may be missing for another reason."""
+    """No axis is isolated by elimination, because the torque may be missing for another reason."""
     watch, flown = _probed_for_missing_torque(np.ones(3))
     assert watch.verdicts == ()
     alone = np.flatnonzero(np.abs(flown).max(axis=1) > 0.03)
@@ -208,7 +208,7 @@ def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None
 
 
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
-    """A deviation of 15 % is that of copper at 60 degrees C; the commands of all three axes change."""
+    """A deviation of 15 % is that of copper at 60 degrees C; all three axes have changing commands."""
     seen = observe(hold(TARGET, noise=0.005, others=0.04), 20.0, gain=(0.87, 1.1, 1.0))
     assert seen.found == []
     assert seen.suspicious == 0
@@ -229,7 +229,10 @@ def test_an_axis_that_is_never_driven_is_not_judged() -> None:
 
 @pytest.mark.parametrize("fault", ["bridge-y: a-high", "bridge-y: b-high"])
 def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> None:
-    """With either leg, both ends of the coil are high. Only the broken coil carries current."""
+    """With either leg stuck, the brake sets both ends of the coil high.
+
+    Only the broken coil carries current.
+    """
     seen = observe(hold(0.0), 10.0, [f"{fault} @ {FAULT_AT}"])
     assert seen.watch.braked == {1}
     time, carried = seen.times, np.abs(seen.carried)
@@ -269,7 +272,7 @@ def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_
 
 
 def _looks(leg: StuckLeg, stuck: Iterable[int], count: int = 40) -> list[int | None]:
-    """Return results of ADC samples at zero commands, while each stuck axis without brake draws current."""
+    """Return results of ADC samples at zero commands; each stuck, unbraked axis draws current."""
     drawing = set(stuck)
     found = []
     for _ in range(count):
@@ -382,7 +385,7 @@ def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_ca
 
 
 def windows(time: float, _: ImuReading) -> FloatArray:
-    """Return the currents of B-dot for a fast rotation: off and fully on, four times a second."""
+    """Return B-dot's currents for a fast rotation, which are off and fully on four times a second."""
     return np.array([0.0 if time % 0.25 < 0.1 else FULL, 0.0, 0.0])
 
 
@@ -433,9 +436,9 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
     """No coil is suspected in 2,388 driver readings (seed 11).
 
     The gains are within 15 %. Every driven coil has an error within the thesis's 3.5 mA in every cycle, and
-    the readings have the resolution of the monitor. Single ADC samples differ from the chopped current by 18
-    %. Without a suspicion in N readings, the rate of suspicions is below 3 / N at 95 % confidence. Only
-    suspicions of a single axis become a verdict.
+    the readings have the resolution of the monitor. Single ADC samples differ from the mean of the chopped
+    current by up to 18 %. Without a suspicion in N readings, the rate of suspicions is below 3 / N at 95 %
+    confidence. Only a suspicion of a single axis leads to a verdict.
     """
     rng = np.random.default_rng(11)
     suspected = readings = 0
@@ -501,7 +504,7 @@ def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_
     watch._evidence.add([_alone(1, 0.04 if probed else 0.0)])
     watch._evidence.begin_segment()
     watch._evidence.add([_alone(0, 0.0)])
-    for _ in range(1 if probed else 2):  # the second time, a different coil has also been probed
+    for _ in range(1 if probed else 2):  # by the second time, a different coil has also been probed
         watch._conclude(0, CoilFault.OPEN, 0)
     assert bool(watch.verdicts) is probed
     assert bool(watch.monitor_doubted) is not probed

@@ -26,7 +26,7 @@ FIELD = np.array([0.0, 0.0, 60e-6])
 INERTIA, DIPOLE = 0.02, 60.0
 TICK_NS = 25_000_000
 STAND_EVERY = 176
-"""Cycles from one stall of the loop to the next: 4.4 s."""
+"""Number of cycles between two stalls of the loop (4.4 s)."""
 STANDS = 36
 STALE = 12
 """Number of cycles after which the coil driver, or the guardian, zeroes a command."""
@@ -35,9 +35,9 @@ STALE = 12
 def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list[float], int]:
     """Drive coil x with a loop that stalls repeatedly; the samples arrive in a burst after each stall.
 
-    Meanwhile the driver zeroes the coils, and reports when; or a guardian does without a report, unless the
-    loop is `informed` that the currents of that time are unknown.
-    Returns the trusted gains of coil x, and how often an axis was found reversed.
+    During a stall the driver zeroes the coils and reports the time, or a guardian zeroes them without a
+    report. With `informed`, the loop knows that the currents of that time are unknown. Returns the trusted
+    gains of coil x, and the number of times that an axis was found reversed.
     """
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
     response, noise = CoilResponse(settings), np.random.default_rng(3)
@@ -112,7 +112,10 @@ class Orbiting:
         self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
 
     def fly(self, seconds: float, weak: bool = False) -> None:
-        """Simulate coils that pause for 0.2 s of each second; `weak`: currents that no monitor can judge."""
+        """Simulate coils that pause for 0.2 s of each second.
+
+        `weak` currents are too small for the monitor.
+        """
         begun, self._cycles = self._cycles, self._cycles + round(40 * seconds)
         for cycle in range(begun, self._cycles):
             now_ns, within, time = cycle * TICK_NS, cycle % 40, cycle / 40
@@ -173,7 +176,7 @@ PYRAMID = 0.4 * np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 
 
 @pytest.mark.parametrize("reversed_coil", [None, 0, 3])
 def test_of_four_coils_the_reversed_one_is_found(reversed_coil: int | None) -> None:
-    """The four currents always form one dipole together, so that they depend on each other."""
+    """The four currents are those of one common dipole, so they are correlated."""
     signs = np.where(np.arange(4) == reversed_coil, -1.0, 1.0)
     flown = Orbiting(signs, dipoles=PYRAMID)
     flown.fly(60.0)
@@ -197,7 +200,7 @@ def test_a_coil_that_makes_no_torque_is_found_at_currents_too_small_for_the_moni
 
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
-    """In the second case, a wrong gyro or field is the more likely cause."""
+    """If all coils seem without effect, a wrong gyro or field is the more likely cause."""
     body = Orbiting(np.full(3, gain), speed=0.02)
     body.fly(120.0, weak=True)
     assert body.watch.suspicion == ""
@@ -255,7 +258,7 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     assert watch.available.all()
     assert not watch.resting.any()
     assert watch.suspicion == ""
-    watch.tumble_rate = 10.0  # as if the body were slow
+    watch.tumble_rate = 10.0  # makes the monitor treat the body as slow
     body.fly(40.0)
     assert watch.correction.factors.tolist() == signs.tolist()
     assert watch.correction.unreviewed == frozenset()
@@ -316,7 +319,7 @@ def test_a_gain_that_misaligned_coils_can_explain_is_not_used(gain: float, found
 def test_a_gain_that_changed_within_the_bins_is_not_used(
     newest: float, found: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The mean gain over an interval with a fault is neither the gain before nor after the fault."""
+    """The mean gain over an interval with a fault is neither the gain before nor that after it."""
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     alone, never = (False, True, False), (False, False, False)
     fits = {
@@ -485,9 +488,9 @@ def test_without_the_motion_nothing_is_contradicted() -> None:
 def _point_in_dense_air(
     disturbance: float | None, seed: int, gains: tuple[int, int, int] = (1, 1, 1)
 ) -> tuple[dict[Finding, int], FloatArray]:
-    """Command coils with the given `gains` for 150 s to hold an attitude against a torque that changes.
+    """Command coils with the given `gains` for 150 s to hold an attitude against a varying torque.
 
-    Returns how many fits of how many axes made each finding, and the errors of the gains in standard
+    Returns the numbers of fits with each finding by number of axes, and the errors of the gains in standard
     deviations.
     """
     settings = ResponseSettings(

@@ -78,7 +78,7 @@ def test_a_weaker_response_is_tested_by_more_current_and_then_for_longer(strengt
     driven = np.count_nonzero(current) / 40
     rate = strength * np.abs(np.cumsum(current)) / 40
     assert np.abs(current).max() <= LIMIT
-    # The information grows with the square of the rate that the test adds, and with its duration.
+    # The information increases with the square of the rate that the test adds, and with its duration.
     assert np.sqrt(np.square(rate).sum()) == pytest.approx(8.0 * 4e-4 / 0.7, rel=0.02)
     assert driven == pytest.approx(4.0, abs=0.1) or np.abs(current).max() == LIMIT
 

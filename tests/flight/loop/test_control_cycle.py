@@ -58,7 +58,7 @@ class Bench:
         return self.loop.run(Cycle(slot, self.now_ns, self.now_ns))
 
     def results(self, *workers: str) -> list[Any]:
-        """Let each worker finish a job."""
+        """Make each worker finish a job."""
         made = [SimpleNamespace(worker=worker) for worker in workers]
         self.services.jobs.collect.return_value = made
         return made

@@ -43,7 +43,7 @@ def test_a_damaged_state_is_refused_or_can_be_stored_again(chance: Random) -> No
 
 @given(chances())
 def test_a_resealed_message_of_a_worker_brings_nothing_to_call(chance: Random) -> None:
-    """A damaged message with a valid checksum reaches the decoder, which must not end the control process."""
+    """A damaged message with a valid checksum must not end the control process in the decoder."""
     slab = mmap.mmap(-1, 1 << 16)
     values: tuple[object, ...] = (
         {"path": np.linspace(0.0, 1.0, 50), "cost": 1.5},

@@ -1,4 +1,4 @@
-"""Tests that facts count after N updates in a row, latch, reset in modes without watch, and report once.
+"""Tests that facts become true after N updates in a row, latch, reset in modes without watch, report once.
 
 Liveness, rate and validity of a stream are checked separately; a stale stream is never good.
 """
@@ -67,9 +67,10 @@ PERSISTENCE = {
     **{f"battery-{level}": (3, 3, "") for level in ("low", "very-low", "critical")},
     **{f"{rail}-monitor-lost": (3, 3, "") for rail in ("battery", "bus")},
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
-"""Number of updates until a fact counts and until it ends (None if it latches), and the modes that watch it.
+"""Number of updates until a fact becomes true, number until it ends (None if it latches), and the modes
+that watch it.
 
-All remaining facts count and end at once, and are watched in all modes.
+All other facts become true and end immediately, and are watched in all modes.
 """
 
 EVENTS_OF = {
@@ -104,7 +105,7 @@ EVENTS_OF = {
         for stream in ("imu", "field", "coils", "power", "camera", "gps")
     },
 }
-"""Events at the begin and end of a fact; other facts begin with the event of their name and end silently."""
+"""Events at the start and end of a fact; other facts start with the event of their name and end silently."""
 
 
 @pytest.mark.parametrize("fact", FACTS, ids=lambda fact: str(fact.name))
@@ -221,7 +222,7 @@ PERIOD = 25_000_000
 def fed(
     seconds: float, every: int = 1, value: float = 0.5, row: StreamLimits = ROW
 ) -> tuple[StreamWatch, int]:
-    """Return a watch that got every n-th sample for some seconds, and the time after them."""
+    """Return a watch that has received every n-th sample for some seconds, and the time at the end."""
     watch = StreamWatch(row, 0)
     count = round(seconds * 40)
     for k in range(0, count, every):
@@ -314,7 +315,7 @@ def test_the_window_has_two_seconds_or_five_periods() -> None:
 
 
 def test_a_stream_is_slow_below_80_percent_of_its_rate() -> None:
-    for count, state in ((64, StreamState.GOOD), (63, StreamState.SLOW)):  # of 80 in two seconds
+    for count, state in ((64, StreamState.GOOD), (63, StreamState.SLOW)):  # of 80 samples in two seconds
         watch = StreamWatch(ROW, 0)
         for k in range(count):
             watch.note(2_000_000_002 + k * 1_999_999_999 // (count - 1), 0.5)

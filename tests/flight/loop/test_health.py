@@ -165,7 +165,7 @@ def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_noth
 
 
 def grown(count: int, window: float = 30.0) -> float:
-    """Return the slope of memory that grows 5 kB/s after `count` samples, 5 s apart, without a warm-up."""
+    """Return the slope of memory that grows by 5 kB/s, from `count` samples 5 s apart, without warm-up."""
     monitor = ResourceMonitor(Health(look_period=5.0, warm_up=0.0, slope_window=window))
     for k in range(count):
         monitor.ingest(sample(5.0 * k, proportional=150 * MIB + 5e3 * 5.0 * k))

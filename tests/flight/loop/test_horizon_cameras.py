@@ -82,7 +82,7 @@ class Bench:
         return found.sun is not None, False
 
     def fly(self, seconds: int) -> None:
-        """Run the task once a second; the worker answers within a second."""
+        """Run the task once a second; the worker returns a result within a second."""
         sun = MeasuredDirection(np.array([1.0, 0.0, 0.0]), 1e-6 * np.eye(3), (1,))
         found = HorizonCameraResult(sun, None, false=self.denied)
         for _ in range(seconds):

@@ -1,4 +1,4 @@
-"""Tests of star camera frames: rows of an earlier frame, pixels without stars, and mid-exposure."""
+"""Tests of star camera frames: repeated rows of an earlier frame, pixels without stars, mid-exposure time."""
 
 from __future__ import annotations
 

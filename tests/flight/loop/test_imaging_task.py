@@ -146,12 +146,12 @@ class Bench:
         return cast(Any, SimpleNamespace(start_ns=at))
 
     def take(self, sequence: int, start: int, now: int) -> None:
-        """Let a frame arrive, exposed for 0.2 s from `start`."""
+        """Make a frame arrive that was exposed for 0.2 s from `start`."""
         self.frames.append(frame(sequence, start))
         self.task.serve(now)
 
     def finish(self, value: Any, now: int, outcome: str = "done") -> None:
-        """Let the worker end its job."""
+        """Make the worker end its job."""
         result = SimpleNamespace(worker="vision", outcome=outcome, error="why", value=value)
         self.task.finish(cast(JobResult, result), now)
 
@@ -571,7 +571,8 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     bench.finish(FrameFound(motion(), None, lens=better), 12 * S)
     values = bench.only(LENS)
     assert (values["frames"], values["contradictions"], values["sequence"]) == (3, 0, 1)
-    assert values["centre"] == [160.0, 120.0]  # half a pixel from the image centre (159.5, 119.5)
+    # Half a pixel from the image centre (159.5, 119.5) on each axis.
+    assert values["centre"] == [160.0, 120.0]
     assert np.allclose(values["sigma"], better.sigma[[0, 1, 2, 3, 4, 9, 10]])
     stored = bench.task.learned()["lens"]
     assert np.array_equal(stored.arrays()[0], better.learned[0])

@@ -83,7 +83,7 @@ def test_a_latched_fault_bars_both_also_what_has_begun(watched: Watched) -> None
 def test_an_attitude_that_is_lost_for_long_enough_ends_pointing(watched: Watched) -> None:
     watch = watched.watch
     for second in range(20):
-        known = second < 5 or second == 7  # restarts the timeout
+        known = second < 5 or second == 7  # a known attitude restarts the timeout
         trigger = watch.trigger(Mode.POINT, known, second * SECOND_NS)
         assert (trigger is Trigger.LOST) is (second >= 12), second
     assert watch.trigger(Mode.ACQUIRE, False, 30 * SECOND_NS) is None

@@ -38,7 +38,7 @@ class Board:
         )
 
     def values(self, **changes: float) -> dict[str, float]:
-        """Return the table in force with changes."""
+        """Return the values of the active table with changes."""
         return {
             **self.parameters._values,
             **{key.replace("__", "."): value for key, value in changes.items()},

@@ -1,4 +1,4 @@
-"""Tests of battery, panels, current monitors and the power task on a simulated clock.
+"""Tests of the power system: battery, panels, current monitors and the power task.
 
 Battery, panels, monitors at the wire and the power task run on a simulated clock, without a flight. The true
 battery has 10 % less capacity, 30 % more resistance and a slightly different curve than the configured one.

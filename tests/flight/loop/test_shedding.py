@@ -17,7 +17,7 @@ S = 1_000_000_000
 
 
 class Bench:
-    """A load-shedding task whose signs of overload are counters set by the test."""
+    """A load-shedding task; its signs of overload are counters that the test sets."""
 
     def __init__(self) -> None:
         self.frames = self.cycles = 0

@@ -1,6 +1,6 @@
 """Tests that crashes are counted over the operating time and forgotten after operating time only.
 
-Parameters learned in one boot are the prior of the next, with an increased covariance.
+Parameters estimated in one boot are the prior of the next, with an increased covariance.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def test_a_table_that_a_crash_left_unproven_gives_way_to_the_one_before() -> Non
         state = begin_boot(StoredState(running=not clean, table=table), LABEL)
         assert state.table.values == {"modes.known_for": flown}
         assert state.table.loads == 2
-    # The rejected table is not tried again, and the former table stays after a second crash.
+    # The rejected table is not tried again, and the former table remains in use after a second crash.
     again = begin_boot(begin_boot(StoredState(running=True, table=new), LABEL), LABEL)
     assert again.table.values == new.before
 
@@ -135,7 +135,8 @@ def test_the_count_is_that_of_the_crashes_in_the_window(
 
 
 BOOT, SETTLED, AGAIN = 0, 600, 640
-"""Cycle numbers of the end of the first boot, and of the end of the second boot, a second after its start."""
+"""Cycles at which the first boot starts, the first boot ends, and the second boot ends one second after
+its start."""
 CHANGED = 0.3
 
 

@@ -81,7 +81,7 @@ def test_running_is_on_disk_before_anything_flies_and_gone_after_a_clean_end() -
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -> None:
-    """Cases: the process was killed, or an exception ended it, which closed the keeper."""
+    """The process was killed, or an exception ended it and closed the state keeper."""
     disk, clock = Disk(), ManualClock()
     first = keeper_on(disk, clock)
     first.note("hold")
@@ -164,7 +164,7 @@ class HungDisk(Disk):
         self.let_go = threading.Event()
 
     def sync(self, file: int) -> None:
-        """Hang."""
+        """Wait until the test releases the disk."""
         if self.hangs.is_set():
             self.hung.set()
             self.let_go.wait(20.0)
@@ -307,7 +307,7 @@ def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before
     assert state.operated == pytest.approx(3.0, abs=1.1), "a second of preparation and two of flight"
     with ExitStack() as killed:
         open_state(configuration.load(path), {}, ManualClock(), killed)
-        killed.pop_all()  # like kill -9: nothing is closed
+        killed.pop_all()  # as after kill -9, nothing is closed
     second = fly(request)
     assert second.folder.name == "run-000002"
     names = [to_text(name) for name in read_run(second.folder)["event"]["name"]]

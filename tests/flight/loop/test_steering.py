@@ -24,7 +24,7 @@ DIPOLE = 0.65
 
 
 class Coils:
-    """Keeps the newest command."""
+    """Coils that store the newest command."""
 
     def __init__(self) -> None:
         self.currents: FloatArray = np.zeros(3)

@@ -32,7 +32,7 @@ LENS = Lens(1024, 768, 500.0, (511.5, 383.5))
 
 
 class Pair(NamedTuple):
-    """Two numbers."""
+    """A value of two numbers that messages may contain."""
 
     first: int
     second: float

@@ -1,4 +1,4 @@
-"""Tests that jobs behave alike in simulated time and in processes, and that no call waits."""
+"""Tests that jobs behave equally in simulated time and in processes, and that no call waits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WORKERS = [worker("double", double), worker("fail", fail)]
 
 
 def wait(runner: JobRunner, seconds: float = 20.0) -> list[JobResult]:
-    """Poll as the control loop does until something arrives."""
+    """Poll as the control loop does, until a result arrives."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         if results := runner.collect():
@@ -216,7 +216,7 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
         assert flight.stderr is not None
         orphan = int(flight.stdout.readline())
         flight.kill()
-        # The worker inherits standard error, so that its end shows the end of the last process.
+        # The worker inherits standard error, so the pipe closes only when the last process has ended.
         assert flight.stderr.read() == ""
     assert not lives(orphan)
 

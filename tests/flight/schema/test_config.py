@@ -380,7 +380,8 @@ def test_values_that_follow_from_craft_and_coils_are_those_tuned_for_the_shipped
     assert config.torque_noise() == noise
     assert config.torque_sizes() == pytest.approx((size, 2e-3 * size))
     assert config.dipole_weight() == dipole
-    # A rigid body turns by a fixed angle in a time that grows with the square root of its moment.
+    # A rigid body rotates by a given angle in a time proportional to the square root of its moment of
+    # inertia.
     rows = (4.0 * config.craft.inertia_matrix()).tolist()
     heavy = reader.replace(config.craft, inertia=tuple(tuple(row) for row in rows))
     ratio = reader.replace(config, craft=heavy).slew_duration() / config.slew_duration()
@@ -431,7 +432,7 @@ FIELD_SENSOR = "magnetometer: {max_age: 0.2, sensors: [{part: lis3mdl, measures:
 
 @pytest.mark.parametrize("word", ["inertial_unit: none\n", ""])
 def test_a_magnetometer_becomes_the_unit_of_a_file_without_an_inertial_unit(word: str) -> None:
-    """The section of the VN-100 is removed from the demonstration, or replaced by none."""
+    """The section of the VN-100 is removed from the demonstration, or replaced by `none`."""
     without = re.sub(r"(?m)^inertial_unit:.*\n(?:  .*\n)*", word, DEMO)
     config = reader.parse(without + FIELD_SENSOR)
     assert (config.inertial_unit.driver, config.inertial_unit.max_age) == ("sensors", 0.2)

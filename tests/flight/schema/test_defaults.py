@@ -59,7 +59,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
 """Configuration sections from which a flight fills each settings class."""
 
 FILLED = {"DetectionSettings"}
-"""None means that the value is measured from the frame; a flight replaces it by the camera's value."""
+"""Settings classes in which None means a value measured from the frame; a flight uses the camera's value."""
 
 OTHERS = {
     "ClassicalSettings": "the thesis's star tracker, for comparison",
@@ -74,7 +74,7 @@ OTHERS = {
     "VerificationSettings": "limits of the method",
     "Vn100EmulatorSettings": "the emulated unit: truth, not belief",
 }
-"""Settings classes that no section fills, and why."""
+"""Settings classes that no section fills, with the reasons."""
 
 
 def _modules(package: ModuleType) -> Iterator[ModuleType]:
@@ -104,7 +104,7 @@ def _default(field: dataclasses.Field[object]) -> object:
 def _disagreements(kind: type, section: type[msgspec.Struct]) -> list[str]:
     """Return the values with two different defaults, where times in ns are compared with times in s.
 
-    A section without a value of its own (None) leaves it to the settings class.
+    If a section has no value (None), the settings class determines it.
     """
     of_section = {field.name: field.default for field in msgspec.structs.fields(section)}
     found = []

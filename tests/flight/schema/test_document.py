@@ -37,7 +37,7 @@ from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 FILES = sorted(path for path in FOLDER.rglob("*.yaml") if "\nextends:" not in path.read_text("utf-8"))
-"""Files without `extends`, which the independent reader does not know."""
+"""Files without `extends`, a key that the independent reader does not support."""
 
 _PLAIN = st.sampled_from(
     """true True FALSE yes no on off null ~ none x y N -x- a:b 12:30 1:30:00 1.2.3
@@ -110,7 +110,7 @@ def test_both_readers_agree_about_every_shipped_file_and_its_lines(path: Path) -
 
 
 def _loaded(compose: Callable[[], tuple[_Loader, Any]]) -> tuple[list[tuple[str, int]], Any] | None:
-    """Return lines and values of a composed text, or None if it is refused."""
+    """Return lines and values that a parser finds in a text, or None if the parser refuses it."""
     try:
         loader, node = compose()
         return list(_lines_of(node, "")), node and loader.construct_document(node)

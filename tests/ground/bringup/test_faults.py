@@ -1,4 +1,4 @@
-"""Tests that a bench session with emulated devices names each wiring fault, and none in a correct set-up.
+"""Tests that a bench session with emulated devices identifies each wiring fault, and none if all is correct.
 
 The drivers are configured by `step_demo`. The emulated devices differ from `step_demo` by one wiring fault.
 The devices send and receive the bytes of their real protocols.
@@ -53,7 +53,7 @@ def fault(*names: str) -> Change:
 
 
 def coil_field(matrix: Any) -> Change:
-    """Return the field of the coils at the magnetometer, in multiples of the usual field."""
+    """Return the coils' field at the magnetometer, relative to the usual field."""
     return {"simulation": {"coil_field": (FIELD * np.array(matrix)).tolist()}}
 
 
@@ -66,7 +66,7 @@ def sensed(**matrices: Any) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """A wiring fault: changed values, steps that detect it, and expected findings as "part kind"."""
+    """A wiring fault: changed values, the steps that detect it, and expected findings ("part kind")."""
 
     change: Change
     steps: str
@@ -102,14 +102,14 @@ def repeated(sensor: str) -> Callable[[Any], Any]:
 
 
 def exchanged_strings() -> list[Any]:
-    """Return the solar strings of `orbit` with the first two channels exchanged."""
+    """Return the solar strings of `orbit` with the first two channels swapped."""
     strings = [msgspec.to_builtins(one) for one in configuration("orbit")[1].solar_strings.strings]  # type: ignore[union-attr]
     strings[0]["channel"], strings[1]["channel"] = strings[1]["channel"], strings[0]["channel"]
     return strings
 
 
 def sagging(opened: Session) -> None:
-    """Make the supply fall by 2 V/A times its voltage."""
+    """Make the supply voltage fall in proportion to its current, by 20 % at 0.1 A."""
     circuit = opened.hand.hardware.circuit
     measure, currents = circuit.mean_supply, circuit.currents
 
@@ -509,7 +509,7 @@ def test_faults_of_the_power_system_are_named(fault_of: str, expected: list[str]
 
 
 def rail(gain: float) -> Callable[[Session], None]:
-    """Return a fault of the battery monitor whose current has a gain."""
+    """Return a fault of the battery monitor, whose measured current is multiplied by `gain`."""
 
     def spoil(opened: Session) -> None:
         battery = opened.hand.hardware.power.rails[0]

@@ -99,7 +99,7 @@ def test_one_element_of_a_list_is_drawn_by_its_index() -> None:
 
 
 def test_values_of_an_extended_file_and_defaults_can_be_drawn() -> None:
-    path = DEMO.with_name("orbit_object.yaml")  # extends orbit_3u.yaml
+    path = DEMO.with_name("orbit_object.yaml")  # this configuration extends orbit_3u.yaml
     for given in cases(path, "craft.mass=5%", "estimation.changed=0.1..0.2"):
         assert 0.1 <= yaml.safe_load(given["config"])["estimation"]["changed"] <= 0.2
 
@@ -145,7 +145,8 @@ def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) 
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "campaign.json").write_text((tmp_path / "whole" / "campaign.json").read_text())
-    (broken / "results.jsonl").write_text(lines[1] + lines[0][:40])  # line cut off by a kill of the campaign
+    # The second line is cut off, as after a kill of the campaign.
+    (broken / "results.jsonl").write_text(lines[1] + lines[0][:40])
     facts = json.loads(json.dumps(fly(campaign, 3, 7, broken, workers=1).facts).replace("broken", "whole"))
     assert facts == whole.facts
     again = varied_campaign(SIMULATION, [variation_of("plant.inertia=10%")], 2.0)
@@ -176,7 +177,7 @@ def test_the_listed_command_flies_a_failed_flight_again(
 
 @pytest.mark.slow
 def test_an_interrupted_flight_has_no_result() -> None:
-    """The signal comes during the run, and ends it like Ctrl-C."""
+    """The signal arrives during the run, and ends it like Ctrl-C."""
     code = (
         "import os, signal, sys, threading\n"
         "from pathlib import Path\n"

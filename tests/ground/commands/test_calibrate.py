@@ -42,7 +42,7 @@ def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], 
 
 
 def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path], tmp_path: Path) -> None:
-    """The central 7 deg of one image contain no edge, where a distortion would be measurable."""
+    """The central 7 deg of one image exclude the edge, where a distortion would be measurable."""
     middle, out = tmp_path / "middle.png", tmp_path / "camera.yaml"
     pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle)
     done = command("calibrate", middle, "--fov", "7.05", "--out", out)

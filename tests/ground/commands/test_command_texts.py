@@ -42,12 +42,12 @@ class Source:
         self.clock, self.polls, self.triggers = clock, polls, list[int]()
 
     def trigger(self, exposure_ns: int) -> None:
-        """Begin."""
+        """Start an exposure."""
         self.triggers.append(exposure_ns)
         self.left = self.polls
 
     def poll(self) -> Frame | None:
-        """Return the frame in time."""
+        """Return the frame after the given number of polls."""
         self.left -= 1
         return None if self.left >= 0 else FRAME
 

@@ -29,7 +29,7 @@ def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def obeyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
-    """Return exit status, output and error output of a command that the test process runs."""
+    """Return exit status, output and error output of a command that runs in the test process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         try:

@@ -41,7 +41,7 @@ def test_output_that_does_not_fit_the_disk_is_one_line(words: str, run_folder: P
 
 
 def test_ctrl_c_ends_a_command_by_the_signal_itself_from_its_first_import_on() -> None:
-    """At this time, neither project code nor library code can be interrupted."""
+    """During the first import, neither project code nor library code can handle the interrupt."""
     script = (
         # Restore the handler as in a terminal, because a shell's `&` ignores the signal.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"

@@ -1,4 +1,4 @@
-"""Tests of `knightcube horizon`: from an image file to the nadir direction, as numbers and as an image."""
+"""Tests of `knightcube horizon`, which gives the nadir direction of an image as numbers and as an image."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_colour_without_an_altitude_gives_one_and_a_picture(folder: Path) -> Non
         assert label in done.stdout
     drawn = np.asarray(pillow.open(overlay)).astype(int)
     orange = np.count_nonzero(np.all(np.abs(drawn - [230, 159, 0]) < 2, axis=2))
-    # The image shows the limb's line across the whole width and a ring for each edge.
+    # The image shows the line of the limb across the whole width, and a ring for each edge.
     assert orange > 512
 
 
@@ -185,7 +185,7 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
         )
         assert done.returncode == 0, done.stderr
         facts[field, error] = json.loads(done.stdout)
-    # The curvature of the limb from a known altitude determines much of the focal length.
+    # If the altitude is known, the curvature of the limb determines the focal length well.
     assert facts[67.0, 3.3]["sigma_deg"] > 1.1 * facts[67.0, None]["sigma_deg"]
     for uncertain in (facts[67.0, 3.3], facts[70.3, 3.3]):
         off = np.subtract(uncertain["nadir_camera"], facts[67.0, None]["nadir_camera"])

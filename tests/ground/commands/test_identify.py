@@ -40,7 +40,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, obj
 
 
 def test_a_flight_finds_the_simulated_body(flown: tuple[Path, dict[str, object]]) -> None:
-    """Values of N A B / J, k / J and c / J of config/step_demo.yaml."""
+    """The expected values are N A B / J, k / J and c / J of config/step_demo.yaml."""
     _, facts = flown
     motion: dict[str, dict[str, float]] = facts["motion"]  # type: ignore[assignment]  # JSON
     truth = {"gain": 80 * 0.0081 * 4.5e-4 / 1.05e-3, "torsion": 1e-5 / 1.05e-3, "damping": 2e-6 / 1.05e-3}

@@ -144,7 +144,7 @@ def _coil(dipole: float, current: float, resistance: float) -> str:
 
 
 def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
-    # Vallado, Fundamentals of Astrodynamics, example 11-2: 800 km, near-circular, 98.6 deg.
+    # In Vallado, Fundamentals of Astrodynamics, example 11-2, a near-circular orbit at 800 km has 98.6 deg.
     assert sun_synchronous_inclination(800e3, 0.0) == pytest.approx(98.60, abs=0.02)
     assert sun_synchronous_inclination(6000e3, 0.0) is None
     equal = read_coils("axis=xyz,turns=80,area=0.0081,current=0.148,resistance=23")
@@ -265,7 +265,7 @@ def test_weak_coils_are_warned_of(tmp_path: Path) -> None:
 
 
 class Terminal(io.StringIO):
-    """A terminal on which the given lines are typed."""
+    """A test double of a terminal on which given lines are typed."""
 
     def isatty(self) -> bool:
         return True

@@ -67,7 +67,8 @@ def test_the_orbit_is_the_true_one_in_each_form(
     found = np.array(facts["orbit"]["position_m"] + facts["orbit"]["velocity_m_s"])
     covariance = np.array(facts["orbit"]["covariance"])
     off = found - true
-    assert off @ np.linalg.solve(covariance, off) < 22.5  # 99.9 % of six degrees
+    # 99.9 % quantile of chi-square with six degrees of freedom.
+    assert off @ np.linalg.solve(covariance, off) < 22.5
     assert np.linalg.norm(off[:3]) < 50e3
     assert facts["orbit"]["utc"].startswith("2026-03-20T12:02:00")
     rows = dict(

@@ -1,4 +1,4 @@
-"""Tests of `knightcube rate`: from an image file to a rate, its covariance, and a plot of the streaks."""
+"""Tests of `knightcube rate`, which gives the rate of an image, its covariance, and a plot of the streaks."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def packed(packet: Packet, **values: Any) -> bytes:
 
 
 def answer(obeyed: bool, mode: Mode = Mode.HOLD, text: str = "done") -> bytes:
-    """Return the answer of a flight to a command."""
+    """Return the reply of a flight to a command."""
     return packed(COMMAND, obeyed=int(obeyed), mode=int(mode), text=text, count=4)
 
 
@@ -76,7 +76,7 @@ def table(values: dict[str, float], **changes: Any) -> bytes:
 
 
 class Flight:
-    """A test double of a flight process: it answers from a list and stores the commands it receives."""
+    """A test double of a flight process, which replies from a list and stores the received commands."""
 
     def __init__(self, *answers: bytes) -> None:
         self.answers = list(answers)
@@ -399,7 +399,7 @@ class Session:
         self.ended += ended
 
     def take(self, *_: Any) -> None:
-        """Nothing arrives."""
+        """Do nothing, because no telemetry arrives."""
 
     def reports(self) -> list[Report]:
         found, self._reports = self._reports, []

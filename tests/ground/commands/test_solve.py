@@ -1,4 +1,4 @@
-"""Tests of `knightcube solve`: from an image file to an attitude, its stars, and a plot."""
+"""Tests of `knightcube solve`, which gives the attitude of an image, its stars, and a plot."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> Non
 
 
 def test_the_date_takes_aberration_off(picture: Path) -> None:
-    """The stars were rendered without aberration. Correcting it moves the attitude by at most 20.5"."""
+    """The stars were rendered without aberration. Its correction changes the attitude by at most 20.5"."""
     without = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
     with_it = command("solve", picture, "--fov", "12", "--date", "2026-07-02T12:00", "--json")
     facts = json.loads(with_it.stdout)
@@ -190,7 +190,8 @@ def test_the_world_coordinates_put_the_stars_where_the_picture_has_them(
         assert _sky_of(wcs, x, y, crval) == pytest.approx(
             (place["right_ascension_deg"], place["declination_deg"]), abs=1e-6
         )
-    # From pixel to sky by the forward polynomials and back by the inverse polynomials, out to the corners.
+    # The conversions from pixel to sky (forward polynomials) and back (inverse polynomials) agree out to the
+    # corners.
     x, y = 400.0, -350.0
     u, v = x + _polynomial(wcs, "A", x, y), y + _polynomial(wcs, "B", x, y)
     assert (u + _polynomial(wcs, "AP", u, v), v + _polynomial(wcs, "BP", u, v)) == pytest.approx(

@@ -87,7 +87,7 @@ def test_a_watch_ends_with_the_flight_or_fails_when_its_log_stops_growing(tmp_pa
 
 
 def answer(count: int) -> Any:
-    """Return an answer of a flight to a ping."""
+    """Return a reply of a flight to a ping."""
     packer = Packer()
     raw = packed(packer, MODE, 0.5, mode=int(Mode.HOLD)) + packed(
         packer, EVENT, 1.0, name="started", text="now"

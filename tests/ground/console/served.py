@@ -24,7 +24,7 @@ def asked(
     send: Any = None,
     access: Access | None = None,
 ) -> Any:
-    """Serve a run, and return the response to a client that is admitted unless `access` says otherwise."""
+    """Serve a run, and return the response to a client, which is admitted unless `access` differs."""
 
     async def talk(history: History) -> Any:
         place = FlightSurroundings.of(folder / "config.yaml")
@@ -34,7 +34,8 @@ def asked(
         console.read()
         door = access or Access(lambda token: None)
         server = TestServer(application(console, door), host="127.0.0.1")
-        async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:  # also of numeric hosts
+        # Cookies are also accepted from numeric hosts.
+        async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:
             if access is None:
                 async with client.get("/", params={"token": door.token}) as answer:
                     assert answer.status == 200

@@ -17,7 +17,7 @@ from tests.flight.link.process.filed_ends import FiledEnds
 
 
 class Ends(FiledEnds):
-    """Both ends of a link. The console is the only program at the ground end."""
+    """Both ends of a link, with the console as the only program at the ground end."""
 
     def collect(self) -> None:
         """Keep the telemetry for the console."""

@@ -1,4 +1,4 @@
-"""Tests of the console's history: each packet once, peaks kept, and the state at an instant."""
+"""Tests of the console's history: each packet occurs once, peaks are kept, and states at an instant."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
         async with client.ws_connect("/api/live", origin=own(client)) as line:
             first = (await line.receive_json())["time"]
             growing.write_bytes(data)
-            for _ in range(10):  # pushes, ten a second
+            for _ in range(10):  # waits for pushes, which come ten times a second
                 if (time := (await line.receive_json())["time"]) > first:
                     break
             return first, time
@@ -415,7 +415,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
         pytest.approx(0.0, abs=0.3),
         pytest.approx(1.9, abs=0.5),
     )
-    # The zenith direction is opposite to nadir, and the ground track passes below the satellite.
+    # The zenith direction is opposite to nadir, and the ground track is below the satellite.
     track = np.array(FlightSurroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)

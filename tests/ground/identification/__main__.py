@@ -16,7 +16,7 @@ from tests.ground.identification.worlds import believed, drawn, fly_bare, fly_st
 
 
 def main() -> int:
-    """Fly, fit, and compare with the truth."""
+    """Run flights in random worlds, fit their constants, and compare the results with the truth."""
     parser = argparse.ArgumentParser(prog="python -m tests.ground.identification", description=__doc__)
     parser.add_argument("--runs", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
@@ -41,7 +41,7 @@ def main() -> int:
         error = motion_error(world, found.constants)
         motion.append((error, found.covariance[:3, :3]))
         plant = absolute(found, prior_of(config), record.field)
-        # One of the six is a combination of the first three and the last two, so it is omitted.
+        # One of the six constants is a combination of the first three and the last two, so it is omitted.
         keep = [0, 1, 2, 4, 5]
         scaled.append((scale_error(world, plant)[keep], plant.covariance[np.ix_(keep, keep)]))
         relative.append(np.abs(error) / world.constants.to_array()[:3])

@@ -25,7 +25,7 @@ def controller(**changes: float) -> ExcitationController:
 
 
 def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_reach() -> None:
-    """Integrate a double integrator exactly under the pulses."""
+    """The motion of a free body (a double integrator) under the pulses is integrated exactly."""
     strength, reach = 0.02, 0.5
     for manoeuvre in manoeuvres(strength, reach, 45.0):
         angle = rate = farthest = 0.0
@@ -49,7 +49,7 @@ def test_within_the_drawn_worlds_the_body_stays_within_half_and_the_current_with
 
 
 def test_a_body_far_livelier_than_believed_is_caught_before_the_bound() -> None:
-    """The acceleration is three times the assumed one: without feedback the pulses would reach q2 = 0.52."""
+    """At three times the assumed acceleration, the pulses would reach q2 = 0.52 without feedback."""
     record = fly_bare(replace(USUAL, inertia=USUAL.inertia / 3.0), 60.0)
     assert np.sin(0.5 * np.max(np.abs(record.angle))) < usual_excitation().largest_q2
     pulses = manoeuvres(1.0, 3.0 * 0.45 * 2.0 * math.asin(usual_excitation().largest_q2), 45.0)[1]

@@ -31,7 +31,7 @@ NOISE = noise_of(believed())
 
 
 def chi_square(found: list[Identified], off: float = 1.0) -> float:
-    """Return the sum over all worlds for gain, torsion and damping; `off` changes the true gain."""
+    """Return the chi-square of gain, torsion and damping over all worlds; `off` changes the true gain."""
     total = 0.0
     for world, _, made in found:
         error = motion_error(replace(world, dipole=world.dipole * off), made.constants)
@@ -40,7 +40,7 @@ def chi_square(found: list[Identified], off: float = 1.0) -> float:
 
 
 def test_the_truth_lies_within_the_stated_uncertainty_in_all_worlds(identified: list[Identified]) -> None:
-    """Chi-square of 4 worlds x 3 constants in its 99.8 % band, which a gain error of 0.5 % would exceed."""
+    """The chi-square of 4 worlds x 3 constants is in its 99.8 % band; a gain error of 0.5 % exceeds it."""
     low, high = chi2.ppf([0.001, 0.999], 3 * len(identified))
     assert low < chi_square(identified) < high
     assert chi_square(identified, off=1.005) > high
@@ -78,7 +78,7 @@ def test_a_delay_of_the_coils_is_distinguished_from_the_torque() -> None:
 
 
 def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
-    """The body is held for ten samples and then released, an impulse that no constants explain."""
+    """The body is held for ten samples and then released, a motion that no constants explain."""
     record = fly_bare(USUAL, 40.0)
     held = np.arange(len(record.time)) < 10
     noise = record.angle - np.where(held, 0.3, record.angle)
@@ -175,7 +175,7 @@ def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
     states = [state]
     for begin, end in itertools.pairwise(time.tolist()):
         for span in ((begin, begin + 0.017), (begin + 0.017, end)):
-            middle = 0.5 * sum(span)  # the current is constant within a segment
+            middle = 0.5 * sum(span)  # middle of a segment of constant current
             solution = solve_ivp(lambda _, s, m=middle: motion(m, s), span, state, rtol=1e-11, atol=1e-13)
             state = solution.y[:, -1]
         states.append(state)

@@ -1,4 +1,4 @@
-"""Tests of the identification record of a flight: which data it takes from the log, and which it omits."""
+"""Tests of the identification record of a flight: which data of the log it includes, and which it omits."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_values_that_no_flight_writes_are_reported_as_damage(
     values = short[packet][field].copy()
     values[len(values) // 2] = value
     damaged = altered(short, packet, **{field: values})
-    if field == "sample_time_ns":  # irrelevant while the unit's clock runs
+    if field == "sample_time_ns":  # host times are irrelevant while the unit's clock runs
         damaged = altered(damaged, "imu", device_time_ns=values)
     with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
         recorded(damaged)

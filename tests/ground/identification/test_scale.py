@@ -1,4 +1,4 @@
-"""Tests of the scale: prior and magnetometer determine what motion does not, with a correct uncertainty."""
+"""Tests of the scale, which prior and magnetometer determine because motion does not, and its uncertainty."""
 
 from __future__ import annotations
 

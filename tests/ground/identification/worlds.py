@@ -1,4 +1,4 @@
-"""Testbeds that differ from the configured one by the stated accuracies, and flights in them."""
+"""Simulated testbeds that differ from the configured one by the stated accuracies, and flights in them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3
 
 @dataclass(frozen=True)
 class World:
-    """True constants: `dipole` is n A per commanded ampere, `magnetometer` its scale."""
+    """True constants of a testbed.
+
+    `dipole` is n A per commanded ampere, `magnetometer` the sensor's scale.
+    """
 
     inertia: float
     dipole: float
@@ -48,7 +51,7 @@ class World:
 
     @property
     def constants(self) -> MotionConstants:
-        """Constants divided by the inertia."""
+        """True constants divided by the inertia."""
         return MotionConstants(
             gain=self.dipole * self.field / self.inertia,
             torsion=self.stiffness / self.inertia,

@@ -46,7 +46,7 @@ def test_a_byte_that_no_token_has_is_refused_at_once(data: bytes) -> None:
 
 
 def test_how_much_of_a_token_is_right_is_not_disclosed() -> None:
-    """A wrong character at any position is refused only when the line is complete."""
+    """A token with a wrong character at any position is refused only when the line is complete."""
     for right in range(len(TOKEN)):
         wrong = TOKEN[:right] + ("1" if TOKEN[right] == "0" else "0") + TOKEN[right + 1 :]
         stream = CommandStream(TOKEN)
@@ -70,17 +70,17 @@ def changed(packet: bytes, at: int, value: int) -> bytes:
 @pytest.mark.parametrize(
     ("packet", "wrong"),
     [
-        (changed(PING, 0, PING[0] | 0x20), 0),  # version 1
-        (changed(PING, 0, PING[0] & ~0x10), 0),  # telemetry
+        (changed(PING, 0, PING[0] | 0x20), 0),  # a packet of version 1
+        (changed(PING, 0, PING[0] & ~0x10), 0),  # a telemetry packet
         (changed(PING, 0, PING[0] & ~0x08), 0),  # packet without a secondary header
-        (changed(PING, 1, 0xFF), 1),  # another application
-        (changed(PING, 2, 0x40), 2),  # a segment
-        (changed(PING, 4, 1), 4),  # longer than any ping
+        (changed(PING, 1, 0xFF), 1),  # a packet with the APID of another application
+        (changed(PING, 2, 0x40), 2),  # a packet that is a segment of a sequence
+        (changed(PING, 4, 1), 4),  # a length greater than that of any ping
         (changed(PING, 5, PING[5] + 1), 5),
         (changed(PING, 5, PING[5] - 1), 5),
         (changed(PING, 6, PING[6] + 1), 6),  # packet of an unknown version of the definition
-        (changed(UNIT, 4, 0xFF), 4),  # longer than any frame
-        (changed(UNIT, 4, 0)[:5] + b"\x00", 5),  # shorter than its headers
+        (changed(UNIT, 4, 0xFF), 4),  # a length greater than that of any frame
+        (changed(UNIT, 4, 0)[:5] + b"\x00", 5),  # a length shorter than the headers
         (UnitPacker(DOWN).pack(b"unit", 1), 0),
         (Packer().pack(HEALTH, 1, plain_contents(HEALTH)), 0),
         (b"POST / HTTP/1.1\r\n", 0),

@@ -37,7 +37,7 @@ def report(stage: Stage, text: str = "", counter: int = 0, spi: int = 1) -> Repo
 
 
 class FakeTerminal:
-    """A test double of the terminal: it stores sent packets and answers with given reports."""
+    """A test double of the terminal, which stores sent packets and replies with given reports."""
 
     packet_bytes = LONGEST_PACKET
 
@@ -269,7 +269,7 @@ def test_a_checksum_is_that_of_the_file(tmp_path: Path) -> None:
 
 
 def _answering(server: socket.socket, answer: bytes) -> threading.Thread:
-    """Answer one datagram in a thread."""
+    """Reply to one datagram in a thread."""
 
     def run() -> None:
         data, sender = server.recvfrom(4096)

@@ -35,7 +35,7 @@ PATIENCE_S = 60.0
 
 
 class Satellite:
-    """A test double of the terminal: it stores uplinked frames and returns downlinked frames."""
+    """A test double of the terminal, which stores uplinked frames and returns downlinked frames."""
 
     packet_bytes = 987
 

@@ -115,7 +115,7 @@ def cookie(ground: Ground) -> str:
 def _asked(
     port: int, method: str, path: str, headers: dict[str, str] | None = None, body: str | None = None
 ) -> tuple[int, str, str]:
-    """Return the status, the text and the cookie of an answer."""
+    """Return the status, the text and the cookie of a response."""
     line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     try:
         line.request(method, path, body, headers or {})
@@ -157,7 +157,7 @@ REQUESTS: list[tuple[str, str, dict[str, str], str | None]] = [
 def test_no_forged_request_is_obeyed_even_by_the_operators_browser(
     ground: Ground, cookie: str, forged: dict[str, str]
 ) -> None:
-    """Test requests with the cookie from a page with a rebound DNS name, and from other origins."""
+    """The requests have the cookie, and come from a page with a rebound DNS name or from other origins."""
     headers = {name: text.replace("PORT", str(ground.console)) for name, text in forged.items()}
     for method, path, more, body in REQUESTS:
         status, text, _ = _asked(ground.console, method, path, {**headers, **more, "Cookie": cookie}, body)
@@ -167,7 +167,7 @@ def test_no_forged_request_is_obeyed_even_by_the_operators_browser(
 
 @pytest.mark.parametrize("session", ["", "knightcube-console-PORT=", "knightcube-console-PORT=" + "A" * 43])
 def test_without_the_token_nothing_is_obeyed(ground: Ground, cookie: str, session: str) -> None:
-    """Test requests of a program on the same machine, which can state any Host and Origin."""
+    """The requests come from a program on the same machine, which can state any Host and Origin."""
     del cookie  # the token in the printed address is already used
     used = ground.url.partition("?")[2]
     headers = {
@@ -209,7 +209,7 @@ def _rest(line: socket.socket) -> bytes:
 
 
 def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
-    """If this test passes, the other tests refuse requests because of their sender."""
+    """This test shows that the requests of the other tests are refused only because of their sender."""
     with socket.create_connection(("127.0.0.1", ground.gateway), PATIENCE_S) as line:
         line.sendall(token_path(ground.keys, ground.gateway).read_bytes() + SAFE)
         assert len(ground.obeyed(PATIENCE_S)) == 1
@@ -222,7 +222,7 @@ def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
 def test_another_user_finds_no_token(ground: Ground) -> None:
-    """In this test, all users may enter the key folders, although no command makes them so."""
+    """In this test all users may enter the key folders, although no command creates such folders."""
     places = [token_path(ground.keys, ground.gateway), *sorted(ground.keys.glob("spi-*"))]
     places += [Path(f"/proc/{pid}/{name}") for pid in ground.processes for name in ("environ", "mem")]
     token = places[0].read_text(encoding="ascii").strip()
@@ -311,7 +311,7 @@ def context(ground: Ground, cookie: str) -> Iterator[Any]:
 
 
 def _attacked(ground: Ground, context: Any, origin: str, host: str) -> list[object]:
-    """Let a page at `origin` send its requests to both programs at `host`, and return the results."""
+    """Make a page at `origin` send its requests to both programs at `host`, and return the results."""
     page = context.new_page()
     page.goto(origin)
     console, gateway = (f"http://{host}:{port}/" for port in (ground.console, ground.gateway))
@@ -325,7 +325,7 @@ def _attacked(ground: Ground, context: Any, origin: str, host: str) -> list[obje
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["127.0.0.1", "evil.example"])
 def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, context: Any, name: str) -> None:
-    """Test a page on a different port of the same host (with cookies), and a page of a different site."""
+    """The pages are on a different port of the same host (with cookies), and on a different site."""
     with browser.another_origin() as url:
         found = _attacked(ground, context, url.replace("127.0.0.1", name), "127.0.0.1")
     assert set(found) <= {0, "refused"}, "0 is the status of an answer that the page may not read"
@@ -334,7 +334,7 @@ def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, con
 
 @pytest.mark.slow
 def test_a_page_whose_name_is_rebound_to_loopback_is_not_obeyed(ground: Ground, context: Any) -> None:
-    """The page has the origin of the console's port, so the browser permits it to read all answers."""
+    """The page has the origin of the console's port, so the browser permits it to read all responses."""
     origin = f"http://evil.example:{ground.console}/start"
     context.route(origin, lambda route: route.fulfill(content_type="text/html", body="<!doctype html>"))
     found = _attacked(ground, context, origin, "evil.example")

@@ -1,4 +1,4 @@
-"""An artificial run with known figures: each step is the noise-free response of a second-order system.
+"""An artificial run with known results: each step is the noise-free response of a second-order system.
 
 The body follows y(t) = 1 - exp(-z w t) (cos(wd t) + z/sqrt(1 - z^2) sin(wd t)), wd = w sqrt(1 - z^2), in each
 step. The overshoot is exp(-pi z/sqrt(1 - z^2)). The coil carries `CURRENT` for the first `PULSE_S` of every
@@ -30,7 +30,7 @@ STREAK_ERROR = 2e-4  # error of each streak rate about the thread, rad/s, altern
 
 @dataclass(frozen=True)
 class Recipe:
-    """Recipe of a run: `duration` of `planned` s, a target every `hold` s, a rate `rate_hz`, and extras.
+    """Parameters of a run: `duration` of `planned` s, a target every `hold` s, `rate_hz`, and extras.
 
     `bus_power` (W) is measured each second by a monitor in the coils' supply; None without a monitor.
     """
@@ -79,7 +79,7 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
     time, q2, rate = trajectory(recipe)
     stamps = np.round(time * 1e9).astype(np.int64).tolist()
     current = np.where(time % recipe.hold < PULSE_S, CURRENT, 0.0)
-    spent = np.concatenate([[0.0], np.cumsum(current[:-1] * np.diff(time))])  # A s
+    spent = np.concatenate([[0.0], np.cumsum(current[:-1] * np.diff(time))])  # charge, A s
     if recipe.identity:
         logs["flight"].write(_identity(packer, recipe))
     frame = round(5.0 * recipe.rate_hz)
@@ -161,7 +161,7 @@ def _housekeeping(packer: Packer, stamp: int, bus_power: float) -> bytes:
 
 
 def _truth(packer: Packer, stamp: int, q2: float, rate: float, current: float, spent: float) -> bytes:
-    sign = -1.0 if stamp % 2_000_000_000 == 0 else 1.0  # q and -q are one attitude
+    sign = -1.0 if stamp % 2_000_000_000 == 0 else 1.0  # q and -q represent the same attitude
     return packer.pack(
         table.TRUTH,
         stamp,

@@ -72,7 +72,7 @@ def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
 
 
 def test_the_thesis_line_stands_beside_the_supply_power_and_r_i_squared_apart(tmp_path: Path) -> None:
-    """A current of 0.1 A in a tenth of the time takes 34 mW at 3.4 V and 50 mW from the bus."""
+    """A current of 0.1 A for a tenth of the time takes 34 mW at 3.4 V and 50 mW from the bus."""
     signals, ax = RunSignals(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots()
     panels.power(ax, signals)
     drawn = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in ax.get_lines()}

@@ -1,4 +1,4 @@
-"""Tests of the figures of an orbit run: pointing errors, verdicts on requirements, and residual dipole."""
+"""Tests of an orbit run's results: pointing errors, verdicts on requirements, and residual dipole."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 NAN3 = (math.nan,) * 3
 PERIOD_S, SECOND_AIM_S, SLEWED_S, DURATION_S = 10, 1000, 1700, 2000
 OFF_DEG = (3.0, 4.0, 12.0)
-"""Pointing errors about x, y and z after settling; before settling they are ten times as large."""
+"""Pointing errors (deg) about x, y and z after settling; before settling they are ten times as large."""
 LIMITS = "requirements: {slow_within: 100.0, knowledge_deg: 0.1, pointing_deg: %s}"
 
 
@@ -162,7 +162,7 @@ TRUE = np.array([6e-4, 0.0, 8e-4])
 
 
 def dipole_flight(known: bool = True) -> Run:
-    """Return a run with a dipole error of a half, later a tenth, and in shadow a fifth of the dipole."""
+    """Return a run whose dipole error is half, later a tenth, and in shadow a fifth of the dipole."""
     times = np.arange(END)
     share = np.where(times < SHADOW - JUDGED, 0.5, np.where(times < SHADOW, 0.1, 0.2))
     packets = np.zeros(END, dtype=[("time_ns", "i8"), ("residual_dipole", "f8", 3)])

@@ -1,4 +1,4 @@
-"""Tests of the figures of an orbit run from artificial packets, with results computed by hand."""
+"""Tests of an orbit run's results from artificial packets, against values computed by hand."""
 
 from __future__ import annotations
 
@@ -213,8 +213,8 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
     sigmas = {f"{name}_sigma": [0.1] * 9 for name in matrices}
     inertia = [0.3, 0.3, 0.4, 0.0, 0.0, 0.1]
     doubled = [2.0 * one for one in inertia]
-    # The body's attitude has the whole misalignment as its error; the star camera's attitude has 1e-4 rad
-    # about x.
+    # The error of the body's attitude is the whole misalignment; that of the star camera's attitude is 1e-4
+    # rad about x.
     body = from_rotation_vector(tilt + np.array([1e-4, 0.0, 0.0])).tolist()
     run = packed_run(
         navigation=[(0.0, {"knowledge": 2})],

@@ -1,4 +1,4 @@
-"""Tests of the signals of a run from artificial packets, with results computed by hand."""
+"""Tests of the signals of a run from artificial packets, against values computed by hand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_the_energy_and_averages_weigh_each_interval_by_its_length() -> None:
 
 
 def test_the_truth_is_interpolated_between_close_records_and_unknown_elsewhere() -> None:
-    """The body turns by 0.02 rad per 0.025 s; the second record has the other sign of the quaternion."""
+    """The body rotates by 0.02 rad per 0.025 s; the second record has the quaternion's opposite sign."""
     times = (0.0, 1.0, 1.01, 1.025, 1.5, 2.0, 2.01)
     half = {1.0: 0.0, 1.01: 0.004, 1.025: 0.01, 2.0: 0.05}
     sign = {1.0: 1.0, 1.025: -1.0, 2.0: 1.0}

@@ -1,4 +1,4 @@
-"""Tests of the fraction of the star camera's unobstructed instants with an attitude or a rate."""
+"""Tests of the fraction of unobstructed instants at which the star camera gave an attitude or a rate."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ END = 200
 PERIOD, FINE_PERIOD, FINE_FROM = 5, 10, 100
 """Periods (s) of the configured camera, and the time (s) from which the attitude is fine."""
 FAST_UNTIL, HIDDEN = 20, (50, 80)
-"""Time (s) until which the body is too fast for the camera, and times (s) of the Earth in the exclusion
-cone.
+"""Time (s) until which the body is too fast for the camera, and interval (s) with the Earth in the
+exclusion cone.
 """
 
 
@@ -86,7 +86,7 @@ def flight(gave: list[float]) -> Run:
 
 
 FIRST_FINE = FINE_FROM + PERIOD
-"""First instant (s), 10 s after the last instant before the attitude was fine."""
+"""First instant (s) with a fine attitude, 10 s after the previous instant."""
 SLOW = [*range(FAST_UNTIL, FINE_FROM, PERIOD), *range(FIRST_FINE, END - FINE_PERIOD, FINE_PERIOD)]
 FREE = [at for at in SLOW if not HIDDEN[0] <= at < HIDDEN[1]]
 

@@ -1,4 +1,4 @@
-"""Tests of the figures of Table 5.3 with signals whose figures have a closed form."""
+"""Tests of the step results of Table 5.3, with signals whose results have a closed form."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_steps_run_from_target_to_target_and_the_first_from_the_release() -> Non
 
 
 def test_a_step_begins_where_the_body_was_unless_the_body_held_the_target_before() -> None:
-    """The second command comes when the body is half way to the first target.
+    """The second target is commanded when the body is half way to the first target.
 
     A mode change ends the third step.
     """

@@ -73,7 +73,7 @@ def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
 
 
 def test_supply_power_and_heat_are_means_from_the_true_energies(full: Run) -> None:
-    """The coil carries 0.1 A in a tenth of the time."""
+    """The coil carries 0.1 A for a tenth of the time."""
     power = summarise(full)["power"]
     assert power["source"] == "truth"
     assert power["heat_average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
@@ -180,7 +180,7 @@ def test_without_a_monitor_the_power_at_the_bus_is_unknown(tmp_path: Path) -> No
 
 
 def test_the_supply_power_is_judged_by_the_thesis_whatever_r_i_squared_is(tmp_path: Path) -> None:
-    """0.11 W at the coils and 0.16 W at the bus against 0.10 W; R I^2 is 0.01 W."""
+    """Powers of 0.11 W at the coils and 0.16 W at the bus exceed 0.10 W; R I^2 is only 0.01 W."""
     log, packer = FlightLog(tmp_path, "truth", clock=ManualClock()), Packer()
     for i in range(100):
         log.write(

@@ -48,8 +48,8 @@ class IoctlCamera:
             error.
         stamps_packets: whether time stamps are those of the first packet, as with uvcvideo.
         spoil, shorten: numbers of frames with an error flag, or with half their bytes.
-        frozen: the sequence number stands still.
-        belies_exposure: frames come at `shortest_ns` however long they should be exposed.
+        frozen: whether the sequence number stays constant.
+        belies_exposure: whether frames come every `shortest_ns`, whatever exposure is set.
         stopped: whether the camera has stopped sending frames.
         absurd: wrong time stamps of single frames, by frame number.
         raw: content of each frame instead of a pattern, and its number of used bytes.
@@ -113,7 +113,7 @@ class IoctlCamera:
         self._pending: list[tuple[int, int]] = []  # delay (frames), exposure
 
     def __call__(self, _: int, request: int, argument: Any) -> int:
-        """Answer one ioctl like the kernel. Raises OSError like the kernel."""
+        """Perform one ioctl like the kernel. Raises OSError like the kernel."""
         if not self.plugged:
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
         answers: dict[int, Callable[[Any], None]] = {
@@ -152,7 +152,7 @@ class IoctlCamera:
 
     def _querycap(self, answer: v4l2.Capability) -> None:
         answer.driver, answer.card = self.driver, self.card
-        answer.capabilities = self.capabilities | 0x2 | v4l2.CAP_DEVICE_CAPS  # output too
+        answer.capabilities = self.capabilities | 0x2 | v4l2.CAP_DEVICE_CAPS  # also capable of video output
         answer.device_caps = self.capabilities
 
     def _enum_fmt(self, answer: v4l2.FormatDescription) -> None:

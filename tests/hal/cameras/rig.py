@@ -32,7 +32,7 @@ SETTLED_NS = 400_000_000
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A frame source, its clock, and the function that unplugs it, or None."""
+    """A frame source, its clock, and the function that unplugs it (None if it cannot be unplugged)."""
 
     source: FrameSource
     clock: Clock
@@ -40,7 +40,7 @@ class Rig:
     unplug: Callable[[], None] | None
 
     def wait(self, span_ns: int) -> None:
-        """Let time pass."""
+        """Advance the clock, or wait on a real clock."""
         self.clock.sleep_until_ns(self.clock.now_ns() + span_ns)
 
     def frame_within(self, span_ns: int) -> Frame | None:

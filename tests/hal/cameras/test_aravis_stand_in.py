@@ -17,7 +17,7 @@ MS = 1_000_000
 
 
 class GlibError(Exception):
-    """Stands for GLib.Error."""
+    """Test double of GLib.Error."""
 
 
 class FakeBuffer:
@@ -203,7 +203,7 @@ class Rig:
         return found
 
     def arrive(self, number: int, status: int = 0, size: int = 640 * 480 * 2) -> None:
-        """Let a frame arrive."""
+        """Make a frame arrive."""
         data = (np.arange(size // 2) % 4096).astype("<u2").tobytes()
         self.stream.finished.append(FakeBuffer(number, data, status))
 

@@ -50,7 +50,7 @@ def test_neither_trigger_nor_poll_waits_for_a_camera_that_hangs() -> None:
     camera = ServedCamera(device, clock)
     camera.trigger(1_000_000)
     assert device.begun.wait(WAIT_S)
-    # The job is now inside the camera. If it held a lock, the following calls would block forever.
+    # The job is now waiting inside the camera. If it held a lock, the following calls would block forever.
     camera.trigger(2_000_000)
     assert camera.poll() is None
     device.go.set()

@@ -368,7 +368,7 @@ def test_no_such_camera_names_the_cure(tmp_path: Path, kernel: IoctlCamera, cloc
 def test_a_path_that_is_not_a_video_device_is_refused(tmp_path: Path, clock: ManualClock) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"")
-    kernel = IoctlCamera(tmp_path, clock.now_ns)  # the binding asks the real kernel
+    kernel = IoctlCamera(tmp_path, clock.now_ns)  # the binding calls the real kernel here
     with pytest.raises(Refused, match="is not a V4L2 device"):
         video_rig(kernel, clock, path=str(path))
     kernel.close()

@@ -62,7 +62,7 @@ BAYER = {
     "10P": "pBAA pGAA pgAA pRAA",
     "12P": "pBCC pGCC pgCC pRCC",
 }
-"""Names of the Bayer formats with the orders BGGR, GBRG, GRBG and RGGB, by the end of the kernel's names."""
+"""Names of the Bayer formats in the orders BGGR, GBRG, GRBG and RGGB, by the suffix of the kernel's names."""
 MONO = {"Mono8", "Mono10", "Mono12", "Mono16"}
 CONSTANTS = {
     "V4L2_BUF_FLAG_ERROR": v4l2.FLAG_ERROR,

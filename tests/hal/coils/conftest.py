@@ -14,7 +14,7 @@ from tests.manual_clock import ManualClock
 
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> IoctlWire:
-    """Replace the kernel's I2C by an emulated bus. Each file that opens is then an adapter."""
+    """Replace the kernel's I2C by an emulated bus. Every file that can be opened then acts as an adapter."""
     wire = Wire(ManualClock(), THESIS, uncertainty=0.0)
     return _replace_ioctl(monkeypatch, wire)
 

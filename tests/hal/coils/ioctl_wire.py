@@ -33,7 +33,7 @@ class IoctlWire:
         self.slave_error = 0
 
     def __call__(self, descriptor: int, request: int, argument: Any = 0) -> int:
-        """Answer one ioctl as the kernel would; raises OSError as it would."""
+        """Perform one ioctl like the kernel. Raises OSError like the kernel."""
         if request == smbus2.I2C_FUNCS:
             argument.value = self.functions
         elif request == smbus2.I2C_SLAVE:

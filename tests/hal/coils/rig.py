@@ -18,7 +18,7 @@ from tests.manual_clock import ManualClock
 PCA, INA = 0x40, 0x45
 THESIS_COILS = (CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0), CoilWiring(4, 5, 23.0))
 THESIS = CoilSettings(THESIS_COILS, supply_voltage=3.4, current_limit=0.148, stale_after=0.25)
-"""Sease 2013, ch. 5."""
+"""Coil settings of the thesis (Sease 2013, ch. 5)."""
 UNEQUAL = dataclasses.replace(
     THESIS,
     coils=(

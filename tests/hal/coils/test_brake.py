@@ -50,7 +50,7 @@ def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig
 
 
 def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
-    """A bridge is not braked on suspicion alone: the current is checked, and the brake is released."""
+    """A bridge does not stay braked on suspicion alone: the current is checked, and the brake released."""
     rig = stuck(CoilCondition.A_LOW)
     assert rig.currents() == [0.0, 0.0, 0.0]
     rig.coils.brake(Y)

@@ -29,7 +29,7 @@ USUAL = st.floats(-0.25, 0.25)
 def test_the_world_feels_what_was_commanded_within_half_a_count(
     command: tuple[float, float, float], limit: float
 ) -> None:
-    """Coils of unequal resistance; one coil is connected with reversed polarity."""
+    """The coils have unequal resistances, and one coil is connected with reversed polarity."""
     rig = Rig(limited_to(limit))
     rig.coils.start()
     rig.command(*command)
@@ -94,7 +94,7 @@ def test_both_inputs_are_low_at_zero_and_the_idle_one_otherwise(rig: Rig) -> Non
 
 
 def test_start_leaves_a_running_chip_at_zero(rig: Rig) -> None:
-    """A process has died while its coils were driven."""
+    """A previous process has ended while its coils were driven."""
     rig.pca.configure()
     rig.pca.write_channels(0, [(0, 3000), (0, 4096)])
     assert rig.currents()[0] != 0.0

@@ -41,7 +41,7 @@ class Bench:
 
 @pytest.mark.parametrize("currents", [[0.148, -0.148, 0.0], [0.004, -0.0115, 0.02], [0.1, 0.05, -0.0333]])
 def test_the_mean_current_is_the_command_although_the_steps_are_coarse(currents: list[float]) -> None:
-    """One step is 3.5 mA, and the smallest driven current 21 mA."""
+    """One step of the bridge is 3.5 mA, and its smallest driven current is 21 mA."""
     np.testing.assert_allclose(Bench().mean(currents), currents, atol=6e-4)
 
 

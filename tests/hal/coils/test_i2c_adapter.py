@@ -71,7 +71,7 @@ def test_faults_of_the_wire_meet_messages_too(bus: SMBus, kernel: IoctlWire) -> 
 def test_what_the_adapter_cannot_do_is_refused_like_the_kernels(
     kernel: IoctlWire, size: int, code: int
 ) -> None:
-    """A block whose length the part sends, a block process call, and a block of 33 bytes."""
+    """The refused transfers are a block with length from the device, a block process call, and 33 bytes."""
     with pytest.raises(OSError, match=r"offered|33 bytes") as caught:
         smbus(kernel.wire, PCA, True, 0x06, size, bytes((33,)))
     assert caught.value.errno == code

@@ -36,7 +36,7 @@ def test_what_cannot_be_measured_is_refused(current: float, shunt: float) -> Non
 
 
 def test_readings_follow_the_coils(rig: Rig) -> None:
-    """Two coils fully on are not chopped: 2 x 3.4 V/23 ohm, 0.1 mA resolution; 3.4 V is 850 steps."""
+    """Two fully driven coils draw 2 x 3.4 V/23 ohm, read to 0.1 mA; 3.4 V is 850 steps."""
     rig.coils.start()
     monitor: PowerMonitor = Ina219(rig.bus, INA, rig.clock)
     assert monitor.latest() is None
@@ -76,7 +76,7 @@ def test_a_chopped_current_is_read_to_the_7_percent_of_five_conversions(rig: Rig
 def test_a_chopped_current_is_averaged_over_several_conversions(
     averaged: int, least: float, most: float
 ) -> None:
-    """Pulses for 10 % of 19.988 ms, integrated exactly over each window; the worst of 20 s of readings."""
+    """Pulses of 10 % of 19.988 ms are integrated exactly; the worst of 20 s of readings is checked."""
     period, duty, amps = 19.988e6, 0.1, 3.4 / 23.0
 
     def charge(time_ns: int) -> float:
@@ -138,7 +138,7 @@ def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
     found = []
     for current in (0.2, 1.0, 0.1):
         amps[0] = current
-        clock.advance(1400 * MS)  # until the mean includes only valid samples again
+        clock.advance(1400 * MS)  # until the mean again includes only valid samples
         reading = monitor.latest()
         assert reading is not None
         assert monitor.error() == ""
@@ -147,7 +147,7 @@ def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
 
 
 def test_an_overflow_of_the_chips_mathematics_is_an_error() -> None:
-    """Another program has written Calibration: 7000 x 65534 / 4096 exceeds the register Current."""
+    """Another program has written Calibration, so that 7000 x 65534 / 4096 exceeds the register Current."""
     clock = ManualClock()
     rig = Rig(clock=clock)
     rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, 0.7)))

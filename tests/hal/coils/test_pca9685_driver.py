@@ -26,12 +26,12 @@ class Recorder(EmulatedI2cBus):
         self.written: list[tuple[int, list[int], int]] = []
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte, and note it with its time."""
+        """Write one byte, and record it with its time."""
         self.written.append((register, [value], self._clock.now_ns()))
         super().write_byte_data(address, register, value)
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
-        """Write a block, and note it with its time."""
+        """Write a block, and record it with its time."""
         self.written.append((register, list(values), self._clock.now_ns()))
         super().write_i2c_block_data(address, register, values)
 
@@ -60,7 +60,7 @@ def test_a_frequency_that_the_chip_cannot_make_is_refused(frequency: float) -> N
 def test_set_up_follows_the_data_sheet_with_all_off_first(
     recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
 ) -> None:
-    """All off, sleep, PRE_SCALE while asleep, wake with auto-increment, wait 500 us, totem pole."""
+    """The sequence is all off, sleep, PRE_SCALE, wake with auto-increment, wait of 500 us, totem pole."""
     pca, bus, chip = recorder
     pca.configure()
     assert [(register, values) for register, values, _ in bus.written] == [
@@ -78,7 +78,7 @@ def test_set_up_follows_the_data_sheet_with_all_off_first(
 def test_a_chip_left_running_is_switched_off_before_anything_else(
     recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
 ) -> None:
-    """A dead process has left MODE1 = 0x20 and driven channels."""
+    """A previous process has left MODE1 = 0x20 and driven channels."""
     pca, bus, chip = recorder
     pca.configure()
     pca.write_channels(0, [FULL_ON, (0, 100)])
@@ -166,7 +166,7 @@ def test_a_silent_chip_is_named_with_what_to_check(rig: Rig) -> None:
 
 
 def test_switch_off_works_in_every_state_of_the_chip(rig: Rig) -> None:
-    switch_off(rig.bus, PCA)  # after power-on, with SLEEP set
+    switch_off(rig.bus, PCA)  # the chip is in its state after power-on, with SLEEP set
     rig.pca.configure()
     rig.pca.write_channels(0, [FULL_ON] * 8)
     rig.pca.write_channels(8, [(0, 2000)] * 8)

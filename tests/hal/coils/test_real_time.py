@@ -17,7 +17,7 @@ from tests.hal.coils.rig import INA, PCA, THESIS, Wire
 
 
 def eventually(condition: Callable[[], bool], within: float = 5.0) -> bool:
-    """Wait for a condition of another thread."""
+    """Wait until a condition that another thread sets is true."""
     deadline = time.monotonic() + within
     while not condition():
         if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""A bus that logs the bytes written to it, opened by a guardian as `tests.hal.guardian.byte_log:open_bus`.
+"""A bus that logs written bytes; a guardian opens it as `tests.hal.guardian.byte_log:open_bus`.
 
 The module has few imports, because the guardian must stay small. While FILE.broken exists, the bus fails like
 a silent device.
@@ -12,7 +12,7 @@ import time
 
 
 class ByteLog:
-    """Appends (monotonic ns, address, register, value) to a file."""
+    """A bus that appends (monotonic ns, address, register, value) of each write to a file."""
 
     def __init__(self, path: str) -> None:
         self._path = path

@@ -1,4 +1,4 @@
-"""Stops, hangs and kills one flight process in several ways, and measures how long current still flows."""
+"""Stops, hangs and kills one flight process in several ways, and measures for how long current flows."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ _CALM_S = 1.2
 
 @dataclass(frozen=True)
 class Hurt:
-    """One act.
+    """Result of one act: a stop, hang or kill of a process.
 
-    Times are in s and the current in A; `recovered` counts from the end of the act; None if the process died.
+    Times are in s, and the current in A. `recovered` is counted from the end of the act, and None if the
+    process died.
     """
 
     act: str
@@ -30,7 +31,7 @@ class Hurt:
 
 @dataclass(frozen=True)
 class Campaign:
-    """All acts, the truth and events of the run, and the successive guardians."""
+    """Results of all acts, the truth and events of the run, and the successive guardian processes."""
 
     hurts: list[Hurt]
     truth: CoilTruth
@@ -42,7 +43,7 @@ class Campaign:
 def hurt_in_every_way(folder: Path) -> Campaign:
     """Stop and hang the flight process (two ways), kill and stop the guardian, and kill the flight process.
 
-    About ten seconds.
+    The acts take about ten seconds.
     """
     times: list[tuple[str, int, int | None]] = []
     guardians: list[int] = []

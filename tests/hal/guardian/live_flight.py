@@ -65,7 +65,7 @@ class LiveFlight:
         *more: str,
         before: str = "",
     ) -> None:
-        """Start it; `before` is a line of Python that its process runs first."""
+        """Start the flight; `before` is a line of Python that its process runs first."""
         self._notifications = notifications
         self.folder = folder / "run"
         words = [
@@ -99,7 +99,7 @@ class LiveFlight:
         raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
 
     def wait_until_driven(self, patience: float = 30.0) -> None:
-        """Wait until the truth ends with a quarter of a second of coil current, without a timeout."""
+        """Wait, without a timeout, until the truth ends with a quarter of a second of coil current."""
         deadline = time.monotonic() + patience
         begun = 0
         while time.monotonic() < deadline:

@@ -150,7 +150,7 @@ def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
 def test_a_guardian_that_hangs_is_replaced_and_reported(guardian: GuardianLine) -> None:
     first = guardian.process_id
     os.kill(first, signal.SIGSTOP)
-    for _ in range(400):  # ten seconds of heartbeats, more than its line takes
+    for _ in range(400):  # ten seconds of heartbeats, more than its pipe can hold
         guardian.beat()
     news_until(guardian, GuardianNews.READY)
     assert guardian.process_id != first

@@ -29,13 +29,13 @@ def at_rest(time_ns: int) -> BodyMotion:
 
 
 def turning(time_ns: int) -> BodyMotion:
-    """Rotate through q2 = 0 at 0.1 rad/s."""
+    """Return the motion of a body that rotates through q2 = 0 at 0.1 rad/s."""
     return about_thread(time_ns, 0.1 * (time_ns * 1e-9 - 2.0), 0.1, 4.5e-4)
 
 
 @dataclass(frozen=True, slots=True)
 class Alone:
-    """A world of one unit."""
+    """A world that consists of one VN-100."""
 
     unit: Vn100Emulator
 
@@ -44,7 +44,7 @@ class Alone:
         return self.unit.next_event_ns()
 
     def advance_to(self, time_ns: int) -> None:
-        """Let the unit act."""
+        """Advance the unit to a time."""
         self.unit.advance(time_ns)
 
     run_events = advance_to
@@ -52,7 +52,7 @@ class Alone:
 
 @dataclass(frozen=True, slots=True)
 class BenchLine:
-    """Everything on the bench."""
+    """Driver, emulated VN-100, line and clock."""
 
     clock: SimClock
     line: EmulatedSerialLine

@@ -33,11 +33,11 @@ class Bench:
         return [item for at, data in self.line.host.receive() for item in self.parser.feed(at, data)]
 
     def exchange(self, line: bytes, seconds: float = 0.02) -> list[Sentence]:
-        """Return the sentences that come after a command."""
+        """Return the sentences that arrive after a command."""
         self.line.host.send(line)
         return [item.sentence for item in self.run(seconds) if isinstance(item, AsciiLine)]
 
     def quiet(self) -> Bench:
-        """Pause its asynchronous output."""
+        """Pause the unit's asynchronous output."""
         self.exchange(build("ASY", 0), 0.05)
         return self

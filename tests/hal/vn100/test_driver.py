@@ -137,7 +137,8 @@ def test_the_data_sheets_noise_has_its_density_at_the_drivers_windows() -> None:
     bench = bench_line(at_rest, MISSION, Vn100EmulatorSettings(noise=PROFILES["datasheet"]))
     bench.driver.configure()
     readings = bench.run(50.0)
-    # Window 20 gives 0.016 deg/s and 0.63 mG; 2000 samples give a deviation to 1.6 %, five times that is 8 %.
+    # Window 20 gives 0.016 deg/s and 0.63 mG. From 2000 samples a deviation is known to 1.6 %; five times
+    # that is 8 %.
     rate = np.array([r.rate for r in readings])
     field = np.array([r.field for r in readings])
     assert rate.std(axis=0) == pytest.approx(np.full(3, np.radians(0.0035) * 20 / np.sqrt(20)), rel=0.08)

@@ -200,7 +200,7 @@ def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_r
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
     assert port._write_timeout < 1.0 / CONTROL_RATE_HZ
     with pytest.raises(NotResponding, match="the output queue is full"):
-        port.send(bytes(1 << 20))  # no process reads the other end
+        port.send(bytes(1 << 20))  # at this time, no process reads the other end
     os.close(near)
     port.close()
     os.close(far)

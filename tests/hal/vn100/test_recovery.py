@@ -53,7 +53,7 @@ def seconds_until_readings(bench: BenchLine, limit: float = 5.0) -> float:
 
 def reset(bench: BenchLine) -> None:
     bench.line.host.send(build("RST"))
-    bench.run(1.0)  # start of the VN-100: the fault has ended when it sends
+    bench.run(1.0)  # the VN-100 starts, and the fault has ended when it sends
 
 
 def lose_power(bench: BenchLine) -> None:

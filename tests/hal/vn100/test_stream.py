@@ -44,7 +44,7 @@ good = st.one_of(
     st.integers(0, 1000).map(packet),
     st.integers(0, 1000).map(lambda n: build("YPR", f"{n:+08.3f}", "+000.278", "-002.026", checksum="crc16")),
 )
-# Noise that contains many starts of packets and lines.
+# Strategy for noise that contains many starts of packets and lines.
 noise = st.lists(
     st.sampled_from([b"\xfa", b"\xfa\x01", b"\xfa\x05\x31", b"$", b"$VN", b"\r\n", b"*", b"\0", b"A"])
     | st.binary(max_size=8),
@@ -104,7 +104,7 @@ def test_no_single_flipped_bit_passes_and_the_next_packet_is_found() -> None:
 
 
 def test_no_burst_within_the_payload_passes() -> None:
-    """CRC-16 sees every burst of up to 16 bits."""
+    """CRC-16 detects every error burst of up to 16 bits."""
     rng = np.random.default_rng(5)
     sound = packet(1)
     for _ in range(500):

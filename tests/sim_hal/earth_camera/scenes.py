@@ -1,4 +1,4 @@
-"""Scenes for tests and campaigns: random low orbits, with horizon or Sun in view on request."""
+"""Scenes for tests and campaigns: random low orbits, optionally with the horizon or the Sun in view."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def limb_scene(
 ) -> EarthScene:
     """Return a scene above `zenith` (3,), the Sun towards `sun` (3,), and a horizontal limb in the centre.
 
-    `dip` (rad) rotates the boresight below the centre of the limb. The azimuth is that of the Sun, or that of
-    the pole if the Sun is overhead.
+    `dip` (rad) rotates the boresight below the centre of the limb. The camera's azimuth is that of the Sun,
+    or that of the pole if the Sun is overhead.
     """
     zenith = zenith / np.linalg.norm(zenith)
     side = np.cross(zenith, sun)
@@ -68,8 +68,8 @@ def random_scene(
 ) -> EarthScene:
     """Return a random scene with the horizon in view.
 
-    `view` states the light on the visible limb: all day, partly day and night, all night, or any. `accept`
-    may refuse a scene. Raises RuntimeError if none is found.
+    `view` states the illumination of the visible limb: all day, partly day and night, all night, or any.
+    `accept` may refuse a scene. Raises RuntimeError if none is found.
     """
     for _ in range(_MOST_DRAWS):
         scene = _draw(generator, model, altitudes)
@@ -103,8 +103,8 @@ def random_sun_scene(
         ray = model.lens.unit_vectors(point[None, :])[0]
         sun = random_direction(generator)
         roll = random_direction(generator)
-        # Camera axes and inertial axes are each built from the Sun direction and a second direction; the
-        # attitude relates them.
+        # The attitude follows from two triads, in camera axes and in inertial axes, each of the Sun direction
+        # and a second direction.
         camera = _triad(ray, np.array([0.6, 0.8, 0.0]))
         attitude = quaternion.from_matrix(camera.T @ _triad(sun, roll))
         position = (SEMI_MAJOR_AXIS + generator.uniform(*altitudes)) * random_direction(generator)
@@ -134,7 +134,7 @@ def _draw(
     upright = EarthScene(position, quaternion.IDENTITY, sun)
     limb, _ = limb_directions(upright, 720)
     target = limb[generator.integers(len(limb))]
-    # A boresight with the limb point within the circle around the detector.
+    # The boresight is chosen so that the limb point is within the circle around the detector.
     aside = generator.uniform(0.0, model.lens.half_diagonal)
     boresight = np.cos(aside) * target + np.sin(aside) * _normal_to(target, generator)
     attitude = pointing(boresight, _normal_to(boresight, generator))

@@ -31,13 +31,13 @@ def test_counts_grow_with_the_light_over_six_decades_evenly_by_its_logarithm() -
     light = LOGARITHMIC.darkest * 10.0 ** np.arange(0.0, 6.01, 0.25)
     mean = np.array([_even(LOGARITHMIC, value).mean() for value in light])
     assert np.all(np.diff(mean) > 0.0)
-    steps = np.diff(mean[6:-1])  # bin above the knee at the dark current
+    steps = np.diff(mean[6:-1])  # steps above the knee at the dark current
     assert steps == pytest.approx(0.25 * (255 - 8) / 6.0, abs=0.5)
     assert mean[-1] == pytest.approx(255, abs=1.0)
 
 
 def test_darkness_reads_the_pedestal_with_the_stated_noise() -> None:
-    """Rounding adds a twelfth of a count to the variance; 262,144 pixels give it to 0.3 %."""
+    """Rounding adds 1/12 count^2 to the variance, which 262,144 pixels give to 0.3 %."""
     for model, sigma in ((LOGARITHMIC, 0.7), (LINEAR, 20.0 / 80.0)):
         fine = EarthCameraModel.fuga15d(
             response=model.response,
@@ -158,7 +158,7 @@ def test_all_the_suns_light_arrives_pi_in_these_units() -> None:
 
 
 def test_the_discs_radius_is_the_suns() -> None:
-    """In a narrow camera, the rim is where the brightness is half of that of its neighbours."""
+    """In a narrow camera, the edge of the disc is where the brightness falls to half."""
     model = EarthCameraModel.fuga15d(scatter=0.0, field_of_view=np.radians(5.0))
     scene = _deep_space(ASTRONOMICAL_UNIT * np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]))
     across = expected_radiance(model, scene)[255]
@@ -254,10 +254,10 @@ def test_logarithmic_and_linear_frames_saturate_in_the_core_and_nowhere_in_the_d
 
 @pytest.mark.parametrize("aside", [1e-3, 1e-6, 1e-9])
 def test_a_sun_at_a_right_angle_to_the_boresight_leaves_no_disc(aside: float) -> None:
-    """Without folding by the lens, its image is at coordinates beyond the range of integers."""
+    """Its image, without folding by the lens, is at coordinates beyond the range of integers."""
     model = EarthCameraModel.fuga15d(scatter=0.0, k1=-0.05, k2=0.01)
     boresight = np.array([0.0, 1.0, 0.0])
-    # The rim of 0.27 deg crosses the plane beyond which the lens sees nothing.
+    # The Sun's disc with a radius of 0.27 deg crosses the plane beyond which the lens images nothing.
     for number in range(48):
         angle = number * (np.pi / 24.0)
         sun = np.array([np.sin(angle), aside, np.cos(angle)])

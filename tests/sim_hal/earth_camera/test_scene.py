@@ -1,4 +1,4 @@
-"""Tests of the Earth camera's scene: terminator, night, air, texture, and geometry of limb and nadir."""
+"""Tests of the Earth camera's scene: terminator, night, atmosphere, texture, geometry of limb and nadir."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_the_night_side_is_dark_and_its_limb_too() -> None:
 
 
 def test_brightness_under_the_sun_is_that_of_matt_ground_seen_through_air() -> None:
-    """It is between those of sea and clouds, each dimmed twice by the air, plus the light of the air."""
+    """It is between those of sea and clouds, each dimmed twice by the air, plus scattered light."""
     light = expected_radiance(QUIET, _nadir_scene(np.array([1.0, 0.0, 0.0])))[206:306, 206:306]
     dimmed = np.exp(-2.0 * AIR.optical_depth)
     haze = 1.5 * 0.375 * (1.0 - np.exp(-AIR.optical_depth))
@@ -221,7 +221,7 @@ def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
 
 
 def test_the_sunlit_limb_has_half_its_brightness_at_the_published_height() -> None:
-    """Down a column, the brightness reaches half of its value at the tangent point of the ground."""
+    """Along an image column, the brightness at this height is half of that at the ground's tangent point."""
     scene = limb_scene(600e3, zenith=np.array([0.3, 0.2, 0.9]), sun=np.array([0.5, 0.2, 0.8]))
     narrow = EarthCameraModel.fuga15d(scatter=0.0, blur=0.0, field_of_view=np.radians(8.0))
     light = expected_radiance(narrow, scene)
@@ -253,7 +253,7 @@ def test_distortion_moves_the_limb_as_the_lens_says() -> None:
 
 
 def test_a_tilted_pole_carries_the_flattening_with_it() -> None:
-    """With the pole towards the camera, the limb is a circle; by default it is not."""
+    """With the pole towards the camera, the limb is a circle; with the default pole it is not."""
     position = np.array([SEMI_MAJOR_AXIS + 400e3, 0.0, 0.0])
     upright = EarthScene(position, quaternion.IDENTITY, SUN)
     lying = replace(upright, pole=np.array([1.0, 0.0, 0.0]), rotation=0.7)

@@ -62,7 +62,7 @@ def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilMon
 
 @dataclass
 class Watched:
-    """Results of a coil monitor: verdicts and corrections with times (s), and the coil currents (k, 3), A."""
+    """A coil monitor's verdicts and corrections with times (s), and the coil currents (k, 3), A."""
 
     watch: CoilMonitor
     found: list[tuple[float, str, str]]

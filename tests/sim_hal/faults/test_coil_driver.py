@@ -19,7 +19,10 @@ WANTED = np.array([0.06, 0.0, -0.03])
 
 
 def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
-    """Command for six seconds under a fault; return (time, error) by cycle, and the last miss in A."""
+    """Command for six seconds under a fault.
+
+    Return (time, error) by cycle, and the last current error (A).
+    """
     config = demo_config(10.0, camera=False)
     lock = build_lockstep(config, demo_world(), None, SimClock())
     coils = PwmTorqueCoils(

@@ -1,4 +1,4 @@
-"""Tests of the size of fault effects on samples, lines and parts of the emulated hardware."""
+"""Tests of the magnitude of fault effects on samples, lines and parts of the emulated hardware."""
 
 from __future__ import annotations
 

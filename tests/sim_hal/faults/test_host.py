@@ -33,7 +33,7 @@ class Found:
 
 
 def find(argument: float) -> Found:
-    """Do a job."""
+    """Perform a job, and return its result."""
     return Found(argument, np.array([argument, 1.0]), 3, (argument, "text"))
 
 
@@ -150,7 +150,7 @@ def test_without_such_faults_everything_is_handed_through() -> None:
     assert faults.jobs(runner, specs, JobResult) is runner
     assert faults.workers(specs) == specs
     assert faults.clock() is clock
-    assert faults.opener(open) is open  # any callable will do
+    assert faults.opener(open) is open  # any callable would be suitable here
 
 
 def test_a_corrupted_configuration_is_refused_in_one_line_or_still_a_valid_one() -> None:

@@ -115,8 +115,8 @@ def test_the_monitors_calibration_is_used_by_nobody() -> None:
         (75, 0),  # no port
         (75, 9),  # ports that do not exist
         (75, 20),  # rate above the capacity of the line
-        (75, 24),  # too seldom for anybody
-        (75, 32),  # without a group
+        (75, 24),  # output that is too infrequent for any user
+        (75, 32),  # output without any group
         (75, 41),  # group that the VN-100 does not have
         (75, 52),  # without the attitude
         (75, 62),  # fields that the VN-100 does not have

@@ -54,7 +54,7 @@ def run(environment: Mapping[str, str], script: str) -> str:
 
 
 def test_smbus2_makes_every_transfer(environment: Mapping[str, str]) -> None:
-    """Values from the data sheets: PRE_SCALE 0x1E and Config 0x399F at power-on, 0x399F sent big-endian."""
+    """Expected from the data sheets: PRE_SCALE 0x1E and Config 0x399F at power-on, sent big-endian."""
     said = run(
         environment,
         """
@@ -153,7 +153,7 @@ def test_adafruits_client_drives_a_coil_and_reads_its_current(environment: Mappi
         """,
     )
     shunt, register = said.splitlines()
-    assert int(shunt) == pytest.approx(1478, abs=40)  # 3.5 mA of noise
+    assert int(shunt) == pytest.approx(1478, abs=40)  # the tolerance allows for 3.5 mA of noise
     assert register == "0x1000 0x20"
 
 
@@ -163,7 +163,7 @@ def test_debians_tools_find_and_read_the_parts(environment: Mapping[str, str]) -
         done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=10, check=True)
         return done.stdout
 
-    tool("i2cset", "-y", "7", "0x40", "0", "0x21")  # as at power-on, but awake
+    tool("i2cset", "-y", "7", "0x40", "0", "0x21")  # set MODE1 as at power-on, but awake
     table = tool("i2cdetect", "-y", "7").split("\n", 1)[1]
     found = {int(word, 16) for line in table.splitlines() for word in line[3:].split() if word != "--"}
     assert found == {PWM, MONITOR, ALL_CALL}

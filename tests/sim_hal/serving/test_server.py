@@ -61,7 +61,8 @@ PATIENCE_S = 15.0
 def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults(tmp_path: Path) -> None:
     path = tmp_path / "orbit.yaml"
     flown = Path("config/orbit.yaml").read_text(encoding="utf-8")
-    flown = re.sub(r"\nwide_cameras:.*?\n\n", "\n\n", flown, flags=re.DOTALL)  # smaller ones follow
+    # The wide cameras are replaced by smaller ones.
+    flown = re.sub(r"\nwide_cameras:.*?\n\n", "\n\n", flown, flags=re.DOTALL)
     path.write_text(flown.replace("\ngps: {}", "\n") + DEVICES, encoding="utf-8")
     config = reader.load(path)
     fixes: list[GpsReading] = []

@@ -10,7 +10,7 @@ from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import StarCameraModel
 
 POINTING = quaternion.normalise(np.array([0.3, -0.5, 0.7, 0.2]))
-"""Arbitrary attitude that is aligned with no axis."""
+"""Arbitrary attitude, which is not aligned with any axis."""
 
 
 def at_pixels(model: StarCameraModel, points: object, attitude: FloatArray = POINTING) -> FloatArray:

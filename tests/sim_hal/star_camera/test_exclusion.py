@@ -24,7 +24,7 @@ def _tilted(axis: FloatArray, towards: FloatArray, degrees: float) -> FloatArray
 
 
 def test_the_boresight_is_the_cameras_z_through_its_mounting() -> None:
-    """Errata to 2.16: the camera looks along body x, and the body is rotated by 90 deg about z."""
+    """As in the errata to 2.16, the camera looks along body x, and the body is rotated by 90 deg about z."""
     body = quaternion.from_rotation_vector(np.array([[0.0, 0.0, 0.5 * np.pi]]))
     rows = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     mounting = quaternion.from_matrix(rows)
@@ -47,7 +47,7 @@ def test_the_sun_spoils_a_frame_to_its_limb(degrees: float, excluded: bool) -> N
 
 
 def test_the_sun_is_seen_from_the_camera_not_from_the_earths_centre() -> None:
-    """From a distance of 4 million km, it is displaced by 1.5 deg."""
+    """From a distance of 4 million km, the Sun is displaced by 1.5 deg."""
     aside = np.array([[0.0, 4e9, 0.0]])
     boresight = _tilted(SUN / ASTRONOMICAL_UNIT, np.array([[0.0, -1.0, 0.0]]), 11.0)
     assert sun_in_field(boresight, aside, SUN, HALF)[0]

@@ -59,7 +59,7 @@ def test_a_curved_streak_about_the_boresight_is_exact() -> None:
 
 
 def test_a_streak_of_changing_rate_is_exact() -> None:
-    """Accelerating from rest, the camera gives the first half of the path four times the usual flux."""
+    """If the camera accelerates from rest, the start of the path is brighter than its end."""
     times = np.linspace(0.0, 1.0, 101)
     turn = np.outer(times**2, [60.0 / FOCAL, 30.0 / FOCAL, 0.0])
     attitudes = quaternion.multiply(quaternion.from_rotation_vector(turn), POINTING)
@@ -95,7 +95,7 @@ def test_the_light_is_the_same_however_far_the_star_moves(heading: float, streak
 
 
 def test_a_streak_runs_along_minus_omega_cross_v_over_the_known_length() -> None:
-    """Rotated by 80 px about +x, a star at the boresight moves towards +y: v' = -w x v = (0, +w, 0)."""
+    """When the camera rotates by 80 px about +x, a star at the boresight moves to +y: v' = -w x v."""
     star = at_pixels(MODEL, MODEL.pinhole.centre)
     angle = 70.0 / FOCAL
     image = expected_electrons(MODEL, star, [0.0], *turning([angle, 0.0, 0.0]))

@@ -96,7 +96,7 @@ def test_the_background_has_gaussian_tails() -> None:
         beyond = np.count_nonzero(np.abs(z) > limit + 0.001)
         expected = (
             2.0 * z.size * ndtr(-limit - 0.005)
-        )  # a count is 0.01 sigma, so the bound applies from half a count on
+        )  # A count is 0.01 sigma, so the bound applies from half a count on.
         assert beyond == pytest.approx(expected, abs=5.0 * np.sqrt(expected))
     assert abs(np.count_nonzero(z > 4.0) - np.count_nonzero(z < -4.0)) < 5.0 * np.sqrt(
         2.0 * z.size * ndtr(-4.0)
@@ -169,7 +169,10 @@ def test_light_is_rounded_to_the_nearest_count() -> None:
 
 
 def test_the_thesis_noise_is_uniform_and_never_negative() -> None:
-    """Text at 2.11: sqrt(signal) U + sqrt(RN^2 + DC T) U, with U in 0..1; here sqrt(400) and sqrt(150)."""
+    """The noise of 2.11 is sqrt(signal) U + sqrt(RN^2 + DC T) U, with U in 0..1.
+
+    Here sqrt(400), sqrt(150).
+    """
     model = replace(DEEP, noise="uniform")
     image = np.full((96, 96), 400.0)
     frames = _frames(model, image, 200)
@@ -237,7 +240,7 @@ SMALL = StarCameraModel(columns=64, rows=48, field_of_view=np.radians(4.0))
 
 
 def test_a_star_of_magnitude_zero_gives_liebes_flux() -> None:
-    """19,000 e-/s for each mm^2 of a 25 mm aperture in 0.2 s are 1.8653e6 e-."""
+    """A flux of 19,000 e-/s per mm^2 of a 25 mm aperture gives 1.8653e6 e- in 0.2 s."""
     image = expected_electrons(SMALL, at_pixels(SMALL, [30.2, 20.7]), [0.0], *still(0.2))
     assert image.sum() == pytest.approx(19_000 * math.pi * 12.5**2 * 0.2, rel=1e-5)
 
@@ -251,7 +254,7 @@ def test_no_light_is_lost_whatever_the_place_in_the_pixel(psf: str, point: tuple
 
 
 def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
-    """Errata to 2.8: the scale is Pogson's, not 2.5 per magnitude (which would give 97.7)."""
+    """By the errata to 2.8, the scale is Pogson's, not 2.5 per magnitude (which would give 97.7)."""
     star, history = at_pixels(SMALL, [30.2, 20.7]), still()
     bright, faint = (expected_electrons(SMALL, star, [v], *history).sum() for v in (1.0, 6.0))
     assert bright / faint == pytest.approx(100.0, rel=1e-5)
@@ -284,7 +287,7 @@ def test_the_image_is_the_gaussian_integrated_over_each_pixel(sigma: float) -> N
 
 
 def test_the_thesis_kernel_appears_around_a_star_in_the_middle_of_a_pixel() -> None:
-    """Sease 2.9, printed to four digits."""
+    """The expected kernel is that of Sease 2.9, printed to four digits."""
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear")
     image = expected_electrons(model, at_pixels(model, [30.0, 20.0]), [3.0], *still()) / model.electrons(
         3.0, 1.0
@@ -295,7 +298,10 @@ def test_the_thesis_kernel_appears_around_a_star_in_the_middle_of_a_pixel() -> N
 
 
 def test_the_thesis_placement_shares_a_star_among_four_pixels() -> None:
-    """2.5, 2.6 by hand at (30.25, 20.4), with the kernel so narrow (sigma 0.2) that 3.7e-6 leaves a pixel."""
+    """By 2.5 and 2.6 at (30.25, 20.4).
+
+    The kernel is so narrow (sigma 0.2) that only 3.7e-6 leaves a pixel.
+    """
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear", psf_sigma=0.2)
     image = expected_electrons(model, at_pixels(model, [30.25, 20.4]), [3.0], *still()) / model.electrons(
         3.0, 1.0
@@ -314,7 +320,7 @@ def test_the_thesis_placement_and_kernel_together() -> None:
 
 
 def test_a_star_behind_the_camera_gives_no_light() -> None:
-    """Errata to 2.1: through the collinearity equations alone it would fall on the same pixel."""
+    """By the collinearity equations alone (errata to 2.1), such a star would fall on the same pixel."""
     star = at_pixels(SMALL, [30.2, 20.7])
     assert expected_electrons(SMALL, -star, [0.0], *still()).max() == 0.0
     assert expected_electrons(SMALL, star, [0.0], *still()).max() > 0.0

@@ -138,9 +138,9 @@ def test_a_tumbling_object_is_as_bright_as_its_mean_light_over_the_exposure() ->
     objects.begin(5_000_000_000)
     slow, fast = objects.tracks(105_000_000_000, np.array([0.0, 0.5]))
     assert slow.magnitude == pytest.approx(4.0, abs=1e-4)
-    # The mean of exp(x sin) over a turn is the modified Bessel function I0: I0(0.921) = 1.2236.
+    # The mean of exp(x sin) over a rotation is the modified Bessel function I0, and I0(0.921) = 1.2236.
     assert fast.magnitude == pytest.approx(3.0 - 2.5 * np.log10(1.2236), abs=1e-3)
-    # Mission time 100 s at 0.1 deg/s: 10 deg from where it began, due north.
+    # At a mission time of 100 s, 0.1 deg/s have moved the object by 10 deg due north.
     assert np.degrees(np.arcsin(slow.directions[0, 2])) == pytest.approx(30.0, abs=1e-9)
 
 
@@ -233,7 +233,7 @@ def test_in_the_umbra_there_is_no_track_and_in_the_penumbra_a_fainter_one() -> N
 
 
 def test_an_object_behind_the_earth_has_no_track() -> None:
-    """Two on one orbit see each other while the chord clears the Earth: to 2 acos(R/a) = 48.7 deg apart."""
+    """Two objects on one orbit are visible to each other up to 2 acos(R/a) = 48.7 deg apart."""
     clear = 2.0 * np.arccos(EARTH_RADIUS / 7000e3)
     epochs = (EPOCH, EPOCH + 182.0)
     for ahead, seen in ((clear - 0.01, True), (clear + 0.01, False)):
@@ -333,7 +333,7 @@ def test_every_opportunity_lies_within_a_window() -> None:
     found, stretches = opportunities(scenario, cadence=1.0, exposure=0.5), windows(scenario)
     for item in found:
         assert any(w.start - 2e-3 <= item.start and item.start + 0.5 <= w.end + 2e-3 for w in stretches)
-    # No start is missed: as many starts on the grid fit into the windows.
+    # The number of starts equals the number of grid points that fit into the windows, so no start is missed.
     fit = sum(
         len([t for t in np.arange(np.ceil(w.start), w.end - 0.5)]) for w in stretches if w.end - w.start > 0.5
     )

@@ -124,7 +124,7 @@ def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> 
 
 
 def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None:
-    """In N m at 500 km: gravity gradient 4.9e-8, dipole of 1e-3 A m^2 2 to 5e-8, drag along x 6e-9."""
+    """At 500 km: gravity gradient 4.9e-8 N m, dipole of 1e-3 A m^2 2 to 5e-8 N m, drag along x 6e-9 N m."""
     sizes: dict[str, list[float]] = {}
     for seed in range(12):
         body = FreeBody(FreeBodySection(craft="cubesat_3u"), lambda: np.zeros(3), seed=seed)
@@ -165,7 +165,7 @@ def test_a_configuration_names_the_free_body_and_must_describe_it() -> None:
 
 
 def test_the_documents_section_is_read_and_flies() -> None:
-    """The example of docs/fly/simulation.md."""
+    """The configuration section is the example of docs/fly/simulation.md."""
     page = Path("docs/fly/simulation.md").read_text(encoding="utf-8")
     text = page.split("worlds/test_free_body.py -->\n```yaml\n")[1].split("```")[0]
     section = reader.simulation_section(text, "simulation.md", Simulation)
@@ -264,7 +264,7 @@ def test_without_torque_energy_and_momentum_are_kept(speed: float) -> None:
 
 
 def test_a_body_at_the_stable_attitude_swings_with_the_known_period() -> None:
-    """Pitch about the local vertical: omega^2 = 3 n^2 (J_x - J_z) / J_y (Wertz 1978, 18.3)."""
+    """Pitch oscillates with omega^2 = 3 n^2 (J_x - J_z) / J_y (Wertz 1978, 18.3)."""
     inertia = (0.0333, 0.0333, 0.0066)
     rotation, n = Rotation(inertia), 1.1e-3
     expected = 2.0 * np.pi / (n * np.sqrt(3.0 * (inertia[0] - inertia[2]) / inertia[1]))
@@ -350,7 +350,7 @@ def test_the_campaign_of_pointing_judges_the_weights_that_are_flown(name: str, c
 
 
 def test_the_filter_expects_the_errors_of_tilted_coils_that_the_world_draws() -> None:
-    """Mean square of the coil matrix's elements in expected standard deviations, over 200 satellites."""
+    """The mean square of the coil matrix's errors, in expected sigmas, over 200 satellites is checked."""
     config = as_orbit(reader.load(FOLDER / "orbit_1u_tilted.yaml"))
     coils, prior = config.coils.map(), filter_settings(config).coils
     assert prior is not None

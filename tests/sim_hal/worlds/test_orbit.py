@@ -180,7 +180,7 @@ def test_the_node_regresses_at_the_secular_rate(inclination: float) -> None:
 
 
 def test_a_sun_synchronous_orbit_follows_the_sun() -> None:
-    """Published inclination: 98.6 deg at 800 km.
+    """The published inclination at 800 km is 98.6 deg.
 
     The node rotates by 0.9856 deg a day (once a tropical year).
     """
@@ -271,7 +271,7 @@ def test_the_sun_stands_where_it_was_published(
 ) -> None:
     """The references are geometric; the apparent Sun is 20.5" behind along the ecliptic.
 
-    To 40" and 1e-4 AU.
+    The tolerances are 40" and 1e-4 AU.
     """
     place = np.array(published)
     pole = np.array([0.0, -np.sin(OBLIQUITY), np.cos(OBLIQUITY)])
@@ -285,7 +285,7 @@ def test_the_sun_stands_where_it_was_published(
     ("julian_date", "longitude"),
     [
         # US Naval Observatory, Earth's seasons: 2026 March 20 14:46, June 21 08:25, September 23 00:05,
-        # December 21 20:50; 2030 March 20 13:52 UT. 69 s more are TT.
+        # December 21 20:50; 2030 March 20 13:52 UT. TT is 69 s later.
         (2_461_120.11528, 0.0),
         (2_461_212.85069, 90.0),
         (2_461_306.50347, 180.0),
@@ -294,7 +294,7 @@ def test_the_sun_stands_where_it_was_published(
     ],
 )
 def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float, longitude: float) -> None:
-    """Longitudes of date; Longitudes of J2000 are smaller by the precession of 50.29" a year."""
+    """The longitudes are those of date; longitudes of J2000 are smaller by the precession, 50.29" a year."""
     when = julian_date + 69.0 / DAY
     x, y, z = sun_position(when)
     along = np.arctan2(y * np.cos(OBLIQUITY) + z * np.sin(OBLIQUITY), x)
@@ -305,7 +305,7 @@ def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float
 
 
 def test_the_distance_is_least_in_january_and_greatest_in_july() -> None:
-    """Perihelion 0.9833 AU and aphelion 1.0167 AU, 2026 January 3 and July 6 (US Naval Observatory)."""
+    """By the US Naval Observatory, the extremes are 0.9833 AU (2026 January 3) and 1.0167 AU (July 6)."""
     days = 2_461_041.5 + np.arange(365.0)
     distance = np.linalg.norm(sun_position(days), axis=-1) / ASTRONOMICAL_UNIT
     assert distance.min() == pytest.approx(0.9833, abs=1e-4)

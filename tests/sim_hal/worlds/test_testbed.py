@@ -112,9 +112,10 @@ def test_the_result_does_not_depend_on_how_the_time_was_cut() -> None:
 
 
 RADIUS, CURRENT, MEASURED = 0.15, 2.19, 9.98e-4
-"""m, A, T: "approximately 15 cm", "9.98 gauss ... at a current of 2.19 A" (the thesis)."""
+"""Radius (m), current (A) and field (T) by the thesis: "approximately 15 cm", "9.98 gauss ... at a current
+of 2.19 A"."""
 TURNS = 76
-"""Number of turns of each coil that follows from eq. 5.34 and the measurement; the thesis states none."""
+"""Number of turns of each coil, which the thesis does not state, from eq. 5.34 and the measurement."""
 
 
 def test_the_measured_field_is_that_of_76_turns() -> None:
@@ -124,7 +125,7 @@ def test_the_measured_field_is_that_of_76_turns() -> None:
 
 
 def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
-    """The thesis: 4.5 gauss, "approximately 9 times Earth's ambient magnetic field strength"."""
+    """The thesis states 4.5 gauss, "approximately 9 times Earth's ambient magnetic field strength"."""
     flown = as_testbed(reader.load(config_path("step_simulation"))).plant.field
     current = CURRENT * flown / MEASURED
     assert current == pytest.approx(0.99, abs=0.005)
@@ -133,7 +134,7 @@ def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
 
 
 def test_it_is_biot_and_savart_summed_over_the_two_coils() -> None:
-    """On the axis of a loop B = mu0 I R^2 / (2 (R^2 + z^2)^1.5); here two loops at z = R / 2."""
+    """The field of two loops at z = R / 2 is the sum of mu0 I R^2 / (2 (R^2 + z^2)^1.5) for each loop."""
     mu, radius = 1.25663706127e-6, 0.3  # CODATA 2022
     loop = mu * radius**2 / (2.0 * (radius**2 + (radius / 2.0) ** 2) ** 1.5)
     assert helmholtz_field(10, 2.0, radius) == pytest.approx(2 * 10 * 2.0 * loop, rel=1e-8)

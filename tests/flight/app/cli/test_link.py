@@ -52,7 +52,7 @@ from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """Return the addresses of a link on each kind of line, beside a flight that obeys; and its folder."""
+    """Return the addresses of a link on each kind of line, beside an obeying flight, and its folder."""
     place = tmp_path_factory.mktemp("link")
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     radio, device = pty.openpty()

@@ -266,7 +266,7 @@ def strength(flight: Flight, elements: TwoLineElements) -> float:
 
 
 def test_the_field_decides_between_elements_and_a_consistent_false_orbit() -> None:
-    """The magnetometer refutes a position error of a quarter of an orbit, and confirms the true position."""
+    """The magnetometer reveals a position error of a quarter of an orbit, and confirms the true position."""
     there, here = ahead(90.0), TwoLineElements(FIRST, SECOND)
     for known, true, used in ((here, there, False), (there, here, True)):
         flight = Flight(known, true)

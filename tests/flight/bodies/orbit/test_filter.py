@@ -378,7 +378,7 @@ def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim
 
 
 def test_commands_that_were_doubted_are_tried_again_after_a_rest() -> None:
-    """The coils rest while they are doubted, and would never show that they obey again."""
+    """Coils that are not trusted stay off, so without a trial they could not prove that they work again."""
     flown = acquired(pulses=True)
     flown.carries = -3.0
     flown.fly(6.0)

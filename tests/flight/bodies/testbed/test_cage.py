@@ -1,4 +1,4 @@
-"""Tests of the flight software's cage model: its field is the simulator's, and two coils make a torque."""
+"""Tests of the flight software's coil cage model: its field, and torques of two coils."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def packets_of_prefix(data: bytes) -> int:
 
 @pytest.mark.parametrize("seed", range(40))
 def test_random_damage_costs_the_packets_it_touches_and_invents_none(run: Path, seed: int) -> None:
-    """Up to three flipped bits in a packet, which the CRC always finds (distance 4 below 32,751 bits)."""
+    """Up to three bits of a packet are flipped, which the CRC always finds (distance 4 below 32,751 bits)."""
     draw = random.Random(seed)
     data = bytearray(find_segments(run, "flight")[0].read_bytes())
     packets = packets_of(bytes(data))

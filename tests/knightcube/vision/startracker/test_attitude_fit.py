@@ -43,7 +43,7 @@ def directions(count: int, seed: int = 1) -> FloatArray:
 
 
 def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
-    """The fit starts two degrees and three per cent off, and converges quadratically to rounding errors."""
+    """The fit starts with errors of two degrees and 3 %, and converges quadratically to rounding."""
     seen, quaternion = directions(12), normalise(np.array([0.3, -0.2, 0.5, 0.7]))
     matrix = attitude_matrix(quaternion)
     reference = stretched(seen, 1.03) @ matrix
@@ -190,7 +190,7 @@ def test_a_match_grows_from_the_axis_as_the_distortion_is_determined(distortion:
 
 
 def test_the_distorted_fits_covariance_is_that_of_many_fits() -> None:
-    """For 100 lenses of 5 % at the corner, attitude and scale have a chi-square of 4."""
+    """For 100 lenses with 5 % of distortion, attitude and scale have a chi-square with 4 degrees."""
     draw = np.random.default_rng(4)
     errors, shares = [], []
     for _ in range(100):

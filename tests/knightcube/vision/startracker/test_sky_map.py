@@ -40,7 +40,7 @@ _ARCSECOND = np.radians(1.0 / 3600.0)
 
 
 def test_a_star_across_the_motion_is_displaced_by_the_constant_of_aberration() -> None:
-    """IAU 1976: 20.49552" = n a / (c sqrt(1 - e^2)), with n a = 29,784.69 m/s and e = 0.01670862."""
+    """The constant is n a / (c sqrt(1 - e^2)), with n a = 29,784.69 m/s and e = 0.01670862 (IAU 1976)."""
     speed = 29_784.69 / np.sqrt(1.0 - 0.01670862**2)
     seen = apparent(np.array([[0.0, 0.0, 1.0]]), np.array([speed, 0.0, 0.0]))[0]
     assert np.arctan2(seen[0], seen[2]) == pytest.approx(20.49552 * _ARCSECOND, abs=1e-3 * _ARCSECOND)
@@ -83,7 +83,7 @@ def test_the_earths_velocity_is_the_slope_of_the_suns_place_by_another_series() 
 
 
 def test_the_earth_is_opposite_the_sun() -> None:
-    """Meeus, Astronomical Algorithms, example 26.b: the Sun on 1992 October 13.0 TD in J2000 axes, au."""
+    """The expected Sun (au, J2000) on 1992 October 13.0 TD is that of Meeus, example 26.b."""
     published = np.array([-0.93739691, -0.31316824, -0.13577924])
     place, _ = earth_from_sun(2_448_908.5)
     np.testing.assert_allclose(-place / ASTRONOMICAL_UNIT, published, atol=1e-6)

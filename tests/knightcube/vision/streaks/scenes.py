@@ -46,7 +46,7 @@ class Scene:
 
 
 def turn_of(theta: float, length: float, roll: float, camera: StarCameraModel = CAMERA) -> FloatArray:
-    """Return the rotation (3,) rad, `theta` rad off the boresight, for streaks of about `length` px."""
+    """Return a rotation (3,), rad, `theta` rad off the boresight, for streaks of about `length` px."""
     pinhole = camera.pinhole
     axis = np.array([np.sin(theta) * np.cos(roll), np.sin(theta) * np.sin(roll), np.cos(theta)])
     off_axis = 0.5 * pinhole.columns / pinhole.focal_length
