@@ -3,8 +3,8 @@
 `python -m tests.deploy.emulated_board CONFIG WORLD FOLDER` emulates the devices of CONFIG in the world that
 the section `simulation` of WORLD describes. The device files of serial devices in CONFIG become links to
 pseudo-terminals. With the printed environment, programs open the I2C bus by its device file, by the preload
-library of `sim_hal emulate i2c`. Frames come through `tests.deploy.emulated_video`. The true state is logged
-in FOLDER. The program prints one JSON object when the devices respond, and ends at SIGTERM.
+library of `sim_hal emulate i2c`. Frames are supplied by `tests.deploy.emulated_video`. The true state is
+logged in FOLDER. The program prints one JSON object when the devices respond, and ends at SIGTERM.
 """
 
 from __future__ import annotations

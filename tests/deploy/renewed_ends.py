@@ -33,7 +33,7 @@ class RenewedEnds(FiledEnds):
 
     Attributes:
         board: files of the satellite.
-        reacts: name of the configuration whose flight goes to SAFE by a reaction.
+        reacts: name of the configuration whose flight changes to SAFE by a reaction to an event.
         crashes: label of the release whose flight ends at once.
     """
 

@@ -39,7 +39,7 @@ class Service:
         return int(self.show("MainPID"))
 
     def driven(self) -> bool:
-        """Return whether a coil carries current; the answer may be delayed on a busy machine."""
+        """Return whether a coil carries current; the result may be delayed on a busy machine."""
         for _ in range(50):
             with contextlib.suppress(TimeoutError):
                 return any(self._bus.call("currents"))

@@ -1,7 +1,7 @@
 """Tests of the configurations of boards, checked and started as on a board with emulated devices.
 
 The flight software uses its drivers of real devices: serial ports are pseudo-terminals, the I2C bus is
-/dev/i2c-N or a name made by udev, through the preload library, and cameras answer the ioctls of Video for
+/dev/i2c-N or a name made by udev, through the preload library, and cameras perform the ioctls of Video for
 Linux with rendered frames. No virtual camera of the kernel replaces the rendered frames: `vivid` and
 `v4l2loopback` have no control of the exposure time, and the driver refuses a camera without this control
 (`tests/hal/cameras/test_v4l2_camera.py` reads frames of `vivid` where the kernel has this module).
@@ -87,7 +87,7 @@ class Flown:
 
 
 def unit_words(config: Path, runs: Path) -> list[str]:
-    """Return the arguments of `fly` in the unit's ExecStart for a given configuration and archive."""
+    """Return the launcher's arguments in the unit's ExecStart for a configuration and an archive."""
     unit = (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
     (line,) = re.findall(r"' fly (run .*)$", unit, re.MULTILINE)
     places = {"/etc/knightcube/flight.yaml": str(config), "/var/lib/knightcube/runs": str(runs)}

@@ -38,7 +38,7 @@ class Tools:
         tool.chmod(0o755)
 
     def emulate(self, bus: Path) -> None:
-        """Let python3 open the bus served at a socket as /dev/i2c-7, without i2cset."""
+        """Make python3 open the bus served at a socket as /dev/i2c-7, without i2cset."""
         shutil.copy(Path(smbus_byte.__file__), self.folder)
         self.put("i2cset", 1)
         (self.folder / "bin/python3").write_text(

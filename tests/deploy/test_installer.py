@@ -88,7 +88,7 @@ def test_everything_is_put_in_its_place_once(image: Image) -> None:
     before = image.files()
     assert image.install("--config", str(TESTBED))[0] == 0
     assert image.files() == before
-    # A renewal may write the settings of the link's unit although the unit itself is not installed.
+    # An update may write the settings of the link's unit although the unit itself is not installed.
     settings = image.root / "etc/systemd/system/knightcube-link.service.d"
     settings.mkdir()
     (settings / "board.conf").touch()

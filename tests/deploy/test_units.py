@@ -77,7 +77,7 @@ def exposure(unit: Path) -> float:
 @needs_systemd
 @pytest.mark.parametrize("name", UNITS)
 def test_the_sandbox_leaves_an_exposure_of_at_most_1(units: Path, name: str) -> None:
-    """The rating holds for any address of the link's peer, and also with a radio on a serial line."""
+    """The rating holds for any address of the link's other end, and also with a radio on a serial line."""
     assert exposure(units / name) <= 1.0
 
 

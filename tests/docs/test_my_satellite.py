@@ -69,7 +69,7 @@ def test_the_example_prints_what_the_page_shows(tmp_path: Path) -> None:
 
 
 def newcomer() -> tuple[list[str], list[str]]:
-    """Return the tutorial's commands that install the software, and those that fly an own satellite."""
+    """Return the tutorial's commands that install the software and that simulate the user's satellite."""
     install, fly = (
         next(one.commands for one in blocks() if one.page == "docs/tutorial.md" and word in one.text)
         for word in ("git clone", "new-satellite")

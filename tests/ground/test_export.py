@@ -83,7 +83,7 @@ def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None
 
 @pytest.fixture
 def rich_run(tmp_path: Path) -> Run:
-    """Return a run with texts, NaN, and whole numbers of 64 bits."""
+    """Return a run with texts, NaN, and 64-bit integers."""
     log = FlightLog(tmp_path / "run", clock=ManualClock())
     packer = Packer()
     for n in range(3):

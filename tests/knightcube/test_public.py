@@ -92,7 +92,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_importing_the_library_imports_none_of_its_modules() -> None:
-    """A program that needs one name does not load the modules of the others."""
+    """A program that needs one name does not load the modules of all other names."""
     script = "import sys, knightcube; print([m for m in sys.modules if m.startswith('knightcube.')])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

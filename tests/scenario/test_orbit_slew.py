@@ -1,4 +1,4 @@
-"""Tests that a slew passes to pointing without a jump, and that a body far off its path is damped."""
+"""Tests that a slew changes to pointing without a jump, and that a body far from its path is damped."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_body_that_leaves_its_path_is_held_still_and_planned_for_again(cripple
 
 @pytest.mark.slow
 def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Path) -> None:
-    """The rest of the slew is planned again for the other two coils."""
+    """The remaining slew is planned again for the other two coils."""
     config, section = slewing(BEGIN + SLEW + AFTER, FaultEntry(fault="coil-x: open", at=1.0))
     run = fly(config, tmp_path, section=section)
     (begun,), (isolated,), (ended,) = (at(run, name) for name in ("slew-begun", "coil-broken", "slew-ended"))

@@ -371,7 +371,7 @@ class _Copy:
     def _write(self, path: str, text: str) -> None:
         """Write a module with a new modification time.
 
-        Python recognises stale bytecode by the second of that time and by the size of the module.
+        Python recognises stale bytecode by the modification time in seconds and by the size of the module.
         """
         (self.folder / path).write_text(text, encoding="utf-8")
         self._writes += 1

@@ -63,7 +63,7 @@ INDEX = (
     ("Meller et al., section 3.2.1", "(pytest tests/knightcube/reference/test_horizon.py)"),
     ("Meller et al., section 4", "campaigns coverage"),
 )
-"""Tables and figures of the sources, with the study that makes each."""
+"""Tables and figures of the source documents, with the study that makes each."""
 
 
 def one_frame_tables(runs: int, seed: int) -> Rows:

@@ -37,7 +37,7 @@ class Published:
     Attributes:
         sorts: arrays of 8,111 integers that heap sort sorts per second (NBench's numeric sort).
         mflops: million floating-point operations per second of Linpack in double precision.
-        source: publication of the figures.
+        source: publication of the two speeds.
     """
 
     name: str

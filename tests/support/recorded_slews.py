@@ -39,7 +39,7 @@ def recorded() -> dict[str, Any]:
 
 
 def problem(name: str) -> dict[str, Any]:
-    """Return the named problem."""
+    """Return the problem with the given name."""
     found: dict[str, Any] = next(one for one in recorded()["problems"] if one["name"] == name)
     return found
 

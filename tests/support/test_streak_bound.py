@@ -1,4 +1,4 @@
-"""Tests of the Cramer-Rao bound against published figures and first principles."""
+"""Tests of the Cramer-Rao bound against published values and first principles."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ class Yamcs:
         return self.raw(f"/archive/{INSTANCE}:exportPackets")
 
     def values(self, names: list[str]) -> Iterator[dict[str, Any]]:
-        """Yield name, generation time and raw value of each archived value of the named parameters."""
+        """Yield name, generation time and raw value of each archived value of the given parameters."""
         ids = [{"name": f"/{SPACE}/{name}"} for name in names]
         text = self.raw(f"/archive/{INSTANCE}:streamParameterValues", {"ids": ids}).decode()
         decoder, at = json.JSONDecoder(), 0

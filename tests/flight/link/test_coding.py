@@ -231,7 +231,7 @@ def test_kiss_escapes_as_its_specification_and_skips_other_frames() -> None:
 
 
 def test_an_ax25_header_is_that_of_the_specification() -> None:
-    """AX.25 2.2, figure 3.5: from N7LEM to NJ7P, the last address marked; then a UI frame without layer 3."""
+    """By AX.25 2.2, figure 3.5: N7LEM to NJ7P, last address marked, then a UI frame without layer 3."""
     header = ax25_header("NJ7P", "N7LEM")
     assert header.hex(" ") == "9c 94 6e a0 40 40 e0 9c 6e 98 8a 9a 40 61 03 f0"
     assert ax25_header("A-15", "B-3")[6:14] == bytes.fromhex("fe 84 40 40 40 40 40 67")

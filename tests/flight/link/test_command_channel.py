@@ -174,7 +174,7 @@ def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_n
 
 
 def test_only_commands_of_a_peer_take_a_place_in_the_queue(place: Path) -> None:
-    """More datagrams than a queue can hold are sent from an unknown address and from a peer's address."""
+    """More datagrams than a queue can hold come from an unknown address and from an accepted one."""
     ping = CommandPacker().pack(Ping(5), 1)
     channels = [open_udp("127.0.0.1:0", [IPv4Network("127.0.0.9"), IPv4Network("127.1.0.0/16")])]
     to = channels[0]._socket.getsockname()

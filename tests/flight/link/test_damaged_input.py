@@ -73,7 +73,7 @@ def test_a_key_or_counter_that_was_never_written_is_not_read(folder: Path, chanc
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**32))
 def test_only_new_genuine_frames_are_admitted(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    """The draws come from a seed, because hypothesis cannot replay them with new keys."""
+    """The draws are determined by a seed, because hypothesis cannot replay them with new keys."""
     attacker, chance = LinkAttacker(tmp_path_factory.mktemp("link")), Random(seed)
     for _ in range(60):
         attacker.attack(chance)

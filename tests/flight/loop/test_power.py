@@ -1,6 +1,6 @@
 """Tests of the power system: battery, panels, current monitors and the power task.
 
-Battery, panels, monitors at the wire and the power task run on a simulated clock, without a flight. The true
+Battery, panels, emulated monitors and the power task run on a simulated clock, without a flight. The true
 battery has 10 % less capacity, 30 % more resistance and a slightly different curve than the configured one.
 """
 
@@ -42,7 +42,7 @@ FULL_COILS = 0.45
 
 
 class Satellite:
-    """Power system, monitors and power task, with coils that obey the limit, and a mode control."""
+    """A power system, its monitors and task, with coils that obey the limit, and a mode control."""
 
     def __init__(self, charge: float = TRUTH.charge) -> None:
         self.clock = SimClock()

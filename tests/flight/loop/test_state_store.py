@@ -45,7 +45,7 @@ def test_what_is_stored_is_read_back_by_another_process_of_the_application(tmp_p
 
 
 def _stored(disk: Disk, reports: Reports) -> StateStore:
-    """Return a store on a disk that holds the states 1 and 2, as a new process sees it."""
+    """Return a store on a disk with the states 1 and 2, as a new process finds it."""
     first = StateStore(FOLDER, reports, disk)
     first.store(state_of(1))
     first.store(state_of(2))

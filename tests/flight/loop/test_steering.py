@@ -1,4 +1,4 @@
-"""Tests that steering without a basis sends zero, and that the coil drive corrects currents and reports."""
+"""Tests that control without a valid estimate commands zero, and that the coil drive corrects and reports."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
 
 
 def test_the_simulation_case_is_the_thesis_s() -> None:
-    """Configuration of the thesis, ch. 5: step_thesis.yaml with another state, without thread and camera."""
+    """The thesis's configuration (ch. 5): step_thesis.yaml with another state, without thread and camera."""
     loop, case = (
         as_testbed(reader.load(FOLDER / name)) for name in ("step_thesis.yaml", "step_simulation.yaml")
     )

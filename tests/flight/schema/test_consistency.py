@@ -1,4 +1,4 @@
-"""Tests that contradictory values are refused, and that the link accepts only its peers."""
+"""Tests that contradictory values are refused, and that the link accepts only its configured addresses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `knightcube calibrate`: from sky images to the lens and a camera file for `knightcube solve`."""
+"""Tests of `knightcube calibrate`, which makes a camera file for `knightcube solve` from sky images."""
 
 from __future__ import annotations
 

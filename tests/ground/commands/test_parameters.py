@@ -30,7 +30,7 @@ class Sink:
 
 
 class Answering:
-    """The flight's end of the socket, which answers parameter commands as the loop does."""
+    """The flight's end of the socket, which replies to parameter commands as the loop does."""
 
     def __init__(self, path: Path) -> None:
         self.modes: list[Modes] = []

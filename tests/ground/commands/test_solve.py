@@ -171,7 +171,7 @@ def test_a_mistake_is_one_line_and_exit_status_2(
 def test_the_world_coordinates_put_the_stars_where_the_picture_has_them(
     picture: Path, tmp_path: Path
 ) -> None:
-    """The tangent plane is computed here by its definition (Calabretta & Greisen 2002), SIP by Shupe 2005."""
+    """The test computes the tangent plane by Calabretta & Greisen 2002, and SIP by Shupe 2005."""
     out = tmp_path / "frame.wcs"
     done = command("solve", picture, "--fov", "12", "--wcs", out, "--json")
     assert done.returncode == 0, done.stderr

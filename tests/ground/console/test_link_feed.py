@@ -53,7 +53,7 @@ def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite:
 
 
 def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dict[str, object]:
-    """Send a command in a second thread, as the page's server does, and return the answer."""
+    """Send a command in a second thread, as the page's server does, and return the reply."""
     answers: list[dict[str, object]] = []
     sending = threading.Thread(target=lambda: answers.append(send()))
     sending.start()

@@ -155,7 +155,7 @@ def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder
 
 
 def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:
-    """Admitted browsers must be refused too: both pages have the same host, so cookies are sent."""
+    """Even an admitted browser must be refused: both pages have the same host, so it sends cookies."""
     with serving(folder) as url, another_origin() as foreign, browsing() as chromium:
         context = chromium.new_context()
         own, other = context.new_page(), context.new_page()

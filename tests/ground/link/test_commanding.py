@@ -64,7 +64,7 @@ class FakeTerminal:
 
 
 def terminal(vault: Vault | None = None, *answers: list[Report]) -> Any:
-    """Return a test double of the terminal that answers each command with a list of reports."""
+    """Return a test double of the terminal that replies to each command with a list of reports."""
     return FakeTerminal(vault, *answers)
 
 

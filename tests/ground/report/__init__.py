@@ -1,1 +1,1 @@
-"""Tests of the report: performance figures, summary, text and plots."""
+"""Tests of the report: performance results, summary, text and plots."""

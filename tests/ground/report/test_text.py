@@ -1,4 +1,4 @@
-"""Tests of the units and digits of each figure in the text of an artificial summary."""
+"""Tests of the units and digits of each value in the text of an artificial summary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Replacement of the kernel's /dev/videoN: a free-running camera that answers the ioctls of V4L2.
+"""Replacement of the kernel's /dev/videoN: a free-running camera that performs the ioctls of V4L2.
 
 The buffers are in a memfd that the binding maps. The queue has the kernel's rules (Linux Media userspace API,
 "Streaming I/O (Memory Mapping)"), and calls out of order get the errno stated there.
@@ -47,7 +47,7 @@ class IoctlCamera:
         stamp_source, clock_flag, stamp_offset_ns: claimed source and clock of the time stamps, and their
             error.
         stamps_packets: whether time stamps are those of the first packet, as with uvcvideo.
-        spoil, shorten: numbers of frames with an error flag, or with half their bytes.
+        spoil, shorten: numbers of the frames with an error flag, and of those with half their bytes.
         frozen: whether the sequence number stays constant.
         belies_exposure: whether frames come every `shortest_ns`, whatever exposure is set.
         stopped: whether the camera has stopped sending frames.

@@ -51,7 +51,7 @@ class FakeStream:
 
 
 class FakeCamera:
-    """A camera that records what is set."""
+    """A camera that records its settings."""
 
     def __init__(self, **changes: Any) -> None:
         self.known: dict[str, Any] = {

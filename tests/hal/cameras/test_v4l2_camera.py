@@ -70,7 +70,8 @@ def test_frames_that_lay_in_the_queue_are_not_the_triggered_one(
     with VideoDevice(str(kernel.path)) as device:
         device.set_format(64, 48, "GREY")
         assert device.start(3) == 3
-        clock.advance(SECOND_NS)  # nobody dequeues: three old frames are queued, and later frames are lost
+        # No frame is dequeued: three old frames are queued, and later frames are lost.
+        clock.advance(SECOND_NS)
         numbers = []
         while (filled := device.dequeue()) is not None:
             numbers.append(filled.sequence)

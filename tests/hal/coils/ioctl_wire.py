@@ -1,4 +1,4 @@
-"""Replacement of the kernel's /dev/i2c-N: an emulated bus answers the ioctls of smbus2."""
+"""Replacement of the kernel's /dev/i2c-N: an emulated bus performs the ioctls of smbus2."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class IoctlWire:
     """A callable that replaces fcntl.ioctl.
 
     Attributes:
-        wire: the emulated bus that answers.
+        wire: the emulated bus that performs the transfers.
         settings: requests and values of all timeout and retry settings, in order.
         functions: the adapter's functionality mask.
         slave_error: errno raised by selecting an address, or 0.

@@ -84,7 +84,7 @@ def test_a_job_that_is_late_for_close_writes_nothing(rig: Rig) -> None:
 
 @pytest.mark.parametrize("action", ["off", "close"])
 def test_zero_asked_for_just_before_a_write_is_not_undone_by_it(action: str) -> None:
-    """The call comes as from a signal handler that interrupts the writing thread."""
+    """The call is made as by a signal handler that interrupts the writing thread."""
 
     class Interrupted(EmulatedI2cBus):
         signal: Callable[[], None] | None = None

@@ -21,7 +21,7 @@ ASCII = ["RRG 1", "WRG 6 0", "WRG 44 0 1 5", "WRG 85 20 20 20 4 0 3 3 3 3 0", "W
 
 
 def converse(settings: Vn100Settings, answers: Mapping[str, tuple[str, ...]] | None = None) -> list[str]:
-    """Return the commands of the set-up; commands without a given answer are echoed."""
+    """Return the commands of the set-up; commands without a given response are echoed."""
     dialogue = set_up(settings)
     asked: list[str] = []
     question = next(dialogue)

@@ -27,13 +27,13 @@ MODEL: EarthCameraModel = camera_model()
 
 
 def attitude() -> FloatArray:
-    """Return an attitude 5 deg off the local vertical."""
+    """Return an attitude that differs from the local vertical by 5 deg."""
     level = from_matrix(local_frame(POSITION, VELOCITY)[0])
     return multiply(from_rotation_vector(np.radians([3.0, -3.5, 10.0])), level)
 
 
 def sun() -> FloatArray:
-    """Return the Sun's direction, 24 deg off the zenith, in the top camera's field, with a sunlit limb."""
+    """Return a Sun direction 24 deg from the zenith, in the top camera's field, with a sunlit limb."""
     zenith = POSITION[0] / np.linalg.norm(POSITION[0])
     towards = zenith + 0.45 * np.array([0.0, 0.6, 0.8])
     return np.asarray(towards / np.linalg.norm(towards))

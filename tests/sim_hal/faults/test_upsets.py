@@ -62,7 +62,7 @@ def test_a_bit_of_the_chips_set_up_is_measured_and_mended_within_half_a_second(
 def test_a_bit_of_an_output_changes_its_coil_until_the_next_command() -> None:
     rig = driven_rig()
     before = rig.currents()
-    rig.wire.chip.flip(LED0_ON_L + 3, 3)  # the pin that drives x goes low half a period later
+    rig.wire.chip.flip(LED0_ON_L + 3, 3)  # the pin that drives x changes to low half a period later
     assert abs(rig.currents()[0] - before[0]) > 0.02
     drive(rig)
     drive(rig)

@@ -203,7 +203,7 @@ def test_a_track_counts_time_from_where_the_attitude_does() -> None:
 
 @pytest.mark.parametrize("height", [100.0, 5e3, 330e3])
 def test_a_track_is_sampled_finely_enough_for_any_pass(height: float) -> None:
-    """Orbits that cross `height` m apart: even motion between samples misses by 1e-7 rad at most."""
+    """If orbits cross `height` m apart, uniform motion between samples is correct to 1e-7 rad."""
     low = KeplerianElements(semi_major_axis=7000e3)
     high = KeplerianElements(semi_major_axis=7000e3 + height, inclination=1.5)
     camera, other = propagate(low, 10.0, j2=0.0), propagate(high, 10.0, j2=0.0)

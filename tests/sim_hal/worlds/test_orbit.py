@@ -102,7 +102,7 @@ def test_mean_elements_written_as_an_orbit_keep_its_shape(seed: int) -> None:
 
 
 def test_elements_give_the_published_state() -> None:
-    """Vallado, Fundamentals of Astrodynamics, Example 2-6 (its GM differs by 4e-10)."""
+    """The expected state is that of Vallado's Example 2-6, whose GM differs by 4e-10."""
     position, velocity = VALLADO.state()
     assert position == pytest.approx([6_525_368.12, 6_861_531.83, 6_449_118.61], abs=0.01)
     assert velocity == pytest.approx([4902.2786, 5533.1396, -1975.7101], abs=1e-4)

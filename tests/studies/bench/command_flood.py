@@ -36,7 +36,7 @@ FLOODS = ("none", "no commands", "begin as commands")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run all cases and print the figures.
+    """Run all cases, and print the measured values.
 
     Returns 1 if a ping was lost without a flood or under datagrams that are not commands.
     """
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure(place: Path, seconds: float, kind: str) -> dict[str, Any]:
-    """Run one case. Returns the lateness, the number of flood datagrams, and the number of answered pings."""
+    """Run one case. Returns the lateness and the numbers of flood datagrams and of acknowledged pings."""
     port, run, config = free_port(), place / "run", place / "flight.yaml"
     commands = json.dumps({"udp": f"127.0.0.1:{port}"})
     config.write_text(f"{CONFIG.read_text(encoding='utf-8')}\ncommands: {commands}\n", encoding="utf-8")
@@ -91,7 +91,7 @@ def _datagrams(kind: str) -> list[bytes]:
 
 
 def _is_answered(port: int, number: int) -> bool:
-    """Send a ping once, and return whether its answer arrived."""
+    """Send a ping once, and return whether its reply arrived."""
     try:
         return bool(exchange(f"127.0.0.1:{port}", CommandPacker().pack(Ping(number), utc_ns()), _ANSWER_S))
     except FlightError:

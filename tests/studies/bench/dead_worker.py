@@ -35,7 +35,7 @@ _BESIDE_S = 1.0
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the flight and print the figures.
+    """Run the flight, and print the counts.
 
     Returns 1 if a cycle was lost or an attempt was not limited and reported.
     """

@@ -214,7 +214,7 @@ def full_load(load: Load) -> str:
 
 @contextmanager
 def _compiled() -> Iterator[None]:
-    """Let Python use compiled modules, as after an installation, whatever the environment of the shell."""
+    """Make Python use compiled modules, as after an installation, whatever the shell's environment is."""
     with tempfile.TemporaryDirectory() as folder:
         before = {name: os.environ.pop(name, None) for name in (_NO_BYTECODE, _BYTECODE)}
         os.environ[_BYTECODE] = folder

@@ -52,7 +52,7 @@ PLANNERS: dict[str, Planner] = {"collocation": plan_task, "vmc": slew_vmc.plan_t
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the figures; return the exit status."""
+    """Print the results; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.bench orbit_slews", description=__doc__)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

@@ -83,7 +83,7 @@ def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the figures."""
+    """Print the results."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.bench plan", description=__doc__)
     parser.add_argument("--runs", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)

@@ -149,7 +149,7 @@ class Rehearsal:
         self._begun = time.monotonic()
 
     def activate(self, version: str, number: int, added: str = "", killed: bool = False) -> None:
-        """Sign, send and activate a release, and let the privileged program build it."""
+        """Sign, send and activate a release, and make the privileged program build it."""
         bundle = self.board.bundle("release", self.board.sources(version, added), number)
         self.ends.activate(bundle, "release", 2.0)
         if killed:
@@ -170,7 +170,7 @@ class Rehearsal:
         self._note(step)
 
     def advance(self, seconds: float = 10.0) -> None:
-        """Run a step of the privileged program, restart flight and link, and let the link report."""
+        """Run a step of the privileged program, restart flight and link, and make the link report."""
         sys.stderr.write(self.board.step(seconds))
         self.ends.services()
         self.ends.turn(1.5)

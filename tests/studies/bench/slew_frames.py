@@ -46,7 +46,7 @@ AS_THEY_COME = BodyKind(ORBIT.plan, _as_they_come)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the figures; return the exit status."""
+    """Print the results; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.bench slew_frames", description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--as-they-come", action="store_true", help="exposures may meet the coils' steps")

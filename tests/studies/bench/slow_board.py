@@ -117,7 +117,10 @@ def configuration(wish: Wish) -> str:
 
 
 def fly(folder: Path, wish: Wish) -> Figures:
-    """Fly once in `folder`, and return the figures. Raises OSError if the system refuses the limit."""
+    """Run the flight once in `folder`, and return the results.
+
+    Raises OSError if the system refuses the limit.
+    """
     config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
     facts = devices / "facts.json"
     config.write_text(configuration(wish), encoding="utf-8")
@@ -201,7 +204,7 @@ def _shed(run: Run, seconds: float) -> Figures:
 
 
 def table(wish: Wish, figures: Figures) -> str:
-    """Return the figures as text."""
+    """Return the results as text."""
     late, spent = figures["lateness_s"], figures["execution_s"]
     group = f"; the group's {figures['memory_group_mib']:.0f} MiB" if "throttled" in figures else ""
     throttled = f", throttled in {figures['throttled']:.0%} of the periods" if "throttled" in figures else ""

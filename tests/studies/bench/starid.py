@@ -137,7 +137,7 @@ def pointing_bound(drawn: StarList, sky: SkyIndex) -> float:
 def row_of(
     solver: str, kind: str, answers: Sequence[Answer], lists: Sequence[StarList], bounds: Sequence[float]
 ) -> dict[str, Any]:
-    """Return the figures of one solver on the lists of one kind."""
+    """Return the results of one solver on the lists of one kind."""
     errors = np.array(
         [np.nan if a.boresight is None else pointing_error(a, d) for a, d in zip(answers, lists, strict=True)]
     )
@@ -210,7 +210,7 @@ def cases(count: int, sky: SkyIndex, seed: int) -> dict[str, list[StarList]]:
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Return all figures."""
+    """Return all results of the benchmark."""
     sky = default_index()
     everything = cases(options.lists, sky, options.seed)
     # The first call of each numpy function and the first use of each triangle list take extra time.

@@ -174,7 +174,7 @@ def _right(answers: Sequence[Answer], drawn: Sequence[StarList]) -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table. Returns 1 if an answer is wrong."""
+    """Print the table. Returns 1 if a result is wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lists", type=int, default=100, help="of each row (default %(default)s)")
     parser.add_argument("--only", default="", metavar="WORD", help="rows whose names contain it")

@@ -38,7 +38,7 @@ COIL_JUDGED = frozenset({"coil-broken", "coil-corrected"})
 """Events by which a broken coil is isolated, or a reversed one used with its sign changed."""
 
 OWN_OF_KIND: dict[str, frozenset[str]] = {
-    # The packets are valid, but too few or too old for control, so only the event of the stream comes.
+    # The packets are valid, but too few or too old for control, so only the event of the stream is reported.
     "imu: slow": OWN["imu"] | {"stream-poor"},
     "imu: delayed": OWN["imu"] | {"stream-poor"},
     "imu: intermittent": OWN["imu"] | {"stream-poor"},

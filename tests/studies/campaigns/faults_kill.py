@@ -99,7 +99,7 @@ KILLS = 16
 """Number of kills of a board, which is the highest `crash_limit` that a configuration may have."""
 
 EARLY = 0.25
-"""Fraction of the kills that come before the flight is ready."""
+"""Fraction of the kills that happen before the flight is ready."""
 
 LONGEST_FLOWN_S = 1.5
 _BEFORE_S = 0.1
@@ -185,8 +185,8 @@ def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, flo
     """Return the time (s) from the kill to lasting zero current, and the largest current after the limit.
 
     The first sample of zero current determines the time, which can be late by one sample interval, but not
-    early. Coils that carried current are watched beyond the limit, and others for long enough to see that
-    they stay at zero.
+    early. Coils that carried current are observed beyond the time limit, and all others long enough to show
+    that they stay at zero.
     """
     zero_after = beyond = 0.0
     driven = before > 0.0

@@ -1,8 +1,8 @@
 """Campaign `installer-kill`: kill -9 of the installer during an update, at a random time or system call.
 
 A case is a board that flies one release. Updates to other releases are killed repeatedly. Half of the kills
-end the installer and its child processes at a random time. The others end one process at a random system call
-that changes files (by strace, if it is installed). After each kill the board must fly the old or the new
+end the installer and its child processes at a random time. The other half end one process at a random system
+call that changes files (by strace, if it is installed). After each kill the board must fly the old or the new
 release without an error. At the end an update must complete, and its release must fly.
 """
 

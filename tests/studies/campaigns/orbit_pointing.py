@@ -15,9 +15,10 @@ Cells `unknown` are holds of a body whose moments, principal axes and coils diff
 up to the default accuracies.
 
 Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, at a rate of 0.3 deg/s, and last 100
-min. `arrived` counts bodies whose pointing axis comes within ARRIVED deg and stays there for the rest, at
-least half a revolution. `lost` counts bodies farther than LOST deg off at the end. The weight of the rotation
-about that axis is small (WEIGHTS of `orbit_pointing_flight`), so only the error of three axes includes it.
+min. `arrived` counts bodies whose pointing axis reaches the target within ARRIVED deg and stays there until
+the end, for at least half a revolution. `lost` counts bodies that are more than LOST deg from the target at
+the end. The weight of the rotation about that axis is small (WEIGHTS of `orbit_pointing_flight`), so only the
+error of three axes includes it.
 
 `share` multiplies the torques that the coils cannot cancel immediately: drag, sunlight, and the rotation of
 the principal axes. The residual dipole always has its full magnitude.

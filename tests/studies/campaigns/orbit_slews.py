@@ -4,9 +4,10 @@ A 3U slews by 30 to 180 deg between inertial attitudes in 600 to 1,200 s, the Kn
 multiplies the worst cases of drag, sunlight and the rotation of the principal axes; all other disturbances
 have their full magnitude. The optimum is that of the true body for the same duration.
 
-A described body is held for 1,200 s before its slew. An unknown body has moments of inertia up to 5 % and
-principal axes up to 3 deg off, and a residual dipole of 4e-3 A m^2. It flies two slews, each after 60 s: the
-`first`, and a second one with the parameters that have been estimated by then (`learned`).
+A described body is held for 1,200 s before its slew. An unknown body has moments of inertia that are wrong by
+up to 5 %, principal axes that are wrong by up to 3 deg, and a residual dipole of 4e-3 A m^2. It flies two
+slews, each after 60 s: the `first`, and a second one with the parameters that have been estimated by then
+(`learned`).
 
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner

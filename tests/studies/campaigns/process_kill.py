@@ -2,8 +2,8 @@
 
 A case is one flight with active planner and vision, on devices in a separate process. Workers and guardian
 are killed or stopped at random times; the log must report each event, and each process must be replaced.
-Finally the flight process itself is killed or stopped. The coils must come to zero current, and no process
-and no file of the flight may remain in the folder for temporary files or in shared memory.
+Finally the flight process itself is killed or stopped. The coil currents must become zero, and no process and
+no file of the flight may remain in the folder for temporary files or in shared memory.
 
 The emulated devices and the process that samples the coils represent hardware, which needs no processor. Both
 run under SCHED_FIFO if it is permitted, so that a busy machine delays only the flight.

@@ -5,9 +5,9 @@ changes linearly along its axis by 0 to 200 % of its mean, up or down; in a thir
 200 %, so the motion starts or ends at rest.
 
 Half as many additional frames have rotations that reverse within the exposure: 220 to 400 % in half of them,
-and up to 4,000 % in the others, over paths of the same lengths. The model does not include reversals, so a
-refusal is correct. Beyond 4,000 % both directions of the path coincide to a pixel, and no frame distinguishes
-the rotation from one that begins at rest.
+and up to 4,000 % in the other half, over paths of the same lengths. The model does not include reversals, so
+a refusal is correct. Beyond 4,000 % both directions of the path coincide to a pixel, and no frame
+distinguishes the rotation from one that begins at rest.
 
 The frames are summed instant by instant (`row_exposure`), not by the estimator's model. A result is right if
 its error is within 6 claimed standard deviations, or within 1 % of the rate.

@@ -1,8 +1,8 @@
 """Campaign `rso-orbits`: ten orbits as in the thesis (Tables 4.3 and 4.4), and the faintest detected object.
 
 The camera rotates at 0.05 rad/s about its y axis for ten orbits, with a frame every second. The frames in
-which the object is observable are the opportunities. Run 0 starts as the thesis does; the others start at a
-random angle about that axis, and all have independent noise. The default detector, which uses the pixels, is
+which the object is observable are the opportunities. Run 0 starts as the thesis does, and all other runs at a
+random angle about that axis. All runs have independent noise. The default detector, which uses the pixels, is
 compared with each indicator alone, by the thesis's strict rule of 2.5 sigma of the frame, and with the lower
 bounds that the thesis requires. The streak that an indicator selects is correct if it is the object, an
 overlap if other stars lie on it, and otherwise false. Table 4.4 is also counted with the 7,000 brightest

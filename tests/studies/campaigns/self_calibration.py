@@ -176,7 +176,7 @@ def _judged(found: FrameFound, rate: FloatArray, bound: FloatArray) -> dict[str,
 
 
 def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
-    """Return the NEES of the six learned parameters, and the number of contradictions."""
+    """Return the NEES of the six estimated parameters, and the number of contradictions."""
     values, covariance = lens.learned
     error, unit = values[:6] - true.parameters(), np.sqrt(np.diag(covariance)[:6])
     scaled = error / unit
@@ -191,7 +191,7 @@ def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return claimed uncertainties and NEES by row, before and after the lens is learned."""
+    """Return claimed uncertainties and NEES by row, before and after the lens is estimated."""
     del out
     facts: dict[str, dict[str, Any]] = {}
     for row in ROWS:

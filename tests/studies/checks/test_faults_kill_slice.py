@@ -22,7 +22,7 @@ def test_boards_come_to_the_kills_that_are_asked() -> None:
 
 @pytest.mark.slow
 def test_after_each_kill_coils_log_and_state_are_sound_and_the_next_flight_starts(tmp_path: Path) -> None:
-    """With seed 7 the first kill comes with the coils on (on a fast machine), the second before READY."""
+    """With seed 7 the first kill is made with coils on (on a fast machine), the second before READY."""
     facts = summarise(fly_here(faults_kill.FAULTS_KILL, 2, seed=7), tmp_path).facts
     assert (facts["kills"], facts["early"]) == (2, 1)
     assert (facts["beyond_limit"], facts["current_after_a"]) == (0, 0.0)

@@ -165,7 +165,7 @@ def test_wrong_path_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_mirrored_tests_come_first() -> None:
-    """The mirrored file comes first, then the files that import the module, then the rest of the folder."""
+    """The mirrored file comes first, then the files that import the module, then all others of the folder."""
     tests = mirrored_tests(ROOT, "knightcube/astro/quaternion.py")
     assert tests[0] == "tests/knightcube/astro/test_quaternion.py"
     assert all(name.startswith("tests/knightcube/astro/") for name in tests)

@@ -69,7 +69,7 @@ class Verdict:
 
     Attributes:
         compared: number of compared packets and values.
-        added: numbers of packets and keys of answers that only the new side has, by name.
+        added: numbers of packets and of keys of command results that only the new side has, by name.
         extended: packets whose new definition has more fields.
         difference: the first difference, or None.
     """

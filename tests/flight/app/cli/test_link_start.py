@@ -132,7 +132,7 @@ def test_no_line_is_opened_during_the_separation_inhibit(
 
 
 def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callable[[Path], Service]) -> None:
-    """The start waits for the configuration, for keys that are not mounted yet, and for an old process."""
+    """The start waits for the configuration, for unmounted keys, and for the end of an old process."""
     whole = write_linked_config(place, udp="127.0.0.1:0")
     config = place / "later.yaml"
     keys, away = place / "keys" / "satellite", place / "away"

@@ -1,4 +1,4 @@
-"""Tests that Sun acquisition reports a missing Sun once, and that commands use the learned coils."""
+"""Tests that Sun acquisition reports a missing Sun once, and that commands use estimated coil gains."""
 
 from __future__ import annotations
 

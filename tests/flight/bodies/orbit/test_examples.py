@@ -1,4 +1,4 @@
-"""Tests that the shipped satellites detumble with other coils, sizes and orbits."""
+"""Tests that the shipped satellites detumble with other coils, dimensions and orbits."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     assert int(run["health"]["coils_in_use"][-1]) == 0b0111
     after = told["time_ns"] > event["time_ns"] + 1_000_000_000
     assert not told["command"][after, broken].any()
-    # The learned state of four coils is not valid for three coils.
+    # The estimated parameters of four coils are not valid for three coils.
     told_of = run["description"]
     place = np.searchsorted(told_of["time_ns"], event["time_ns"])
     learned, anew = told_of["coils_sigma"][place - 1], told_of["coils_sigma"][place]

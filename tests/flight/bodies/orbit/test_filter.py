@@ -257,7 +257,7 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
 
 @pytest.mark.parametrize("wrong", [-2e-3, 1.5e-3])
 def test_stars_replace_a_wrong_bias_of_an_earlier_boot_within_half_a_minute(wrong: float) -> None:
-    """The stored bias claims an uncertainty of 1e-5 rad/s.
+    """The stored bias has a claimed uncertainty of 1e-5 rad/s.
 
     Star fixes contradict it and restart the filter.
     """
@@ -414,7 +414,7 @@ def _coil_x(flown: Flown) -> tuple[float, float]:
 
 
 def test_a_correction_of_a_coil_is_applied_in_the_currents_and_not_in_the_learned_matrix_as_well() -> None:
-    """The filter has learned a gain of 0.8 before the coil monitor multiplies the dipole by 0.8."""
+    """The filter has estimated a gain of 0.8 before the coil monitor multiplies the dipole by 0.8."""
     flown = acquired(pulses=True)
     flown.carries = 0.8
     for _ in range(10):

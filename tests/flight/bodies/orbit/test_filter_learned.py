@@ -44,7 +44,7 @@ THEN, CHANGED = 1.78e9, 0.05
 
 
 def known(share: float = 0.1) -> SlowStates:
-    """Return states with a fraction of their initial standard deviations and correlated dipole parts."""
+    """Return parameters known to a fraction of their prior sigmas, with correlated dipole parts."""
     sigma = share * START
     together = np.eye(len(sigma))
     dark, lit = DIPOLE.start - GYRO.start, SUNLIT.start - GYRO.start
@@ -58,7 +58,7 @@ def stored(slow: SlowStates) -> dict[str, Learned]:
 
 
 def grown(age: float) -> FloatArray:
-    """Return the variances, after an age (s), of states that were known to a tenth of their prior."""
+    """Return the variances, after an age (s), of parameters known to a tenth of their prior sigma."""
     return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + thinned(age).diagonal())
 
 

@@ -44,7 +44,7 @@ class Pair:
         return self.ends[source].send(path, name, to, kind, self.now_ns, self.now_ns, Origin())
 
     def turn(self, units: int = 20) -> None:
-        """Let each end send some data units, and advance the clock."""
+        """Make each end send some data units, and advance the clock."""
         for number, other in ((SATELLITE, GROUND), (GROUND, SATELLITE)):
             for _ in range(units):
                 unit = self.ends[number].unit(self.now_ns)

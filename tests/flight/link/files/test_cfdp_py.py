@@ -120,7 +120,7 @@ class Ends:
         return self.ours.send(path, received.name, FOREIGN, kind, 10**9, self.now_ns, NOBODY).number
 
     def turn(self, seconds: float = STEP_S) -> None:
-        """Let both ends send their queued data units."""
+        """Make both ends send their queued data units."""
         until = self.now_ns + round(seconds * 1e9)
         while self.now_ns < until:
             self.now_ns += round(STEP_S * 1e9)
@@ -131,7 +131,7 @@ class Ends:
                 self._go_on()
 
     def until_closed(self) -> None:
-        """Let time pass until both ends have closed all transfers. Raises TimeoutError."""
+        """Advance the clock until both ends have closed all transfers. Raises TimeoutError."""
         while self.ours.transfers() or self.source.states.state.value or self.dest.states.state.value:
             if self.now_ns > LONGEST_S * 1e9:
                 raise TimeoutError(f"{self.ours.transfers()}, {self.source.states}, {self.dest.states}")
@@ -151,7 +151,7 @@ class Ends:
         return bool(self.draw.random() >= self.loss)
 
     def _give(self, unit: Any) -> None:
-        """Pass a data unit to the handler of its transfer, or answer for a transfer that has ended."""
+        """Pass a data unit to the handler of its transfer, or reply for a transfer that has ended."""
         if isinstance(unit, EofPdu) and unit.condition_code > CANCELLED:
             # spacepackets 0.32 does not shift the condition out of the upper half of its byte.
             unit.condition_code = ConditionCode(unit.condition_code >> 4)

@@ -66,7 +66,7 @@ def test_blocks_that_power_loss_left_as_zeros_cost_only_what_they_cover(run: Pat
 
 
 def packets_of_prefix(data: bytes) -> int:
-    """Return where the last whole packet of `data` ends."""
+    """Return the position at which the last complete packet of `data` ends."""
     position = 0
     while True:
         length = int.from_bytes(data[position + 4 : position + 6], "big") + 7

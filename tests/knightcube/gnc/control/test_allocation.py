@@ -58,7 +58,7 @@ def test_two_coils_make_the_same_torque_unless_the_failed_axis_is_normal_to_the_
 
 @pytest.mark.parametrize(("sine", "kept"), [(0.14, False), (0.17, True)])
 def test_a_torque_that_would_take_all_the_current_is_discarded(sine: float, kept: bool) -> None:
-    """Without the coil on y, a field at that sine from the x-z plane leaves this strength about one axis."""
+    """Without the coil on y, a field at this sine from the x-z plane permits only a small torque."""
     field = 3e-5 * np.array([np.sqrt(1.0 - sine**2), sine, 0.0])
     weak = np.array([0.0, 0.0, 1e-8])
     found = allocate(weak, field, COILS, AMPLE, available=np.array([True, False, True]))

@@ -174,7 +174,7 @@ def test_a_body_within_one_cone_still_avoids_the_other() -> None:
 
 
 def rest_of(table: PointingTable, since: float, q: FloatArray, w: FloatArray) -> PointingTable | None:
-    """Return the plan for the rest of the slew of a table, from an estimate `since` s after its start."""
+    """Return the plan for the remaining slew of a table, from an estimate `since` s after its start."""
     assert table.slew is not None
     ahead = replace(ORBIT, times=ORBIT.times - STEP - since)
     at = np.zeros(1)

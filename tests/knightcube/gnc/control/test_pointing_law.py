@@ -1,4 +1,4 @@
-"""Tests that a body far off its path is damped in any attitude until it is slow."""
+"""Tests that a body far from its path is damped in any attitude until it is slow."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_its_dipoles_alone_fly_it(rolling: PlannedMotion) -> None:
 
 
 def test_no_other_motion_near_it_costs_less(rolling: PlannedMotion) -> None:
-    """A new plan from a state ten minutes later equals the rest of the first plan."""
+    """A new plan from a state ten minutes later equals the remainder of the first plan."""
     whole, later = expected(), 60
     count = len(whole.field)
     rest = replace(
@@ -213,7 +213,7 @@ def test_the_derivative_of_a_step_is_exact(rolling: PlannedMotion) -> None:
 
 
 def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
-    """These gains let torques along the field move the body away, faster with each step."""
+    """With these gains, torques along the field move the body away, faster with each step."""
     ahead = expected().until(61)
     rest = PlannedMotion(ahead.wanted.quaternion, ahead.wanted.rate, np.zeros((60, 4)))
     gain = np.zeros((60, 4, 6))

@@ -113,8 +113,8 @@ def test_edges_and_flat_parts_answer_nothing_and_corners_do(neighbours: int) -> 
     response = trajkovic_response(image, neighbours, 0.05, 0.05)
     assert response[20, 35] == 0.0
     assert response[5, 5] == 0.0
-    # By hand with four neighbours: r_A = r_B = 1, B = B2 = -1, A = 2; with eight the lower left diagonal adds
-    # nothing lower.
+    # With four neighbours, r_A = r_B = 1, B = B2 = -1 and A = 2. With eight neighbours, the lower left
+    # diagonal gives no lower value.
     assert response[20, 20] == pytest.approx(0.5 if neighbours == 4 else 1.0)
 
 

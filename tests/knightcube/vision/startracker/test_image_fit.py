@@ -163,7 +163,7 @@ def test_stars_from_different_parts_of_the_sky_do_not_give_an_attitude() -> None
 
 
 def test_an_unknown_lens_is_fitted_and_included_in_the_covariance() -> None:
-    """The optical axis is 25 px off the image centre, and the distortion is 2 % at the corner."""
+    """The optical axis is 25 px from the image centre, and the distortion is 2 % at the corner."""
     squares, off = [], []
     for number in range(12):
         found, truth = drawn("poor", number)
@@ -211,8 +211,8 @@ def test_equal_errors_of_bright_and_faint_stars_are_in_the_covariance(scatter: b
         known += float(error @ np.linalg.solve(found.fix.covariance, error))
         off += float(np.sum(error[:2] ** 2))
         ideal += float(np.sum(_error(_fit(seen, covariance + 0.05**2 * np.eye(2), reference))[:2] ** 2))
-    # Some of the brightest stars are rejected, so that the variance of the others is slightly too small. An
-    # excess that is not significant is not added either unless `scatter` is set.
+    # Some of the brightest stars are rejected, so that the variance of the remaining stars is slightly too
+    # small. An excess that is not significant is not added either unless `scatter` is set.
     assert known / (3.0 * _TRIALS) < (2.3 if scatter else 2.5)
     assert off < 1.5 * ideal
 
