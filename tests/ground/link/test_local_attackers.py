@@ -209,7 +209,7 @@ def _rest(line: socket.socket) -> bytes:
 
 
 def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
-    """This test shows that the requests of the other tests are refused only because of their sender."""
+    """An accepted request shows that the other tests' requests are refused because of their sender."""
     with socket.create_connection(("127.0.0.1", ground.gateway), PATIENCE_S) as line:
         line.sendall(token_path(ground.keys, ground.gateway).read_bytes() + SAFE)
         assert len(ground.obeyed(PATIENCE_S)) == 1

@@ -20,7 +20,7 @@ def at_pixels(model: StarCameraModel, points: object, attitude: FloatArray = POI
 
 
 def turning(rate: object, exposure: float = 1.0, samples: int = 2) -> tuple[FloatArray, FloatArray]:
-    """Return times and attitudes of a camera that starts at `POINTING` and turns at constant `rate` (3,)."""
+    """Return times and attitudes of a camera that starts at `POINTING` and rotates at `rate` (3,)."""
     times = np.linspace(0.0, exposure, samples)
     turn = quaternion.from_rotation_vector(times[:, None] * np.asarray(rate, dtype=float))
     return times, quaternion.multiply(turn, POINTING)
