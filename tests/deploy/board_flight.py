@@ -60,7 +60,7 @@ def everything_arrived(run: Run, orbit: bool) -> bool:
 
 
 def frames_with_rate(run: Run) -> PacketArray:
-    """Return the packets of the frames whose streaks gave a rate, of which the sign may be unknown."""
+    """Return the packets of frames whose streaks gave a rate, possibly with unknown sign."""
     frames = run["streak"]
     found: PacketArray = frames[np.isfinite(frames["rate"]).all(axis=1)]
     return found

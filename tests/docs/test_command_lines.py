@@ -67,7 +67,10 @@ def run(line: str, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(RUNNABLE))
 def test_the_command_lines_of_a_page_work(page: str, home: Path) -> None:
-    """Run the command lines in the order of the page. The fixture has flown the demonstration."""
+    """Run the command lines in the order of the page.
+
+    The fixture has already run the demonstration's flight.
+    """
     for block in blocks():
         if block.page == page and not block.mark:
             for line in block.commands:

@@ -25,7 +25,7 @@ from tests.support.flights import TEXT
 SERVING = {"console", "files", "gateway", "link", "watch", "camera"}
 """Commands that serve or wait until they are ended."""
 SLOW = {"index", "identify", "samples", "run"}
-"""Commands that compute for seconds or simulate a run."""
+"""Slow commands, which compute for seconds or simulate a run."""
 NAMES = sorted({**cli.COMMANDS, **GROUND_COMMANDS}.keys() - SERVING - SLOW)
 PATHS = (
     "good.yaml", "bad.yaml", "notes.txt", "run", "empty", "nowhere/run", "nowhere.png", ".", "..",

@@ -102,7 +102,7 @@ def _seen_circle(camera: LevelCamera, boresight: FloatArray, nadir: FloatArray) 
     down = np.array([0.0, 0.0, 1.0])
     cosine = np.sqrt(1.0 - (6_371_008.8 / (6_371_008.8 + ALTITUDE)) ** 2)
     x = np.array([-20.0, 0.0, 20.0]) / FOCAL
-    # Bisection for y in (b + x r + y d) . n = cosine |b + x r + y d|.
+    # Bisection solves (b + x r + y d) . n = cosine |b + x r + y d| for y.
     low, high = np.full(3, -2.0), np.full(3, 5.0)
     for _ in range(80):
         y = 0.5 * (low + high)

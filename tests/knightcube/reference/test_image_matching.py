@@ -1,4 +1,4 @@
-"""Tests that image matching finds exact attitudes, and Wahba's solution for noisy stars."""
+"""Tests that image matching finds exact attitudes, and for noisy stars the solution of Wahba's problem."""
 
 from __future__ import annotations
 

@@ -65,7 +65,9 @@ def test_the_covariance_is_honest(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(CAMERAS))
 def test_no_sun_is_found_in_frames_without_the_sun(name: str) -> None:
-    """The frames show limb, clouds and hot pixels, in the overexposed camera large saturated ones.
+    """The frames show limb, clouds and hot pixels.
+
+    Those of the overexposed camera also large saturated clouds.
 
     The test uses three frames of seed 12.
     """

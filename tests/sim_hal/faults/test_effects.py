@@ -124,7 +124,7 @@ def test_of_two_faults_on_a_wire_the_stronger_counts(bench: Bench) -> None:
 
 
 class Part:
-    """A device with one attribute."""
+    """A test double of a device with one attribute."""
 
     level = 1
 

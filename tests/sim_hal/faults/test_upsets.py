@@ -117,7 +117,7 @@ def test_the_monitors_calibration_is_used_by_nobody() -> None:
         (75, 20),  # rate above the capacity of the line
         (75, 24),  # output that is too infrequent for any user
         (75, 32),  # output without any group
-        (75, 41),  # group that the VN-100 does not have
+        (75, 41),  # an output group that the VN-100 does not have
         (75, 52),  # without the attitude
         (75, 62),  # fields that the VN-100 does not have
     ],

@@ -64,7 +64,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class UserCampaign:
-    """A campaign command in a folder of its own."""
+    """A user's campaign command that runs in a separate folder."""
 
     folder: Path
     runs: int

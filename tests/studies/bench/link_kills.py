@@ -228,7 +228,7 @@ class _SkyWire(Wire):
 
 
 class _GroundOut(GroundWire):
-    """Line of the ground that sends each frame to the parent process."""
+    """Line of the ground station that sends each frame to the parent process."""
 
     def __init__(self, way: Way) -> None:
         super().__init__(Wire())

@@ -134,7 +134,7 @@ def _facts(flown: Run, settled: float, silent: float, lit: float, last: float) -
 
 
 def judged(error: FloatArray, sigma: FloatArray) -> Result | None:
-    """Return the statistics of errors (n, 3), rad, and their standard deviations (n, 3); None without any."""
+    """Return statistics of errors (n, 3), rad, with standard deviations (n, 3); None if there are none."""
     if not len(error):
         return None
     return {

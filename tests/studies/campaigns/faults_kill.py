@@ -207,7 +207,7 @@ def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, flo
 
 
 def _log_of(folder: Path, ready_for: float | None) -> Result:
-    """Return whether the log can be read to its last complete packet, and how much of the flight it has."""
+    """Return whether the log is readable to its last complete packet, and how much of the flight it has."""
     try:
         flown = read_run(folder)
     except UsageError as error:

@@ -6,9 +6,9 @@ atmosphere. The attitudes are `level` (within 2 deg), `tilted` (within 15 deg, a
 keep the horizon in view) or `any`. In `sunlit` scenes the first two cameras show a sunlit limb; in
 `terminator` scenes the first camera shows the terminator. The default method and the method of all cameras
 together have the prior knowledge of a flight (as in the campaign `nadir`). The methods of the paper know the
-altitude; `graphic` also knows the pointing of the cameras, and `vector` the true nadir half a second earlier,
-at rates up to 2 deg/s. A result is wrong if its error exceeds half a degree, and far wrong if it exceeds five
-degrees.
+altitude; `graphic` also knows the pointing of the cameras. `vector` knows the true nadir half a second
+earlier, while the body rotates at up to 2 deg/s. A result is wrong if its error exceeds half a degree, and
+far wrong if it exceeds five degrees.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Campaign `object-flights`: objects kept in view by coils alone, with filter, planner and pointing law.
 
-Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`). Every other flight has
+Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`). Every second flight has
 no sighting for ten seconds. From the first frame in which a track is followed, the object should stay within
 the field of view. A linear programme (`least_deviation`) computes whether a body that starts at rest could
 keep it there, with the control authority that issue 16 states and with a roll rate of at most the rate at

@@ -48,7 +48,8 @@ LOST = 60.0
 body counts as lost.
 """
 ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
-"""Largest angle (deg) of arrival: the KnightCube is the lighter body, and issue 19 permits it a larger error.
+"""Largest angle (deg) from the target at arrival, by craft; issue 19 permits the lighter KnightCube a
+larger error.
 """
 SPIN = 0.3
 """Initial rate (deg/s) in the cells `turn`."""

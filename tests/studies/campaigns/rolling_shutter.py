@@ -3,8 +3,8 @@
 The fields are random, theta is 0 to 90 deg, streaks have 20 to 300 px, exposures are 0.2 and 1 s, and line
 times 10 to 50 us. Each frame is estimated twice: with a prior, which gives the direction of time, and without
 one. The frames are summed row by row (`row_exposure`), not by the estimator's model. A result without a prior
-may have the opposite sign; its covariance must include both directions. The bound is that of a global
-shutter.
+may have the opposite sign; its covariance must include both directions. The Cramer-Rao bound is that of a
+global shutter.
 """
 
 from __future__ import annotations

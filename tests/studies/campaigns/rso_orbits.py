@@ -201,7 +201,7 @@ def _strict(deviations: FloatArray) -> BoolArray:
 
 
 def _overlap(streak: FloatArray, ends: FloatArray, magnitudes: FloatArray) -> bool:
-    """Return whether two stars or more, of visible brightness, lie on a streak (2, 2) px."""
+    """Return whether at least two stars of visible brightness lie on a streak (2, 2), px."""
     chord = streak[1] - streak[0]
     length = float(np.linalg.norm(chord))
     along = chord / length if length > 0.0 else np.array([1.0, 0.0])

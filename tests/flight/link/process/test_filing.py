@@ -144,7 +144,7 @@ def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
 
 @pytest.mark.parametrize("name", [b"bad\xff", b"loop"])
 def test_a_strange_name_in_the_log_does_not_end_the_link(link: FiledEnds, name: bytes) -> None:
-    """The names are one that is not UTF-8, and a symbolic link to itself."""
+    """The tested names are a name that is not UTF-8, and a symbolic link to itself."""
     link.record(*timing_packets(50))
     run = link.place / "runs" / "run-000001"
     if name == b"loop":

@@ -100,7 +100,7 @@ def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
 
 
 def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> None:
-    """After 30 s errors are within three sigma, and torsion and gain are known ten times better."""
+    """After 30 s errors are within three sigma, and torsion and gain are ten times more accurate."""
     flight = fly(4, 1200, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)

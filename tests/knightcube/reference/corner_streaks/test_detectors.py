@@ -66,7 +66,7 @@ def test_a_patch_computed_by_hand() -> None:
 
 
 def test_where_no_direction_between_is_lower_the_simple_response_stands() -> None:
-    """The pixels right 1, left 3, below 1 and above 1 around 5 give B1 = B2 = (-2)(-2) = 4, not negative."""
+    """The pixels 1 (right), 3 (left), 1 (below) and 1 (above) around 5 give B1 = B2 = 4, not negative."""
     patch = _patch([[0, 1, 0], [3, 5, 1], [0, 1, 0]])
     assert interpixel_response(patch, 4)[1, 1] == 20.0
 

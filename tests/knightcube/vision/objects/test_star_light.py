@@ -32,7 +32,7 @@ _CORNER = np.array([200.0, 220.0])
 
 
 def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | None, seed: int) -> Patch:
-    """Return a patch of 90 x 40 px with stars of `flux` counts, and an object of 40000 along `extra`."""
+    """Return a patch of 90 x 40 px with stars of `flux` counts, and 40000 counts of an object on `extra`."""
     image = np.zeros((40, 90))
     for middle in middles:
         direction = _CAMERA.pinhole.unit_vectors(np.array([middle]))[0]
