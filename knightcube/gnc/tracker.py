@@ -20,12 +20,12 @@ not straight lines. For example, the ratio (range rate) / range changes by the s
 for an object that moves along a great circle at a constant angular rate. The additional noise density is
 (`bend` rate^2)^2 / rate, where rate is the angular rate of the object.
 
-Sightings are assigned to tracks in order of increasing chi-square, each sighting to at most one track. The
-assignment in order of chi-square is the greedy nearest neighbour method (Blackman and Popoli 1999, Design and
-Analysis of Modern Tracking Systems, section 6.4). Unassigned sightings start tentative tracks. A track is
-confirmed after m sightings in n frames if its angular rate differs from the rate of the stars. Two
-unconfirmed tracks may use the same sighting. A confirmed track is propagated without measurements while the
-object is not detected.
+Each sighting is assigned to at most one track, first to confirmed and then to tentative tracks, in order of
+increasing cost: the chi-square plus the logarithm of the determinant of the innovation's covariance. This is
+the greedy nearest neighbour method (Blackman and Popoli 1999, Design and Analysis of Modern Tracking Systems,
+section 6.4). Unassigned sightings start tentative tracks. A track is confirmed after m sightings in n frames
+if its angular rate differs from the rate of the stars. A confirmed track is propagated without measurements
+while the object is not detected.
 """
 
 from __future__ import annotations
