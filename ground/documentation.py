@@ -167,7 +167,8 @@ def _section(layout: Layout) -> str:
         lines += ["", "| byte | field | type | unit | meaning |", "|---|---|---|---|---|"]
     for field, offset in _offsets(layout):
         kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
-        lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {meaning_of(field)} |")
+        meaning = meaning_of(field).replace("|", r"\|")
+        lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {meaning} |")
     return "\n".join(lines) + "\n"
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import pkgutil
 import runpy
 import sys
 from pathlib import Path
+
+# The same setting as in `python -m flight`; a study imports numpy later.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _FOLDER = Path(__file__).parent
 _NOT_STUDIES = {"__main__", "checks"}
