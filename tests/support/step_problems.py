@@ -124,7 +124,7 @@ def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0,
 def feasible_problems(
     count: int, seed: int, share: tuple[float, float] = (1.1, 2.5)
 ) -> list[tuple[Problem, float]]:
-    """Return slews, each with its shortest feasible duration (s); it lasts a random factor in `share` longer.
+    """Return slews that last `share` times their shortest feasible duration, each with this duration (s).
 
     A third of the plants has no thread, and two thirds a thread of one of two stiffnesses. Half of the plants
     have a disturbance, and half of the slews end with a rate.
