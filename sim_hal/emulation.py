@@ -54,7 +54,7 @@ class EmulatedWires:
     def connect(self, kind: str, device: str, baud_rate: int) -> SerialEnd:
         """Make a serial line for the device of section `kind`, and return the device's end."""
         if device in self.lines:
-            raise ConfigError(f"{kind}.device", f"is {device!r}, the line of another device")
+            raise ConfigError(f"{kind}.device", f"is {device!r}, which another device uses")
         generator = line_generator(self._seed, *_LINE_KEYS.get(kind, (zlib.crc32(device.encode()),)))
         self._kinds[kind] = device
         if self._pty:

@@ -506,7 +506,7 @@ def running_server(facts_path: Path) -> Iterator[Served]:
             facts = json.load(file)
             facts = {name: facts[name] for name in _FACTS}
         except (OSError, ValueError, LookupError, TypeError) as error:
-            problem = f"{facts_path} names no server: give a file that `sim_hal serve --facts` wrote"
+            problem = f"{facts_path} describes no server: give a file that `sim_hal serve --facts` wrote"
             raise UsageError(problem) from error
         try:
             lock_bus(file.fileno())

@@ -47,8 +47,8 @@ class CoilFault(Enum):
     B_LOW = "input B's leg stuck low: no current in the negative direction"
     A_HIGH = "input A's leg stuck high: current at zero command"
     B_HIGH = "input B's leg stuck high: current at zero command"
-    HIGH = "a leg stuck high: current at zero command, gone while its bridge is braked"
-    UNCERTAIN = "broken in one of several ways"
+    HIGH = "a leg stuck high: current at zero command, except while its bridge brakes"
+    UNCERTAIN = "faulty, with several possible causes"
 
 
 ELECTRICAL = (

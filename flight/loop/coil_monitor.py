@@ -592,7 +592,7 @@ class CoilMonitor:
         if self.correction.reverse(axis, now_ns, in_tumble=in_tumble):
             self._apply(axis, seen, now_ns)
         else:
-            why = f"coil {COIL_NAMES[axis]}: {seen}; its sign changed too often, kept at zero"
+            why = f"coil {COIL_NAMES[axis]}: {seen}; its sign changed too often, so its current stays zero"
             self._rests[axis] = now_ns, why
 
     def _apply(self, axis: int, seen: str, now_ns: int) -> None:
@@ -795,7 +795,7 @@ class CoilMonitor:
         if not works and self._is_contradicted(axis, fault):
             if self._begin_comparison(axis, fault, now_ns):
                 return
-            why = f"{self._strangeness}; but the motion shows no change of coil {COIL_NAMES[axis]}"
+            why = f"{self._strangeness}; but the measured motion shows no fault of coil {COIL_NAMES[axis]}"
             self._witness.doubt_monitor(why, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)

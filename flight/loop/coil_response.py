@@ -386,7 +386,7 @@ class CoilResponse:
 
     def text(self, axis: int) -> str:
         """Return the gain of an axis as text."""
-        return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
+        return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its expected torque"
 
     def _close_bin(self) -> bool:
         times, spans, rates, fields, currents = zip(*self._samples, strict=True)
@@ -725,7 +725,7 @@ class CoilCorrection:
         sizes = np.abs(factors)
         if factors.shape != self.factors.shape or not ((sizes >= LEAST_GAIN) & (sizes <= 1.0)).all():
             number = f"not {len(self.factors)} factors"
-            return f"{factors.tolist()}: {number} from {LEAST_GAIN:g} to 1 or with the opposite sign"
+            return f"{factors.tolist()}: {number} from {LEAST_GAIN:g} to 1 in magnitude"
         self.factors, self.deviations = factors.copy(), deviations.copy()
         self.sizes = tuple(sizes.tolist())
         return ""
@@ -736,7 +736,7 @@ class CoilCorrection:
 
     def text(self, axis: int) -> str:
         """Return the factor of a coil as text."""
-        return f"flown with {self.factors[axis]:+.2f} of its described dipole"
+        return f"used with {self.factors[axis]:+.2f} of its configured dipole"
 
     def _multiply(self, axis: int, factor: float) -> None:
         self.factors = self.factors.copy()

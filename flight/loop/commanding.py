@@ -106,7 +106,7 @@ class OnboardParameters:
         Return why the new table is rejected, or an empty text.
         """
         if replaced != self._crc:
-            return f"the table in use is {self._crc:08x}, not {replaced:08x}: dump it and check again"
+            return f"the table in use has CRC {self._crc:08x}, not {replaced:08x}: dump and check it again"
         before = self._table.values if self._table.proven else self._table.before
         if problem := problem_of(values) or self._adopt(values):
             return problem

@@ -324,7 +324,9 @@ class FrameReport:
     def lens(self, frame: Frame, before: LensKnowledge, lens: LensKnowledge, now_ns: int) -> None:
         """Record the lens parameters, and report if the frame contradicted the parameters `before` it."""
         if lens.contradictions > before.contradictions:
-            text = f"frame {frame.sequence}: learned from {before.frames} frames, now learned again"
+            text = (
+                f"frame {frame.sequence} contradicts the lens of {before.frames} frames: it is learned again"
+            )
             self._events.report(events.LENS_CHANGED, now_ns, text)
         f, x, y, k1, k2, line_time, psf_sigma = lens.learned[0].tolist()
         sigma = np.sqrt(np.diag(lens.learned[1]))
@@ -459,7 +461,7 @@ class ObjectTracks:
         pixel = float(seen.sigma.min(initial=1.0)) / FLOOR_PX
         place = self._field.locate(seen, predicted, _STEP_PX * pixel)
         if place.begun or self._located is None:
-            self._clear("the stars of earlier frames are lost", now_ns)
+            self._clear("the frame shares no stars with earlier frames", now_ns)
         self._located = middle_ns, place.quaternion, attitude
         kept, turn = ~place.is_star, attitude_matrix(place.quaternion).T
         directions = seen.directions[kept] @ turn.T
@@ -732,7 +734,7 @@ class Imaging:
         self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
         age_ns = now_ns - self._last_frame_ns
         late = age_ns > self._settings.max_age_ns
-        text = f"frame {frame.sequence} comes {age_ns * 1e-9:.1f} s after its exposure"
+        text = f"frame {frame.sequence} arrives {age_ns * 1e-9:.1f} s after its exposure"
         self._facts.update(facts.CAMERA_LOST, late, now_ns, text)
         self._facts.update(facts.CAMERA_LATE, age_ns > self._settings.late_ns, now_ns, text)
         if not late:
@@ -822,5 +824,5 @@ class Imaging:
     def _judge_speed(self, now_ns: int) -> None:
         taken_ns = now_ns - self._busy_since_ns
         self._spare = taken_ns <= self._settings.slow_ns
-        text = f"{taken_ns * 1e-9:.2f} s for a frame, {self._settings.slow_ns * 1e-9:g} s expected"
+        text = f"{taken_ns * 1e-9:.2f} s to process a frame, {self._settings.slow_ns * 1e-9:g} s expected"
         self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)

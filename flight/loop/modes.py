@@ -158,7 +158,7 @@ def check(table: Table) -> None:
             raise FlightError(f"mode table: {mode.label} has no row")
         for trigger in Trigger:
             if trigger not in row:
-                raise FlightError(f"mode table: {mode.label} has no answer to {trigger.value!r}")
+                raise FlightError(f"mode table: {mode.label} has no entry for {trigger.value!r}")
         for trigger in SAFING:
             if row[trigger] is not Mode.SAFE and not (
                 mode is Mode.SAFE and row[trigger] is TriggerAnswer.STAY
@@ -497,7 +497,7 @@ class ModeControl:
         if Mode.ACQUIRE in self._modes and rate is None:
             text = f"no body rate for {blind:.0f} s"
         elif estimate is not None:
-            text = f"no estimate accurate enough to steer by for {blind:.0f} s"
+            text = f"no estimate accurate enough for control for {blind:.0f} s"
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
             self._brake(estimate, rate, now_ns)

@@ -343,8 +343,8 @@ class Navigation:
             self._bytes_since_ns = now_ns
         without_ns = now_ns - max(self._received_ns, self._bytes_since_ns)
         unusable = without_ns > limit_ns
-        text = f"bytes but no reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
-        text = text if unusable else "readings come again"
+        text = f"bytes but no valid reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
+        text = text if unusable else "readings arrive again"
         self._facts.update(facts.IMU_UNUSABLE, unusable, now_ns, text)
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes
@@ -413,7 +413,7 @@ class Positioning:
                 self._fixed_ns = reading.time_ns
                 # Before the first fix, the position was computed with the wall clock.
                 self._off_ns = self._clock.correct(reading.utc_ns + GPS_DELAY_NS, reading.time_ns)
-                text = f"the wall clock is {self._off_ns * 1e-9:+.1f} s off the receiver's time"
+                text = f"the wall clock differs from GPS time by {self._off_ns * 1e-9:+.1f} s"
                 self._facts.update(facts.CLOCK_OFF, abs(self._off_ns) > facts.CLOCK_OFF_NS, now_ns, text)
             elif verdict.refusal:
                 text = f"{verdict.refusal}; {reading.satellites} satellites"
@@ -499,4 +499,4 @@ class SunSensing:
         age_ns = now_ns - self._read_ns
         lost = age_ns > self._max_age_ns
         text = self._strings.error() or f"no reading for {age_ns * 1e-9:.0f} s"
-        self._facts.update(facts.STRINGS_LOST, lost, now_ns, text if lost else "readings come again")
+        self._facts.update(facts.STRINGS_LOST, lost, now_ns, text if lost else "readings arrive again")

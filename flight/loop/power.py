@@ -95,7 +95,7 @@ class MonitorWatch:
         seconds, moved = (now_ns - self._since_ns) * 1e-9, self._high - self._low
         if seconds < STUCK_FOR or moved <= STUCK_RANGE:
             return ""
-        return f"{self.name}: unchanged for {seconds:.0f} s, while the other monitor moved by {moved:.3f} V"
+        return f"{self.name}: unchanged for {seconds:.0f} s, while the other monitor changed by {moved:.3f} V"
 
 
 @dataclass(frozen=True, slots=True)

@@ -570,7 +570,7 @@ class StateKeeper:
         loaded = store.load()
         if boots > loaded.boot_count:
             notices.report(
-                events.STATE_OLD, f"state of boot {loaded.boot_count}, but boot {boots} is on record"
+                events.STATE_OLD, f"the state is of boot {loaded.boot_count}, but boot {boots} is recorded"
             )
             loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
         self._begun = begin_boot(loaded, self._label(), devices)
@@ -589,7 +589,7 @@ class StateKeeper:
         begun, report = self._begun, self._notices.report
         if loaded.learned and not begun.learned:
             former = loaded.devices or "of an older version"
-            text = f"learned for devices {former}, present devices {begun.devices}"
+            text = f"learned with devices {former}, but the present devices are {begun.devices}"
             report(events.LEARNED_REFUSED, text)
         if begun.table.values != loaded.table.values:
             report(

@@ -94,7 +94,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
         raise ConfigError(key, f"is {named!r}: name one of {', '.join(known)}, or `module:object`")
     file = environment.get(MODULES)
     if file is not None and place not in known.values() and place not in _permitted_objects(Path(file)):
-        raise ConfigError(key, f"is {named!r}: add it as a line to {file}, which belongs to root")
+        raise ConfigError(key, f"is {named!r}, which is not permitted: add it as a line to {file} as root")
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:

@@ -143,7 +143,9 @@ def _check_satellite_coils(coils: Coils, refuse: Refuse) -> None:
         limit, reached = coil.current_limit or coils.current_limit, coils.supply_voltage / coil.resistance
         if limit > _BEYOND * reached:
             key = "coils.current_limit" if coil.current_limit is None else f"{place}.current_limit"
-            problem = f"is {limit:g}: the supply drives {reached:.3g} A through {coil.resistance:g} ohm"
+            problem = (
+                f"is {limit:g}: the supply can drive only {reached:.3g} A through {coil.resistance:g} ohm"
+            )
             refuse(key, problem)
     try:
         slots = coils.slots
@@ -197,7 +199,7 @@ def _check_cones(camera: Camera, cones: ExclusionCones, refuse: Refuse) -> None:
     corner = math.degrees(math.atan(half_width * math.hypot(1.0, camera.rows / camera.columns)))
     for name, angle in cones.angles().items():
         if math.degrees(angle) < corner:
-            problem = f"is {math.degrees(angle):g}: the corner of the star camera's field of view is"
+            problem = f"is {math.degrees(angle):g}: must cover the corner of the star camera's image,"
             refuse(f"pointing.cones.{name}_deg", f"{problem} {corner:.1f} deg from its boresight")
 
 
@@ -252,8 +254,8 @@ def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
         order = f"{limits.critical:g}, {limits.very_low:g}, {limits.low:g}"
         refuse("power.low_battery", f"has {order} as critical, very_low and low: must be in rising order")
     if limits.low + limits.hysteresis > 1.0:
-        top = f"is {limits.low:g}: with the hysteresis {limits.hysteresis:g}"
-        refuse("power.low_battery.low", f"{top} the charge cannot reach it: reduce the limit")
+        top = f"is {limits.low:g}: plus the hysteresis {limits.hysteresis:g}"
+        refuse("power.low_battery.low", f"{top} it exceeds 1, the full charge: reduce the limit")
     if config.camera is not None and limits.camera_period < config.camera.period:
         period = f"is {limits.camera_period:g} s: must be at least `camera.period`"
         refuse("power.low_battery.camera_period", f"{period}, {config.camera.period:g} s")
@@ -298,9 +300,7 @@ def _check_connections(config: Config, refuse: Refuse) -> None:
     for key, value, place in _connections(config):
         first = taken.setdefault(place, key)
         if first != key:
-            refuse(
-                key, f"is {value}, which `{first}` has too: give each device an address or file of its own"
-            )
+            refuse(key, f"is {value}, which `{first}` also uses: give each device its own address or file")
 
 
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
@@ -318,7 +318,7 @@ def _check_unit(kind: str, unit: UnitSection, refuse: Refuse) -> None:
 def _check_matrix(dotted: str, matrix: tuple[Vector, Vector, Vector], refuse: Refuse) -> None:
     largest = float(np.abs(np.array(matrix) - np.eye(3)).max())
     if largest > _LARGEST_CORRECTION:
-        problem = f"differs from the identity matrix by {largest:.3g}: a calibrated unit differs by at most"
+        problem = f"differs from the identity matrix by {largest:.3g}: it may differ by at most"
         refuse(dotted, f"{problem} {_LARGEST_CORRECTION:g} in each element")
 
 

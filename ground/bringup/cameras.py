@@ -169,7 +169,7 @@ def _no_light(dark: Outcome | None, pixels: Image, level: float, sources: int) -
         text = f"every pixel has {level:.0f} counts"
         return Finding("camera", "no signal", text, "check sensor, cable, gain and `pixel_format`")
     if same or dark is None:
-        text = f"{sources} point sources, and the level of a dark frame ({level:.0f} counts)"
+        text = f"{sources} point sources; the level is that of a dark frame ({level:.0f} counts)"
         return Finding("camera", "lens cap on", text, "take the cap off, or point the camera at stars")
     text = f"{sources} point sources at a level of {level:.0f} counts, {UNRECOGNISED}"
     return Finding("camera", "no sources", text, "focus the lens, and point the camera at stars or lamps")
@@ -209,7 +209,7 @@ def step_focus(session: Session) -> Outcome:
     last = next(width for width in reversed(widths) if math.isfinite(width))
     findings = []
     if not _SHARP[0] <= last <= _SHARP[1]:
-        text = f"PSF width {last:.2f} px, good are {_SHARP[0]} to {_SHARP[1]} px"
+        text = f"PSF width {last:.2f} px, outside {_SHARP[0]} to {_SHARP[1]} px"
         findings.append(Finding("camera", "out of focus", text, "turn the focus ring, and lock it"))
     values = {"psf_sigma": last, "widths": [None if math.isnan(width) else width for width in widths]}
     changes = {} if findings else {"camera": {"psf_sigma": round(last, 3)}}
@@ -262,7 +262,7 @@ def step_wide(session: Session) -> Outcome:
     """Cover one horizon camera after the other, and check that only the covered camera's frame changes."""
     cameras = session.config.wide_cameras
     if not cameras:
-        raise StepSkipped("the configuration has no wide_cameras")
+        raise StepSkipped("the configuration has no section `wide_cameras`")
     keys = [f"wide_cameras[{number}]" for number in range(len(cameras))]
     findings: list[Finding] = []
     session.ask("Point all horizon cameras at lit surfaces.")
@@ -321,7 +321,7 @@ def _cover_faults(key: str, darkened: Sequence[str], covered: Image) -> list[Fin
     others = [name for name in darkened if name != key]
     if key not in darkened and others:
         text = f"its cover darkens {others[0]}"
-        return [Finding(key, "exchanged", text, "exchange the plugs, or `device` of the two cameras")]
+        return [Finding(key, "exchanged", text, "swap the plugs, or `device` of the two cameras")]
     spread = float(np.std(covered)) / max(float(np.iinfo(covered.dtype).max), 1.0)
     if spread > 0.15:
         return [Finding(key, "noisy", "its covered frame is not dark", "check its cable and `pixel_format`")]

@@ -128,7 +128,7 @@ def _wrong_part(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Fi
         chip = chip_at(rig.wires.i2c(section.bus), section.address)
         if chip != named and chip:
             text = f"a chip of type {chip} answers at 0x{section.address:02x}"
-            return Finding(kind, "exchanged", text, f"exchange the addresses; expected here is a {named}")
+            return Finding(kind, "exchanged", text, f"swap the addresses: a {named} is expected here")
     if kind == "gps":
         return _serial_finding(kind, section, rig, serial)
     return None
@@ -157,7 +157,7 @@ def _wrong_address(kind: str, section: Any, rig: Rig, taken: set[Any]) -> Findin
         text = f"no answer at 0x{section.address:02x}, but a chip of type {named} answers at 0x{where[0]:02x}"
         return Finding(kind, "wrong address", text, f"set `address: 0x{where[0]:02x}`, or change its jumpers")
     listed = ", ".join(f"0x{address:02x}" for address in chips) or "no address"
-    text = f"no answer at 0x{section.address:02x}; on its bus answers {listed}"
+    text = f"no answer at 0x{section.address:02x}; addresses that answer on its bus: {listed}"
     return Finding(kind, "no answer", text, "check power, SDA, SCL and the address jumpers")
 
 
@@ -171,7 +171,9 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     found = None
     if what == wanted and rate != section.baud_rate:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"
-        found = Finding(kind, "wrong baud rate", text, f"set `baud_rate: {rate}`, or change the device's")
+        found = Finding(
+            kind, "wrong baud rate", text, f"set `baud_rate: {rate}`, or change that of the device"
+        )
     elif what == wanted == "vn100" and pause:
         text = f"its output arrives on {section.device}, but stops for up to {pause:.2f} s"
         cure = "check plugs and solder joints for loose contact, and its supply"
@@ -181,7 +183,7 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
         found = Finding(kind, "no answer", text, "check the wire from the host's TX to the unit's RX")
     elif what and what != wanted:
         text = f"{section.device} is the line of the {_SERIAL[what]}"
-        cure = "exchange the plugs, or the `device` of inertial_unit and gps"
+        cure = "swap the plugs, or the `device` of inertial_unit and gps"
         found = Finding(kind, "exchanged", text, cure)
     elif wanted == "gps" and not what:
         text = f"no message of a GPS receiver arrives on {section.device} at any baud rate"

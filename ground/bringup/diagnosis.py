@@ -299,13 +299,16 @@ def diagnose_axes(turns: Turns) -> AxesFound:
         part, size = f"inertial_unit.{name}", float(np.linalg.norm(turns.before[0, index]))
         if name in axes and np.abs(turns.after[:, index] - turns.before[:, index]).max() < 0.02 * size:
             axes[name] = None
-            text, cure = "its values do not change in the turns", "switch the unit off and on, or replace it"
+            text, cure = (
+                "its values do not change during the rotations",
+                "switch the unit off and on, or replace it",
+            )
             findings.append(Finding(part, "stuck", text, cure))
         elif own := [one for one in named if one.part == part]:
             findings += own
         elif name in axes and axes[name] is None:
-            text = f"its values in the turns are {UNRECOGNISED}"
-            cure = "repeat the turns with exact angles of 90 deg, away from iron"
+            text = f"its values during the rotations are {UNRECOGNISED}"
+            cure = "repeat the rotations by exactly 90 deg, away from iron"
             findings.append(Finding(part, "wrong axes", text, cure))
     found = {name: _nearest(matrix) for name, matrix in axes.items() if matrix is not None}
     common = _common(found)
@@ -388,19 +391,25 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
         return None
     if (sizes < 0.2 * QUARTER).any():
         for axis in np.flatnonzero(sizes < 0.2 * QUARTER):
-            text = f"a turn of 90 deg about {_AXES[axis]} gave {math.degrees(sizes[axis]):.1f} deg"
-            findings.append(Finding(part, "dead", text, "repeat the turn; replace the gyro if this recurs"))
+            text = (
+                f"a rotation of 90 deg about {_AXES[axis]} is measured as {math.degrees(sizes[axis]):.1f} deg"
+            )
+            findings.append(
+                Finding(part, "dead", text, "repeat the rotation; replace the gyro if this recurs")
+            )
         return None
     ratio = sizes / QUARTER
     if (np.abs(np.log(ratio)) > math.log(1.35)).any():
         shown = ", ".join(f"{axis} {value:.2f}" for axis, value in zip(_AXES, ratio, strict=True))
-        text = f"ratio of measured to asked angle: {shown}"
-        cure = "turn by 90 deg; if the ratio stays, check the range and the unit (deg/s, rad/s) of the driver"
+        text = f"ratio of measured to requested angle: {shown}"
+        cure = (
+            "rotate by 90 deg; if the ratio stays, check the range and the unit (deg/s, rad/s) of the driver"
+        )
         findings.append(Finding(part, "wrong scale", text, cure))
     found = _orthogonal(measured / sizes[:, None], np.eye(3))
     if found is None:
-        text = f"the axes of its rates in the turns are {UNRECOGNISED}"
-        findings.append(Finding(part, "wrong axes", text, "repeat the turns about the asked axes"))
+        text = f"the axes of its rates during the rotations are {UNRECOGNISED}"
+        findings.append(Finding(part, "wrong axes", text, "repeat the rotations about the requested axes"))
     return found
 
 
@@ -417,7 +426,7 @@ def _gyro_scale(turns: Turns) -> list[Finding]:
     ratio = np.linalg.norm(turns.gyro[:2], axis=1) / np.maximum(angles, 0.2 * QUARTER)
     if np.abs(ratio - 1.0).max() <= SCALE:
         return []
-    text = f"its angles over those of gravity: x {ratio[0]:.2f}, y {ratio[1]:.2f}"
+    text = f"ratio of its angles to those from gravity: x {ratio[0]:.2f}, y {ratio[1]:.2f}"
     cure = "check the range of its driver, and calibrate its scale"
     return [Finding("inertial_unit.gyro", "wrong scale", text, cure)]
 
@@ -437,7 +446,7 @@ def _force_scales(force: FloatArray) -> list[Finding]:
     sizes = np.abs(force).max(axis=0)
     if sizes.min() < 0.1 or np.abs(sizes - 1.0).max() <= 2.0 * SCALE:
         return []
-    return [_wrong_scales("inertial_unit.accelerometer", sizes, "its largest values over gravity")]
+    return [_wrong_scales("inertial_unit.accelerometer", sizes, "ratio of its largest values to gravity")]
 
 
 def _field_faults(field: FieldFound) -> list[Finding]:
@@ -447,7 +456,7 @@ def _field_faults(field: FieldFound) -> list[Finding]:
         return [_wrong_scales(part, field.scales, "relative scales")]
     if field.axes is None or field.bias <= max(0.4 * field.size, STRONGEST_BIAS):
         return []
-    text = f"the body has a field of {1e6 * field.bias:.0f} uT beside {1e6 * field.size:.0f} uT of the site"
+    text = f"the body's own field is {1e6 * field.bias:.0f} uT, the site's {1e6 * field.size:.0f} uT"
     cure = "remove magnets, iron and currents near it; calibrate its bias if they belong to the body"
     return [Finding(part, "biased", text, cure)]
 
@@ -739,12 +748,12 @@ def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known:
         cure = f"correct the supply; or multiply `supply_voltage` by {common:.3g}"
         return [Finding("coils", "wrong supply voltage", f"{text}, and so are the fields", cure)]
     if common < 0.0:
-        cure = "exchange the two wires at its shunt"
+        cure = "swap the two wires at its shunt"
         return [Finding("power_monitor", "reversed", text, cure)]
-    cure = f"set `shunt` to the fitted one, {bound}{common:.3g} times the configured one"
+    cure = f"set `shunt` to the fitted value, {bound}{common:.3g} times the configured value"
     if size_known or not 0.3 < common < 3.0:
         return [Finding("power_monitor", "wrong shunt", text, cure)]
-    cure = "check the shunt, `supply_voltage` and the resistances; the size of the fields is not configured"
+    cure = "check the shunt, `supply_voltage` and the resistances; the field strengths are not configured"
     return [Finding("power_monitor", "wrong current", text, cure)]
 
 
@@ -774,10 +783,10 @@ def _coil_findings(
     if k != j:
         reversed_too = ", reversed" if state.strength[j] < 0 else ""
         text = f"the command of coil {name} drives coil {names[k]}{reversed_too}"
-        found.append(Finding(part, "exchanged", text, "use the fragment's `channels`, or exchange the plugs"))
+        found.append(Finding(part, "exchanged", text, "use the fragment's `channels`, or swap the plugs"))
     elif state.strength[j] < 0:
         text = f"coil {name}: its field is opposite"
-        found.append(Finding(part, "reversed", text, "set `sign: -1`, or exchange the coil's two wires"))
+        found.append(Finding(part, "reversed", text, "set `sign: -1`, or swap the coil's two wires"))
     if legs.min() < 0.25 * legs.max():
         way, leg = ("positive", "A") if legs[0] < legs[1] else ("negative", "B")
         text, cure = f"coil {name}: a {way} current makes no field", f"check input {leg} of its bridge"

@@ -27,7 +27,7 @@ def step_power(session: Session) -> Outcome:
     """Read the monitors of battery and bus, with and without the current of a coil."""
     power = session.config.power
     if power is None:
-        raise StepSkipped("the configuration has no power")
+        raise StepSkipped("the configuration has no section `power`")
     findings: list[Finding] = []
     monitors: dict[str, PowerMonitor] = {}
     for key in power.monitors():
@@ -97,7 +97,7 @@ def _monitor_faults(key: str, power: Power, rest: PowerReading, driven: PowerRea
     rise = driven.current - rest.current
     if rise < -0.02:
         text = f"its current falls by {-1e3 * rise:.0f} mA when a coil is driven"
-        return [Finding(key, "reversed", text, "exchange the two wires at its shunt")]
+        return [Finding(key, "reversed", text, "swap the two wires at its shunt")]
     if rise < 0.01:
         text = f"its current hardly changes when a coil is driven: by {1e3 * rise:.0f} mA"
         return [Finding(key, "no current", text, "wire its shunt into the line of the battery or of the bus")]
@@ -110,10 +110,10 @@ def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -
         return []
     (first, a), (second, b) = values.items()
     if abs(a["voltage"] - b["voltage"]) > 0.03 * max(a["voltage"], b["voltage"]):
-        text = f"{a['voltage']:.2f} V, but {second} measures {b['voltage']:.2f} V on the same line"
+        text = f"{a['voltage']:.2f} V here, but {second} measures {b['voltage']:.2f} V on the same line"
         return [Finding(first, "wrong voltage", text, f"measure the voltage at {first} and {second}")]
     if abs(a["rise"] / b["rise"] - 1.0) > _NEAR:
-        text = f"a coil adds {1e3 * a['rise']:.0f} mA, but {1e3 * b['rise']:.0f} mA at {second}"
+        text = f"a coil adds {1e3 * a['rise']:.0f} mA here, but {1e3 * b['rise']:.0f} mA at {second}"
         return [Finding(first, "wrong shunt", text, f"check `shunt` of {first} and {second}")]
     return []
 
@@ -208,7 +208,7 @@ def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
         cure = "set the computer's clock by a time server; if the difference stays, replace the receiver"
         findings.append(Finding("gps", "wrong time", text, cure))
     elif offset > _LATE_S:
-        text = f"a fix arrives {offset:.1f} s after its time"
+        text = f"a fix arrives {offset:.1f} s after its time stamp"
         findings.append(Finding("gps", "late", text, "raise `baud_rate`, and switch other messages off"))
     if len(fixes) > 2:
         spans = np.diff(utc)[:, None] * 1e-9
@@ -217,7 +217,7 @@ def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
         largest = float(np.linalg.norm(jumps, axis=1).max())
         sigma = float(np.nanmax([one.sigma for one in fixes] + [0.0]))
         if largest > 50.0 + 6.0 * sigma:
-            text = f"its position jumps by {largest:.0f} m beside its velocity"
+            text = f"its position jumps by {largest:.0f} m more than its velocity explains"
             cure = "check the antenna and its surroundings for reflections and radio transmitters"
             findings.append(Finding("gps", "inconsistent", text, cure))
     return findings
@@ -262,7 +262,7 @@ def step_strings(session: Session) -> Outcome:
             findings.append(Finding(part, "dead", text, "check cells, diode, plug and amplifier"))
         elif not alike[number, shown]:
             text = f"a lamp on its panel gives a current in string {shown + 1}"
-            cure = "exchange the plugs, or `address` and `channel` of the two strings"
+            cure = "swap the plugs, or `address` and `channel` of the two strings"
             findings.append(Finding(part, "exchanged", text, cure))
     return Outcome(findings, {"currents": lit.round(4).tolist()})
 

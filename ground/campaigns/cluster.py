@@ -172,10 +172,10 @@ def _result(future: Any, key: str, address: str) -> Any:
         raise CampaignError(f"the scheduler at {address} is lost") from error
     except distributed.KilledWorker as error:
         raise CampaignError(
-            f"case {key} ended each worker that ran the case, such as {error.last_worker}"
+            f"case {key} terminated every worker that ran it, such as {error.last_worker}"
         ) from error
     if result is None:
         raise CampaignError(
-            f"other packages were sent to the cluster at {address}: one checkout at a time can use it"
+            f"other packages were sent to the cluster at {address}: only one checkout at a time can use it"
         )
     return result

@@ -347,7 +347,8 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
                         if deaths[case.key] == _ATTEMPTS:
                             status = worker.process.exitcode
                             raise CampaignError(
-                                f"case {case.key} ended {_ATTEMPTS} worker processes, status {status}"
+                                f"case {case.key} terminated {_ATTEMPTS} worker processes, "
+                                f"the last with status {status}"
                             ) from lost
                         waiting.appendleft(case)
                         continue

@@ -302,7 +302,7 @@ def warnings_of(values: Derived) -> list[str]:
     ratio = values.coil_torque / values.disturbance
     if ratio < _WEAK:
         found.append(
-            f"the coils' torque is {ratio:.2g} times the worst torque of air and sunlight, so pointing may "
+            f"the coils' torque is {ratio:.2g} times the largest disturbance torque, so pointing may "
             "fail: use stronger coils or a higher orbit"
         )
     if values.momentum_time > values.period:
@@ -329,8 +329,8 @@ def _text(satellite: Satellite, values: Derived, path: Path) -> str:
         ),
         (
             "coils",
-            f"{values.dipole:.3g} A m^2; {values.coil_torque:.2g} N m, {ratio:.3g} times the worst torque of "
-            "air and sunlight",
+            f"{values.dipole:.3g} A m^2; {values.coil_torque:.2g} N m, {ratio:.3g} times the largest "
+            "aerodynamic and solar radiation torque",
         ),
         ("detumbling", f"from {satellite.release_deg:g} deg/s within about {values.slow_within:g} s"),
         *(("warning", text) for text in warnings_of(values)),

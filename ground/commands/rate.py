@@ -103,7 +103,8 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
     if options.fov is None and camera is not None and camera.lens is not None:
         if (camera.rows, camera.columns) != pixels.shape:
             raise UsageError(
-                f"{options.image} has {columns} x {rows} pixels, its camera {camera.columns} x {camera.rows}"
+                f"{options.image} has {columns} x {rows} pixels, "
+                f"but the camera has {camera.columns} x {camera.rows}"
             )
         return camera_model(camera).ideal, exposure
     if not 0.1 <= fov_deg <= 120.0:

@@ -144,7 +144,7 @@ def replace_signing_key(folder: Path, also_root: bool) -> int:
     old = [_read_key(path) for path in sorted(folder.glob("root-*.pem"))]
     old = [signer for signer in old if signer.public_key.keyid in root.roles["root"].keyids]
     if not old:
-        raise UsageError(f"{folder}: no root-*.pem is a root key: copy a root key into this folder")
+        raise UsageError(f"{folder}: no root key (root-*.pem) is valid: copy a root key into this folder")
     new = _new_key(folder / "signing.pem", replaced=True)
     for role in _SIGNED_BY_ONE:
         for keyid in list(root.roles[role].keyids):
@@ -175,7 +175,8 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
     last = before.unrecognized_fields["custom"]["version"] if before is not None else 0
     if options.version <= last and not options.back:
         raise UsageError(
-            f"--version {options.version}: {kind} {last} is signed already; raise it, or add --back"
+            f"--version {options.version}: {kind} {last} is signed already: "
+            "give a higher version, or add --back"
         )
     target = TargetFile.from_data(kind, data)
     target.unrecognized_fields["custom"] = {"version": options.version, "back": bool(options.back)}

@@ -143,7 +143,7 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube command` to the parser."""
     parser.description = (
         "Send a command to a flight that accepts commands (`commands` in its configuration) and print its "
-        "answer. Exit status 0 if the flight obeyed, 1 if it refused or did not answer."
+        "answer. Exit status 0 if the flight executed it, 1 if it refused or did not answer."
     )
     _add_way(parser, 2.0)
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")

@@ -293,7 +293,7 @@ def _density_problem(mass: float, size: Vector) -> str:
     if low <= mass / volume <= high:
         return ""
     bounds = f"{low * volume:.2g} to {high * volume:.3g} kg"
-    return f"{mass:g} kg in this size is {mass / volume:,.3g} kg/m^3: give {bounds}, or another size in m"
+    return f"{mass:g} kg in this size has {mass / volume:,.3g} kg/m^3: give {bounds}, or another size"
 
 
 def _perigee_problem(altitude: float, eccentricity: float) -> str:

@@ -407,7 +407,7 @@ def _finished(
     gain = f"{constants.gain:.3g} +- {sigma:.2g} rad/s^2/A"
     if sigma > _MAX_GAIN_ERROR * abs(constants.gain):
         raise IdentificationError(
-            f"this flight does not determine the torque constant ({gain}): it needs more current or more time"
+            f"this flight does not determine the torque constant ({gain}): fly longer or with more current"
         )
     if constants.gain < 0.0:
         raise IdentificationError(

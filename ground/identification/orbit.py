@@ -142,7 +142,7 @@ def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
         if name != "camera" or config.camera is not None
     ]
     if not any(one.learned for one in found):
-        problem = "no quantity is known twice as accurately as configured: make a longer run"
+        problem = "no uncertainty is below half of its configured value: fly longer"
         raise InputError(str(run.folder), problem)
     time = float(last["time_ns"]) * 1e-9
     return LearnedDescription(config, time, {one.name: one for one in found}, learned_lens(run))

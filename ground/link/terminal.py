@@ -252,7 +252,7 @@ class Terminal:
         return (
             f"{self.gate.admitted} frames accepted, {sum(self.gate.refused.values())} refused, "
             f"{self.lost_frames} lost, {self.idle_frames} idle; {code.corrected} symbols corrected, "
-            f"{code.uncorrectable} codewords not corrigible"
+            f"{code.uncorrectable} codewords uncorrectable"
         )
 
     def close(self) -> None:

@@ -299,9 +299,7 @@ def _power(power: Object, thesis: bool) -> list[str]:
 
 def _loop(summary: Object) -> list[str]:
     lines, cycles = [], summary["cycles"]
-    clock = (
-        "" if summary["run"].get("realtime", True) else ", in times of the host; the flight was in lock-step"
-    )
+    clock = "" if summary["run"].get("realtime", True) else ", in host time; the flight ran in lock-step"
     if summary["rate_groups"]:
         rows = [
             [

@@ -508,7 +508,7 @@ class PwmTorqueCoils:
             saturated = saturated or limited
         with self._mailbox.lock:
             if ticker is None or not self._running:
-                raise Refused(DEVICE, "a command before start() or after close()")
+                raise Refused(DEVICE, "currents cannot be commanded before start() or after close()")
             self._mailbox.put(command, tuple(counts), saturated)
         ticker.kick()
 
@@ -520,7 +520,7 @@ class PwmTorqueCoils:
         with self._mailbox.lock:
             ticker = self._ticker
             if ticker is None or not self._running:
-                raise Refused(DEVICE, "a brake before start() or after close()")
+                raise Refused(DEVICE, "bridges cannot be braked before start() or after close()")
             self._mailbox.brake(axes)
         ticker.kick()
 

@@ -141,7 +141,7 @@ class Pca9685:
             raise OutOfRange(self.name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")
         for on, off in counts:
             if on == off or not (0 <= on <= COUNTS and 0 <= off <= COUNTS):
-                quantity = f"OFF count with ON count {on} (never equal)"
+                quantity = f"OFF count (must differ from ON count {on})"
                 raise OutOfRange(self.name, quantity, off, 0, COUNTS, "counts")
         with answering(self.name):
             self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))

@@ -521,7 +521,7 @@ class ExposureTiming:
         if self._contradictions >= _CONTRADICTIONS:
             raise Refused(
                 self._name,
-                f"frames come every {interval_ns * 1e-6:.1f} ms, so none is exposed for the "
+                f"frames arrive every {interval_ns * 1e-6:.1f} ms, which is shorter than the exposure of "
                 f"{exposure_ns * 1e-6:.1f} ms that the camera reports: configure a shorter exposure",
             )
         return True
@@ -542,7 +542,7 @@ def open_device(name: str) -> VideoDevice:
         raise NotResponding(
             name,
             "no such camera: is it plugged in, and does a udev rule give it this name "
-            "(deploy/99-knightcube.rules)? `v4l2-ctl --list-devices` lists what there is",
+            "(deploy/99-knightcube.rules)? `v4l2-ctl --list-devices` lists the connected cameras",
         ) from error
     except PermissionError as error:
         raise Refused(name, "no permission: add the user to the group video") from error
@@ -553,7 +553,7 @@ def open_device(name: str) -> VideoDevice:
 def meaning(name: str, error: OSError, doing: str) -> DeviceError:
     """Return the DeviceError that corresponds to an errno of the kernel."""
     if error.errno in {errno.ENODEV, errno.ENXIO}:
-        return NotResponding(name, f"gone while {doing}: was it unplugged?")
+        return NotResponding(name, f"the camera disappeared while {doing}: check its cable")
     if error.errno == errno.EBUSY:
         return Refused(name, f"busy while {doing}: another program uses the camera")
     if error.errno == errno.ENOTTY:

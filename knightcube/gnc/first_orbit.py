@@ -189,11 +189,12 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
     degrees = 2 * count - 6
     if smallest > bound(_MISFIT, degrees):
         raise ArcError(
-            f"no free fall fits the sightings: chi-square {smallest:.0f} with {degrees} degrees of freedom"
+            f"no ballistic orbit fits the sightings: "
+            f"chi-square {smallest:.0f} with {degrees} degrees of freedom"
         )
     if not possible.any():
         near, far = 1e-3 * np.exp([low, high])
-        raise ArcError(f"no orbit at {near:.4g} to {far:.4g} km is bound to the Earth and clear of it")
+        raise ArcError(f"every orbit at {near:.4g} to {far:.4g} km leaves the Earth or hits it")
     state = fit.states(unknowns[None])[0]
     jacobian = fit.state_jacobian(unknowns)
     spread = jacobian @ covariance @ jacobian.T
@@ -239,8 +240,8 @@ def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -
     text = f"the arc of {arc:.0f} s is too short: the distance is {low:.3g} to {high:.3g} km (95 %)"
     if len(lasting):
         low, high = (1e-3 * math.exp(end) for end in (lasting.min(), lasting.max()))
-        text += f", {low:.3g} to {high:.3g} km for lasting orbits"
-    return text + f"; an orbit needs ends within a factor of {RATIO:g}"
+        text += f", {low:.3g} to {high:.3g} km for closed orbits that do not hit the Earth"
+    return text + f"; these limits must lie within a factor of {RATIO:g}"
 
 
 class _ArcFit:

@@ -191,7 +191,7 @@ def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField
         known = 100.0 * settings.scales * settings.scale_step
         raise FieldUnknown(
             f"scale known to {50.0 * (high - low):.1f} %: the classical methods need {known:.1f} %; "
-            "the default takes any scale"
+            "the default method accepts any scale"
         )
     edges = np.linspace(low, high, steps + 1)
     middles = 0.5 * (edges[1:] + edges[:-1])

@@ -207,7 +207,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         strip = image[first : min(int(np.ceil(middle[1] + near)), camera.rows - 1) + 1]
         read += strip.size
         disc = _disc(strip, first, middle, near / camera.focal_length, camera, settings)
-        reason = "no round rim" if disc is None else _flaw(disc, settings)
+        reason = "no round edge" if disc is None else _flaw(disc, settings)
         if disc is None or reason:
             reasons.append(f"{reason} about pixel ({middle[0]:.0f}, {middle[1]:.0f})")
         else:
@@ -377,14 +377,14 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     if circle.radius > settings.greatest_radius:
         return f"a patch of {radius:.2f} deg radius, too large,"
     if used < settings.least_agreement * (len(rim.points) + rim.endless):
-        return f"a rim that is round in only {used} of {len(rim.points) + rim.endless} places"
+        return f"an edge on the circle in only {used} of {len(rim.points) + rim.endless} directions"
     if used * 2.0 * np.pi / _SPOKES < settings.least_arc:
-        return f"too short an arc of a rim, {used * 360 // _SPOKES} deg,"
+        return f"too short an arc of the limb, {used * 360 // _SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
     # If the lens stretches the disc, a blur that is circular in the image is elongated on the sphere.
     widest, narrowest = np.linalg.svd(disc.scale, compute_uv=False)
     if residual > settings.tolerance * math.sqrt(float(widest / narrowest)):
-        return f"a rim {residual:.2f} px rms off a circle"
+        return f"an edge that deviates from a circle by {residual:.2f} px rms"
     return ""
 
 

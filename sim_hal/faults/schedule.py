@@ -72,7 +72,9 @@ def parse(text: str) -> ScheduledFault:
     at = _seconds(found["at"], "@", text) if found["at"] is not None else 0.0
     span = _seconds(found["span"], "for", text) if found["span"] is not None else None
     if span == 0.0:
-        raise UsageError(f"fault {text!r}: `for 0` is an empty duration: give more, or omit `for`")
+        raise UsageError(
+            f"fault {text!r}: `for 0` is an empty duration: give a longer duration, or omit `for`"
+        )
     values = {name: value.default for name, value in known.parameters.items() if value.default is not None}
     for word in filter(None, (word.strip() for word in (found["given"] or "").split(","))):
         name, equals, value = (part.strip() for part in word.partition("="))
@@ -115,7 +117,7 @@ def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
         except UsageError as error:
             raise UsageError(f"{key}: {error}") from error
         if entry.at is not None and "@" in entry.fault:
-            raise UsageError(f"{key}: both `at` and `@` give the begin: remove one")
+            raise UsageError(f"{key}: both `at` and `@` give the start time: remove one")
         if entry.span is not None and fault.span is not None:
             raise UsageError(f"{key}: `for` is given twice: remove one")
         at = fault.at if entry.at is None else entry.at
@@ -205,7 +207,7 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
     for fault in faults:
         if fault.at >= config.duration:
             raise UsageError(
-                f"fault {str(fault)!r}: the flight is over after {config.duration:g} s: "
+                f"fault {str(fault)!r}: the flight ends at {config.duration:g} s: "
                 "begin it earlier, or fly longer (--duration)"
             )
         device = fault.kind.device

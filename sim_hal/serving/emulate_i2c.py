@@ -63,7 +63,7 @@ def library() -> Path:
     if compiler is None:
         raise UsageError(
             f"no C compiler ({', '.join(names)}) to build the preload library with: install one"
-            " (Debian: apt-get install gcc libc6-dev) or name it by CC"
+            " (Debian: apt-get install gcc libc6-dev) or set CC to its name"
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)

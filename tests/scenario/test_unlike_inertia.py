@@ -75,7 +75,7 @@ def test_a_sign_found_before_a_restart_is_used_from_the_start(tmp_path: Path) ->
     assert coil_judgement(first, "y")["flown_with"] == -1.0
     again = fly(config, tmp_path / "again", section=section)
     told = [to_text(event["text"]) for event in again["event"] if to_text(event["name"]) == "coil-corrected"]
-    assert told == ["coil y: as before the restart; flown with -1.00 of its described dipole"]
+    assert told == ["coil y: as before the restart; used with -1.00 of its configured dipole"]
     assert coil_judgement(again, "y")["corrected_s"] < 0.1
     gains, sigmas = _coils_and_sigma(again)
     assert (np.abs(gains - 1.0) < 0.4).all()

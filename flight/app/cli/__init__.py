@@ -169,7 +169,9 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"knightcube-flight {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", help="a command of the list above")
+    commands = parser.add_subparsers(
+        required=True, metavar="COMMAND", help="one of the commands listed above"
+    )
     for name, (_, _, target) in available.items():
         command = commands.add_parser(name)
         if words[:1] == [name]:

@@ -71,7 +71,7 @@ def missing_direction(dipoles: FloatArray) -> FloatArray | None:
         axis = ", ".join(f"{component:.2f}" for component in dipoles[:, 0] / lengths[0])
         raise UsageError(
             f"all coils lie along [{axis}]: give at least one of them another axis, because parallel coils "
-            "make a torque about one axis at a time"
+            "can make a torque about only one axis at a time"
         )
     if len(sizes) == 3 and sizes[2] >= LEAST_SPREAD:
         return None

@@ -416,7 +416,9 @@ def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) ->
         if (first := propagate(expected, rest, tried, 1.0)) is not None:
             return first
     fastest = math.degrees(float(np.linalg.norm(rest.rate[0])))
-    raise PlanningError(f"no path: at {fastest:.1f} deg/s the body rotates too far in one step of the plan")
+    raise PlanningError(
+        f"no path: at {fastest:.1f} deg/s the body rotates too far in one planning step: detumble it first"
+    )
 
 
 def _improved(

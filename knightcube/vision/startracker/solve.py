@@ -558,7 +558,7 @@ def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
         return ""
     return (
         f"{count - agreeing} of {count} points match no star, and the others are "
-        f"{math.sqrt(fit.excess):.1f} times as far off as their uncertainty allows: check the focus"
+        f"{math.sqrt(fit.excess):.1f} times their uncertainty away from stars: check the focus"
     )
 
 
@@ -600,5 +600,5 @@ def _reason(status: MatchStatus, seen: FrameSolution) -> str:
     count = len(seen.points)
     return {
         MatchStatus.TOO_FEW_STARS: f"{count} stars are too few for an identification",
-        MatchStatus.AMBIGUOUS: f"the {count} brightest points match the sky in more than one place",
+        MatchStatus.AMBIGUOUS: f"the {count} brightest points match several parts of the sky",
     }.get(status, f"the {count} brightest points match no part of the sky beyond chance")

@@ -583,15 +583,16 @@ def _rejection(
         (verdict is StreakVerdict.REJECTED, "the motion divides streaks into segments or joins several"),
         (
             max(common.across, common.along) > settings.worst_shaking,
-            f"the body shook: all streaks vary in common by {common.across:.2f} px across and "
+            f"the body vibrated: all streaks vary in common by {common.across:.2f} px across and "
             f"{100.0 * common.along:.0f} % in brightness",
         ),
-        (double > _MOST_DOUBLE, "most streaks are double: the body shook, or the point spread has a hole"),
+        (double > _MOST_DOUBLE, "most streaks are double: the body vibrated, or the point spread is a ring"),
         (
             known.model_error > settings.worst_uncertainty,
-            f"uncertain by {100.0 * known.model_error:.1f} %: the streaks disagree, lens or shutter are not "
-            f"known well enough, or the point spread is {result.psf_sigma / settings.psf_sigma:.2f} times as "
-            "wide as described",
+            f"the rate is uncertain by {100.0 * known.model_error:.1f} %: "
+            "the streaks disagree, lens or shutter are inaccurate, or "
+            f"the point spread is {result.psf_sigma / settings.psf_sigma:.2f} times as "
+            "wide as configured",
         ),
     )
     reason = next((reason for failed, reason in checks if failed), "")

@@ -373,7 +373,7 @@ class Binning:
             star_covariance=square * result.star_covariance,
             endpoint_covariance=square * result.endpoint_covariance,
             psf_sigma=size * result.psf_sigma,
-            reason=f"{result.reason}, in sums of {size} x {size} pixels" if result.reason else "",
+            reason=f"{result.reason}, after {size} x {size} binning" if result.reason else "",
         )
 
 

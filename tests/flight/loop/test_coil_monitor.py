@@ -218,7 +218,7 @@ def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
 def test_a_monitor_that_lies_is_doubted_and_no_coil_is_taken_out_of_use() -> None:
     seen = observe(hold(TARGET), 15.0, [f"monitor: wrong @ {FAULT_AT}"])
     assert seen.found == []
-    assert "shows no change" in seen.watch.monitor_doubted
+    assert "shows no fault" in seen.watch.monitor_doubted
 
 
 def test_an_axis_that_is_never_driven_is_not_judged() -> None:

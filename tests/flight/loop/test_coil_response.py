@@ -383,7 +383,7 @@ def test_a_correction_of_an_earlier_boot_is_restored_and_reported() -> None:
     assert watch.restore(np.array([1.0, -0.5, 1.0]), np.array([0.0, 0.2, 0.0])) == ""
     assert watch.correction.factors.tolist() == [1.0, -0.5, 1.0]
     assert watch.correction.deviations.tolist() == [0.0, 0.2, 0.0]
-    assert watch.news() == ["coil y: as before the restart; flown with -0.50 of its described dipole"]
+    assert watch.news() == ["coil y: as before the restart; used with -0.50 of its configured dipole"]
 
 
 @pytest.mark.parametrize("factors", [[1.0, 1.0], [1.0, 0.0, 1.0], [1.0, -1.2, 1.0], [math.nan, 1.0, 1.0]])
@@ -413,7 +413,7 @@ def test_samples_that_are_200_ms_apart_begin_a_new_fit(since_ns: int, kept: bool
 
 def test_before_the_first_fit_no_gain_is_claimed() -> None:
     response = CoilResponse(ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4))
-    assert response.text(1) == "the motion shows +1.00 +- inf of its torque"
+    assert response.text(1) == "the motion shows +1.00 +- inf of its expected torque"
     assert not any(response.axes(finding) for finding in Finding)
     assert not any(response.is_healthy(axis) for axis in range(3))
     assert math.isnan(response.observed_share(0, 0.0, 1, 2) or 0.0)

@@ -169,7 +169,7 @@ def test_coils_that_rest_because_the_estimate_is_inaccurate_end_in_safe(
         bench.step(accurate=recovers and second == 15)
     assert bench.mode() is (command if recovers else Mode.SAFE)
     said = [text for name, text in zip(bench.events, bench.texts, strict=True) if name == "blind"]
-    assert said == ([] if recovers else ["no estimate accurate enough to steer by for 21 s"])
+    assert said == ([] if recovers else ["no estimate accurate enough for control for 21 s"])
 
 
 def test_a_satellite_that_acquires_its_attitude_waits_for_an_accurate_estimate() -> None:

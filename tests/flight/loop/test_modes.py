@@ -107,7 +107,7 @@ def test_boot_is_for_the_start_only() -> None:
 def test_a_table_with_a_hole_is_refused_by_name(mode: Mode, trigger: Trigger) -> None:
     table = copied()
     del table[mode][trigger]
-    with pytest.raises(FlightError, match=f"{mode.label} has no answer to '{trigger.value}'"):
+    with pytest.raises(FlightError, match=f"{mode.label} has no entry for '{trigger.value}'"):
         ModeMachine(table=table)
 
 

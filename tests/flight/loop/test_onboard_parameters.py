@@ -91,7 +91,7 @@ def test_the_packet_has_the_source_the_crc_and_the_number_of_loads() -> None:
 
 def test_a_table_instead_of_another_one_or_with_a_wrong_value_is_refused() -> None:
     board = begun()
-    assert "dump it and check again" in board.parameters.load(board.values(), board.records[-1]["crc"] ^ 1, 6)
+    assert "dump and check it again" in board.parameters.load(board.values(), board.records[-1]["crc"] ^ 1, 6)
     assert "must lie within" in board.load(modes__tumble_rate=99.0)
     assert board.modes == []
     assert board.noted == []

@@ -318,7 +318,7 @@ COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, chan
         ),
         (COIL.replace("648", "648, turns: 80, area: 0.0081"), "omit `turns` and `area`"),
         (COIL.replace("dipole_per_ampere: 0.648", "turns: 80"), r"windings\[2\].turns` needs both"),
-        (COIL.replace("23.0", "46.0"), "`coils.current_limit` is 0.148: the supply drives 0.0739 A"),
+        (COIL.replace("23.0", "46.0"), "`coils.current_limit` is 0.148: the supply can drive only 0.0739 A"),
         (
             COIL.replace("23.0", "23.0, current_limit: 0.2"),
             r"\[2\].current_limit` is 0.2: the supply",

@@ -358,7 +358,7 @@ def test_a_board_imports_only_what_a_file_of_root_permits(
     if permitted and os.getuid() == 0:
         assert imported("body", "math:tau", {}, board) == math.tau
     else:
-        with pytest.raises(ConfigError, match=r"add it as a line to .*, which belongs to root"):
+        with pytest.raises(ConfigError, match=r"not permitted: add it as a line to .* as root"):
             imported("body", "math:tau", {}, board)
     assert imported("body", "math:tau", {}, {}) == math.tau, "not a board"
 

@@ -258,7 +258,7 @@ CASES = {
         {"simulation": {"truth": {"supply_voltage": 2.2}}}, "coils", ["power_monitor wrong current"]
     ),
     "wires at the shunt exchanged": Case(
-        {}, "coils", ["power_monitor reversed"], says="exchange the two wires", spoil=reverse
+        {}, "coils", ["power_monitor reversed"], says="swap the two wires", spoil=reverse
     ),
     "monitor without supply": Case(fault("monitor: off"), "find", ["power_monitor no answer"]),
     "monitor stuck": Case(fault("monitor: stuck"), "coils", ["power_monitor no reading"]),

@@ -131,7 +131,7 @@ def test_a_run_that_learned_nothing_is_refused() -> None:
     ignorant |= {"gyro_bias": [1.0] * 3, "dipole": [1.0] * 3, "sunlit_dipole": [1.0] * 3}
     packet: dict[str, Any] = {f"{name}_sigma": values for name, values in ignorant.items()}
     packet |= {"inertia": [0.0066, 0.0333, 0.0333, 0.0, 0.0, 0.0]}
-    with pytest.raises(InputError, match="make a longer run"):
+    with pytest.raises(InputError, match="fly longer"):
         learned_description(packed_run(description=[(10.0, packet)]), config)
 
 

@@ -106,7 +106,7 @@ def test_one_root_key_is_enough_to_replace_all_keys(signing: Path, tmp_path: Pat
         )
     for key in signing.glob("root-*.pem"):
         key.unlink()
-    assert "no root-*.pem is a root key" in command("renewal", "new-key", signing).stderr
+    assert "no root key (root-*.pem) is valid" in command("renewal", "new-key", signing).stderr
 
 
 def test_elements_are_signed_as_the_command_elements_prints_them(signing: Path, tmp_path: Path) -> None:

@@ -165,7 +165,7 @@ def test_a_scale_known_to_half_a_percent_is_tried_and_found(name: str) -> None:
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_field_of_view_that_is_not_known_is_refused_with_the_reason(name: str) -> None:
     drawn = _drawn(_kind(), 6)[0]
-    with pytest.raises(FieldUnknown, match="the default takes any scale"):
+    with pytest.raises(FieldUnknown, match="the default method accepts any scale"):
         METHODS[name].identify(replace(drawn.field(), scale=(0.8, 1.2)), _sky())
 
 

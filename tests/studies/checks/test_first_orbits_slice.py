@@ -38,7 +38,7 @@ def test_a_motion_that_gravity_cannot_cause_is_not_accepted_as_an_orbit() -> Non
     angle = 0.02 * times + 2e-5 * times**2
     directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(times))], axis=1)
     observer = np.tile([7e6, 0.0, 0.0, 0.0, 0.0, 7546.0], (len(times), 1))
-    with pytest.raises(ArcError, match="no free fall fits"):
+    with pytest.raises(ArcError, match="no ballistic orbit fits"):
         first_orbit(Bearings(times, directions, np.full(len(times), 1e-5), observer, np.zeros(3)))
     few = Bearings(times[:5], directions[:5], np.full(5, 1e-5), observer[:5], np.zeros(3))
     with pytest.raises(ArcError, match="5 sightings"):

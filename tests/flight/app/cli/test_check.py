@@ -75,7 +75,7 @@ def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> Non
     assert done.returncode == 1, done.stdout
     cause = "coil z open: no current when driven (supply current 1 mA, expected 148 mA)"
     assert f"\nproblem:       alarm: coil-z-broken: {cause}\n" in done.stdout
-    assert "\nproblem:       fault noticed: coil-broken (2): coil x broken in one of " in done.stdout
+    assert "\nproblem:       fault noticed: coil-broken (2): coil x faulty, with several " in done.stdout
     assert "\n               coil-suspect: supply current " in done.stdout, "warnings have causes too"
     assert done.stdout.endswith("verdict:       not ready\n")
 
