@@ -213,7 +213,7 @@ def checked(*texts: str, **changed: object) -> None:
     ("text", "changed", "cure"),
     [
         ("imu: silent @ 10", {}, "--duration"),
-        ("disk: full @ 500 for 2", {}, "over after 10 s"),
+        ("disk: full @ 500 for 2", {}, "ends at 10 s"),
         ("camera: black", {"camera": None}, "`camera` section"),
         ("vision: nan", {"camera": None}, "`camera` section"),
         ("monitor: stuck", {"power_monitor": None}, "`power_monitor` section"),
@@ -260,7 +260,7 @@ def test_the_closing_text_names_the_faults(tmp_path: Path, capsys: pytest.Captur
     assert main([*words, "imu: silent @ 0.2 for 0.1", "--out", str(tmp_path / "one")]) == 0
     assert "\ninjected: imu: silent @ 0.2 for 0.1\n" in capsys.readouterr().out
     assert main([*words, "imu: silent @ 3", "--out", str(tmp_path / "two")]) == 2
-    assert "over after 0.5 s" in capsys.readouterr().err
+    assert "ends at 0.5 s" in capsys.readouterr().err
 
 
 def test_a_coil_that_is_not_fitted_has_no_faults() -> None:
