@@ -52,7 +52,7 @@ def test_a_loaded_limit_holds_at_once_and_the_table_is_reported(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("packet", "reason"),
     [
-        (load({"modes.tumble_rate": 0.02}, replaced=1), "the table in use is"),
+        (load({"modes.tumble_rate": 0.02}, replaced=1), "the table in use has CRC"),
         (load({"modes.arrived_for": 0.2, "modes.tumble_rate": 0.02})[:-3] + b"abc", ""),
     ],
 )

@@ -178,7 +178,7 @@ def test_a_configuration_describes_the_devices() -> None:
         (
             "[0, 1, 0], channel: 2",
             "[0, 1, 0], channel: 2, address: 0x40",
-            r"strings\[2\].address` is 0x40, which `coils.address` has too",
+            r"strings\[2\].address` is 0x40, which `coils.address` also uses",
         ),
         ("[0, 0, 1]", "[0, 1, 1]", r"strings\[3\].normal.*unit vector"),
         ("[0, 0, 0, 1]", "[0, 0, 0, 2]", r"wide_cameras\[0\].mounting.*length"),

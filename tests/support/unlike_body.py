@@ -76,7 +76,7 @@ def coil_judgement(flown: Run, broken: str) -> dict[str, Any]:
             continue
         found.setdefault(text[5], float(event["time_ns"]) / SECOND_NS)
         if found is corrected:
-            factors[text[5]] = float(text.partition("flown with ")[2].split()[0])
+            factors[text[5]] = float(text.partition("used with ")[2].split()[0])
     return {
         "healthy_isolated": sorted(axis for axis in isolated if axis != broken),
         "healthy_suspected": sorted(axis for axis in named if axis != broken),

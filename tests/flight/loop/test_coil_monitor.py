@@ -144,7 +144,7 @@ def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple
         if cycle % 8 == 0 and not (silent and time > 3.0):
             watch.measured(reading(time, float(np.abs(gains * wanted).sum())))
         if time >= 5.0:
-            watch._weak = "coil z: the motion shows +0.1 of its torque"
+            watch._weak = "coil z: the motion shows +0.1 of its expected torque"
             watch._probe_weak_coil(2, now_ns)
     return watch, np.array(flown)
 

@@ -254,7 +254,7 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     assert watch.correction.unreviewed == {axis}
     (told,) = watch.news()
     assert told.startswith(f"coil {'xyz'[axis]}: ")
-    assert "flown with -1.00" in told
+    assert "used with -1.00" in told
     assert watch.available.all()
     assert not watch.resting.any()
     assert watch.suspicion == ""

@@ -110,11 +110,11 @@ def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
             "channels: [0, 2]",
             "use channel 2 of the PWM chip twice: give one of the two coils",
         ),
-        ("address: 0x45", "address: 0x40", "is 0x40, which `coils.address` has too"),
+        ("address: 0x45", "address: 0x40", "is 0x40, which `coils.address` also uses"),
         (
             "camera:",
             "gps: {device: /dev/knightcube-imu}\ncamera:",
-            "`gps.device` is /dev/knightcube-imu, which `inertial_unit.device` has too",
+            "`gps.device` is /dev/knightcube-imu, which `inertial_unit.device` also uses",
         ),
         ("exposure: 1.0", "exposure: 6.0", "must be shorter than `camera.period`"),
         ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),

@@ -113,7 +113,7 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
         (
             "channel: 0}",
             "channel: 0, address: 0x40}",
-            r"strings\[0\].address` is 0x40, which `coils.address` has too",
+            r"strings\[0\].address` is 0x40, which `coils.address` also uses",
         ),
         (
             "  baud_rate: 115200",

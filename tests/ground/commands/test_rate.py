@@ -117,7 +117,7 @@ def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, pictur
     assert claims[1] > 2.0 * claims[0]
     wrong = command("rate", picture, *told, "--psf", "4")
     assert wrong.returncode == 1
-    assert "times as wide as described" in json.loads(wrong.stdout)["reason"]
+    assert "times as wide as configured" in json.loads(wrong.stdout)["reason"]
 
 
 def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ PLAN = "plan --from 0.1 --to 0"
         ("rate TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
         ("run step_demo --out TMP/a --seed 1e22", "'1e22' is not a whole number from 0 to 2^64 - 1"),
         ("run step_demo --out TMP/a --seed 99999999999999999999", "from 0 to 2^64 - 1"),
-        ("run step_demo --out TMP/a --realtime --devices /etc/passwd", "/etc/passwd names no server"),
+        ("run step_demo --out TMP/a --realtime --devices /etc/passwd", "/etc/passwd describes no server"),
         ("identify step_demo --run TMP/held --duration 5", "already contains a run: give another folder, or"),
     ],
 )

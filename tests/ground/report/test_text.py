@@ -52,7 +52,7 @@ def blocks(**changes: Any) -> list[str]:
     return found[1:-2]
 
 
-HOST = ", in times of the host; the flight was in lock-step"
+HOST = ", in host time; the flight ran in lock-step"
 CYCLES = "Control cycles in the log: 7, skipped slots: 2"
 
 
@@ -314,11 +314,11 @@ def test_judgements_of_coils_are_listed_with_their_texts() -> None:
     row = {
         "time_s": 9.2,
         "name": "coil-corrected",
-        "text": "coil y: flown with -1.00 of its dipole",
+        "text": "coil y: used with -1.00 of its configured dipole",
     }
     assert blocks(coils=[row])[-1].splitlines() == [
         "Coils",
-        "  9.2 s  coil-corrected: coil y: flown with -1.00 of its dipole",
+        "  9.2 s  coil-corrected: coil y: used with -1.00 of its configured dipole",
     ]
 
 

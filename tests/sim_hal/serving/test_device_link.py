@@ -109,7 +109,7 @@ def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | Non
     path = tmp_path / "facts.json"
     if facts is not None:
         path.write_text(facts, encoding="utf-8")
-    with pytest.raises(UsageError, match=r"facts\.json names no server"):
+    with pytest.raises(UsageError, match=r"facts\.json describes no server"):
         fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))
 
 

@@ -94,7 +94,7 @@ class DamagedBoard:
         ) as started:
             assert started.stderr is not None
             lines = iter(started.stderr.readline, "")
-            runs = any("the flight ended too often" in line for line in lines)
+            runs = any("the flight software ended too often" in line for line in lines)
             os.killpg(started.pid, signal.SIGKILL)
         return runs
 

@@ -35,7 +35,7 @@ def test_a_commanded_direction_is_a_target_with_the_command_s_number() -> None:
 def test_a_satellite_refuses_a_q2_and_an_object_without_a_camera_that_searches() -> None:
     with pytest.raises(UsageError, match="q2 is for the testbed"):
         targets().commanded(0.3, 1)
-    with pytest.raises(UsageError, match="no star camera"):
+    with pytest.raises(UsageError, match="star camera does not search"):
         targets().commanded(OBJECT, 1)
     assert target_of(targets(looks_for_objects=True).commanded(OBJECT, 1)) == OBJECT
 

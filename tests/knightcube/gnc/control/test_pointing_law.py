@@ -148,7 +148,7 @@ def test_uneven_times_and_a_path_without_preview_are_refused() -> None:
 
 
 def test_a_body_that_no_step_can_follow_is_refused_and_gives_no_path_that_is_not_finite() -> None:
-    with pytest.raises(PlanningError, match="too far in one step"):
+    with pytest.raises(PlanningError, match="too far in one planning step"):
         table_from(np.zeros(3), np.array([0.5, 0.4, 0.0]), 30, until=1_000.0)
 
 
