@@ -43,7 +43,7 @@ def test_the_installer_takes_the_testbed_with_streaks_by_default() -> None:
         (TESTBED, {"camera": {"columns": 640}}, "`camera.device` is missing"),
         (TESTBED, {"coils": {"supply_voltage": 50.0}}, "`coils.supply_voltage` is 50.0: must be"),
         (TESTBED, {"inertial_unit": {"driver": "nobodys:UNIT"}}, "`inertial_unit.driver` is 'nobodys:UNIT'"),
-        (ORBIT, {"gps": "none"}, "pointing needs the position"),
+        (ORBIT, {"gps": "none"}, "pointing needs the satellite's position"),
     ],
 )
 def test_the_installer_refuses_what_check_refuses(

@@ -346,7 +346,10 @@ CASES = {
         {}, "axes coils", ["inertial_unit.magnetometer wrong scale"], sensed(mag=HALF), "x 1.00, y 0.50"
     ),
     "magnet beside the magnetometer": Case(
-        fault("magnetometer: false"), "axes", ["inertial_unit.magnetometer biased"], says="20 uT beside 47 uT"
+        fault("magnetometer: false"),
+        "axes",
+        ["inertial_unit.magnetometer biased"],
+        says="20 uT, the site's 47 uT",
     ),
     "magnetometer with one reversed axis": Case(
         {}, "axes coils", ["inertial_unit.magnetometer mirrored"], sensed(mag=MINUS_X), "x shows -x"

@@ -161,7 +161,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
             ("--mass", "4", "--size", "big"),
             "--size big: give three sides in m, such as 0.3x0.1x0.1, or one of the CubeSats 1u, 1.5u",
         ),
-        (("--mass", "400", "--size", "1u"), "--size 1u: 400 kg in this size is 3.52e+05 kg/m^3"),
+        (("--mass", "400", "--size", "1u"), "--size 1u: 400 kg in this size has 3.52e+05 kg/m^3"),
         (("--altitude", "20000"), "--altitude 20000: give a number from 200 to 2000 km"),
         (
             ("--altitude", "500", "--eccentricity", "0.1"),
