@@ -141,6 +141,9 @@ def _mounting(config: Config, axes: FloatArray | None, findings: Sequence[Findin
     return {"inertial_unit": {"mounting": np.round(from_matrix(to_body), 8).tolist()}}
 
 
+_RELATIVE = "along each coil's axis, relative to the coils' median field"
+
+
 def step_coils(session: Session) -> Outcome:
     """Drive each coil in both directions, and compare its field and its current with the expected ones."""
     coils: TorqueCoils = session.device("coils")
@@ -184,9 +187,7 @@ def step_coils(session: Session) -> Outcome:
         "strength": found.strength.round(4).tolist(),
         "serves": found.serves,
         "current": [[None if math.isnan(v) else round(v, 5) for v in row] for row in test.current.tolist()],
-        "expected": "configured"
-        if given is not None
-        else "along each coil's axis, relative to the coils' median field",
+        "expected": "configured" if given is not None else _RELATIVE,
     }
     arrays = {"response": found.response, "expected": found.expected, "strength": found.strength}
     arrays |= {"current": test.current, "commanded": commanded}

@@ -125,8 +125,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     Args:
         currents: currents (n,) of the strings, A.
         strings: the strings.
-        nadir: unit vector (3,) to nadir in body axes, if known. An error of the nadir by ten degrees has
-            little effect.
+        nadir: unit vector (3,) to nadir in body axes, if known; an error of ten degrees has little effect.
 
     Raises:
         ValueError: if the currents are not n finite numbers.

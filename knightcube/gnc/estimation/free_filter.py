@@ -2,10 +2,9 @@
 
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
 gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
-filter of the module `attitude_filter` replays each late sample at the time of the measurement. This filter
-instead propagates a late attitude to the present with the present rate, and the innovation includes the error
-of that rate. This propagation with a constant rate is accurate for some seconds if the body rotates slowly
-enough for star images.
+filter of the module `attitude_filter` replays each late sample at its time. Here, a late attitude is
+propagated to the present with the present rate, whose error is included in the innovation. This is accurate
+for some seconds if the body rotates slowly enough for star images.
 
 Besides attitude and rate, the error state (see `error_state`) contains blocks for the errors of the
 satellite's description.
@@ -16,15 +15,13 @@ inertia and the principal axes are observable (Psiaki 2005, JGCD 28(4)). The com
 observable only relative to the dipole moment of the coils.
 
 The block `coils` is the matrix of gain errors and misalignments of the coils. The estimated dipole is the
-commanded dipole plus the product of the matrix in block `coils` and the commanded dipole. The blocks
-`gyro_matrix` and `field_matrix` contain the scale factor errors and misalignments of gyro and magnetometer
-(Pittelkau 2001, JGCD 24(6)).
+commanded dipole plus this matrix times the commanded dipole. The blocks `gyro_matrix` and `field_matrix` are
+the scale factor errors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
 
 The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
-accurately than the attitude of the body, because the misalignment of the star camera adds to the uncertainty
-of the attitude of the body. The block `horizon` is the misalignment of the horizon cameras that measure Sun
-and nadir. When the body rotates, other horizon cameras are used, so the misalignment is modelled as a
-Gauss-Markov process with a long correlation time.
+accurately than that of the body, whose uncertainty includes the misalignment of the camera. The block
+`horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
+horizon cameras are used, so this block is a Gauss-Markov process with a long correlation time.
 
 Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
 sunlight, and the components of the disturbance torques of `knightcube.astro.earth.disturbance`.
@@ -219,15 +216,13 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s) of the errors of coils and field for a body at rest; these errors are modelled as
-white noise."""
+"""Correlation time (s) of the errors of coils and field, modelled as white noise, for a body at rest."""
 CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected magnitudes of the constant torque, the aerodynamic torque and the solar radiation torque, relative
-to the aerodynamic torque. The expected constant torque is small, because the error of the inertia has its own
-states. At a single attitude the torques cannot be distinguished, and an aerodynamic torque that is attributed
-to the constant torque is wrong at every other attitude."""
+"""Expected magnitudes of the constant, aerodynamic and solar radiation torques, relative to the aerodynamic
+torque. The constant torque is small, because the error of the inertia has its own states, and because an
+aerodynamic torque that is attributed to the constant torque is wrong at every other attitude."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -253,16 +248,14 @@ class FreeFilterSettings:
         coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
             temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
-            rate in rad/s. The random walk represents flexible parts, which Euler's equation of a rigid body
-            omits and which are loaded only while the body rotates. The random walk of the inertia error
-            prevents its uncertainty from becoming too small.
+            rate in rad/s. It represents flexible parts, which are loaded only while the body rotates, and
+            prevents the uncertainty of the inertia from becoming too small.
         errors: largest errors of the description of body and sensors.
         coils: initial covariance (9, 9) of the coils' matrix, whose elements are listed row by row; None for
             coils along the body axes, because their covariance follows from `errors`.
-        roles: roles, by block name, of those blocks of the error state whose role differs from the default.
+        roles: roles of the blocks whose role differs from the default, by name of the block.
         rate_start: initial standard deviation of the rate, rad/s.
-        fine, coarse: largest standard deviation about the least certain axis for the accuracy classes FINE
-            and COARSE, rad.
+        fine, coarse: largest standard deviation about the least certain axis if FINE and if COARSE, rad.
         gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
             component by this many standard deviations.
     """
@@ -367,8 +360,7 @@ class FreeMemory:
 class FreeFilter:
     """The navigation filter of a free satellite, with its present estimate.
 
-    The class is over 350 lines long, because every propagation and every measurement changes the same
-    estimate and covariance.
+    The class has over 350 lines, because all propagations and measurements change the same estimate.
 
     Attributes:
         layout: blocks of the error state.
@@ -427,10 +419,9 @@ class FreeFilter:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
         If the rate was not measured by the gyro, its covariance is `spread` (3, 3), rad^2/s^2. If `by_stars`
-        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slowly
-        varying states keep their estimated values. If the previous estimate was contradicted (`doubted`), the
-        covariance of the slow states is reset to that of the settings, and implausible values of slow states
-        are set to zero.
+        is true, the attitude was measured by the star camera, otherwise by the horizon cameras. The slow
+        states keep their estimated values. If the previous estimate was contradicted (`doubted`), their
+        covariance is reset to that of the settings, and implausible values are set to zero.
         """
         self.changes += 1
         if doubted:
@@ -531,9 +522,8 @@ class FreeFilter:
     def renew(self, at: slice, covariance: FloatArray, memories: Sequence[FreeMemory] = ()) -> None:
         """Reset the block `at` of slowly varying states (n,) to zero, with a given covariance (n, n).
 
-        The estimate and its copies `memories` are changed. The reset is necessary when the block describes a
-        different device, such as another magnetometer, or a different allocation of the currents to the
-        coils.
+        The estimate and its copies `memories` are changed. The reset is necessary when the block describes
+        another magnetometer, or coils among which the currents are allocated differently.
         """
         self.changes += 1
         estimated = self.layout.prior[at, at].any()
@@ -654,8 +644,7 @@ class FreeFilter:
             field = attitude_matrix(self.quaternion) @ around.field
             slope = cross_product(rate, field)
             rotation = self.motion.inverse @ cross_product(changed, field + 0.5 * seconds * slope)
-            # The field and the gyroscopic torque change during the step, so the effect of a dipole depends on
-            # its time within the step.
+            # Field and gyroscopic torque change during the step, so the time of each dipole matters.
             change = self.motion.inverse @ cross_product(changed, slope)
             self.rate = self.rate + change + self.motion.stiffness(rate) @ rotation
             self.quaternion = multiply(from_rotation_vector(rotation), self.quaternion)

@@ -247,9 +247,8 @@ def nadir_of_uncertain_field(
 
     The image is searched with eleven trial focal lengths. Nadir and altitude are means over the horizons of
     all focal lengths. The weight of a horizon is the probability of its focal length and of its misfit. The
-    uncertainties include the differences between the horizons. A horizon that contradicts the brightness of
-    the image keeps its weight, because the brightness does not determine the focal length. If horizons that
-    contradict the brightness have more than half of the total weight, the image is refused. See `find_nadir`.
+    uncertainties include their differences. A horizon that contradicts the brightness keeps its weight. If
+    such horizons have more than half of the total weight, the image is refused. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)

@@ -331,8 +331,7 @@ def measure_objects(
         solution: star tracker solution of the image.
         exposure: exposure time, s.
         epoch: Julian year of the positions of the stars.
-        velocity: velocity of the camera (3,), m/s, for the correction of aberration, or None for no
-            correction.
+        velocity: velocity of the camera (3,), m/s, to correct aberration, or None for no correction.
         detection: settings of the survey of the image.
         settings: settings of the measurement of objects.
     """

@@ -27,6 +27,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.startracker.attitude_fit import (
     MatchStatus,
+    ScaleSteps,
     StarField,
     StarMatch,
     stretched,
@@ -147,41 +148,6 @@ def neighbours(field: StarField) -> IntArray:
 
 
 _LARGEST_SIZE = (1 << SIZE_BITS) - 1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScaleSteps:
-    """Steps of the range of possible scales within which the side ratios of triangles are nearly constant.
-
-    Attributes:
-        middle: scale in each step for which the side ratios of triangles are computed (s,).
-        lowest, highest: limits of the scale of each step (s,).
-    """
-
-    middle: FloatArray
-    lowest: FloatArray
-    highest: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.middle)
-
-    @classmethod
-    def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return steps of a field's range of scales, within each of which side ratios vary by `tolerance`.
-
-        At a field angle of tangent t, a gnomonic image is enlarged by 1 + t^2 along the radius and by 1 + t^2
-        / 2 across the radius. The ratio of two sides of a triangle at the field-angle tangent t therefore
-        depends on their directions by up to t^2 / 2. The steps are computed for the field angle half-way to
-        the corner of the field.
-        """
-        lowest, highest = field.scale
-        half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
-        count = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
-        if count == 1:
-            edges = np.array([math.sqrt(lowest**2), math.sqrt(highest**2)])
-        else:
-            edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
-        return cls(np.sqrt(edges[:-1] * edges[1:]), edges[:-1], edges[1:])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -529,10 +529,7 @@ def _first_match(
 ) -> _Found:
     given, observed = len(expected) > 0, len(direction)
     seen, nearest, squared = np.empty((observed, 3)), np.empty(observed, dtype=np.int64), np.empty(observed)
-    most, widest = _most_stars(observed), 0.0
-    for gate in gates:
-        widest = max(widest, gate)
-    tangent = direction[:, 0] / direction[:, 2]
+    most, widest, tangent = _most_stars(observed), gates.max(), direction[:, 0] / direction[:, 2]
     order = np.argsort(tangent, kind="mergesort")
     tangent = tangent[order]
     for number in range(len(scales)):

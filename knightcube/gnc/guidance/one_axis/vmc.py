@@ -554,10 +554,8 @@ def plan_step(
         horizon: duration, s, or the initial guess of the duration if `time_cost` is given.
         start_rate: body rate at the start, rad/s.
         end_rate: body rate at the end, rad/s.
-        time_cost: cost of time, W. If a cost is given, the duration is optimised for minimum energy plus
-            `time_cost` times duration. If it is None, the duration is fixed.
-        minimise: "heat" minimises the integral of R I^2, and "supply" minimises the integral of V |I|, which
-            is the energy taken from the supply with pulse-width modulation.
+        time_cost: cost of time, W, for minimum energy plus cost times duration; None for a fixed duration.
+        minimise: "heat" for the integral of R I^2, or "supply" for that of V |I|, the energy of the supply.
         nodes: number of nodes of the path, 8 to 40.
         max_stretch: largest ratio of the duration to `horizon`.
 
