@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import angle_between, attitude_matrix
-from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch, _refined
+from knightcube.vision.startracker.attitude_fit import MatchStatus, ScaleSteps, StarField, StarMatch, _refined
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import (
     IdentificationSettings,
-    ScaleSteps,
     _choose,
     _look_up,
     identify,
