@@ -49,7 +49,6 @@ pytestmark = [
         not any(map(shutil.which, ("cc", "gcc", "clang"))),
         reason="no C compiler builds the preload library",
     ),
-    pytest.mark.timeout(300),
 ]
 PATIENCE_S = 120.0
 """Longest time (s) until every device has been read, on a busy machine."""

@@ -71,7 +71,6 @@ def run(line: str, folder: Path, satellite: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_the_commands_of_the_page_operate_a_simulated_satellite(tmp_path: Path) -> None:
     first, link, export, *ground = [
         block.commands

@@ -84,7 +84,6 @@ def test_a_newcomer_needs_at_most_ten_commands() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: Path) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}

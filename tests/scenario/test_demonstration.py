@@ -46,7 +46,6 @@ def summary(demonstration: Run) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_it_is_flown_whole_with_every_cycle_and_no_alarm(demonstration: Run) -> None:
     run = demonstration
     assert len(run["control"]) == 28_000
@@ -57,7 +56,6 @@ def test_it_is_flown_whole_with_every_cycle_and_no_alarm(demonstration: Run) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any]) -> None:
     """Limits of Sease 2013, Table 5.3: 4.5 deg, 20 %, 8 s and 30 s, with a mean supply power below 0.10 W."""
     assert summary["attitude_source"] == "truth"
@@ -73,7 +71,6 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any])
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any]) -> None:
     """Errors are those of the true attitude with all noise.
 
@@ -89,7 +86,6 @@ def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any]) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
     run = demonstration
     assert np.abs(run["truth"]["current"]).max() <= 0.148
@@ -97,7 +93,6 @@ def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
     """Check the fraction of angle and rate errors within 3 sigma, and rms / sigma, in 28,000 cycles."""
     run = demonstration
@@ -112,7 +107,6 @@ def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: Run) -> None:
     """All 14 frames exposed in motion give a rate; six of the exposures begin at rest, with a step."""
     _assert_streaks_right(demonstration, 14)
@@ -140,7 +134,6 @@ def _assert_streaks_right(run: Run, moving: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
     """The steps begin within exposures: the body is at rest for a part of them, and then accelerates."""
     config = demo_config(44.0)
@@ -153,7 +146,6 @@ def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
     demonstration: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,7 +155,6 @@ def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, Any]) -> None:
     """The same current flows at 5 V (bus) and 3.4 V (coils). The bus monitor is read once a second."""
     power = summary["power"]
@@ -171,7 +162,6 @@ def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_the_readme_states_the_power_that_is_measured(summary: dict[str, Any]) -> None:
     """The README's mean powers (mW) at the coils, at the bus and as R I^2 must be the measured ones."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -58,7 +58,6 @@ print(*found.quaternion, *found.covariance.ravel(), len(found.stars))
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_path: Path) -> None:
     """A numpy form that silently replaces a compiled form is slow; in this test it ends the program.
 

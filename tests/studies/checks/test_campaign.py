@@ -145,7 +145,6 @@ def test_a_campaign_that_is_killed_leaves_no_worker_behind(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_a_killed_campaign_is_equal_to_an_undisturbed_one_and_leaves_nothing(tmp_path: Path) -> None:
     found = killed(tmp_path, 6, 0.1, kills=2, seed=4)["killed"]
     assert found.sound(6), found

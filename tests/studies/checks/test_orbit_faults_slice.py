@@ -109,7 +109,6 @@ def refly(
     return orbit_faults.run(Case(name, (seed, number), {"fault": fault, "mode": mode}))
 
 
-@pytest.mark.timeout(400)
 def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

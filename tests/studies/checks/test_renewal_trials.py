@@ -11,7 +11,6 @@ from tests.studies.campaigns.renewal_trials import FLAWS, cases, run
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(400),
     pytest.mark.skipif(shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"),
 ]
 

@@ -143,7 +143,6 @@ def test_mission_control_refuses_what_it_cannot_show(
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
-@pytest.mark.timeout(300)
 def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path: Path) -> None:
     """Raise and acknowledge an alarm, run stacks, transfer files, and find a pass on the timeline."""
     from tests.support.yamcs_operator import Operator  # noqa: PLC0415 - imports the client for a second
@@ -207,7 +206,6 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(missing()), reason=missing() or "-")
-@pytest.mark.timeout(300)
 def test_yamcs_archives_and_commands_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The archive has every packet and value, every command completes, and no socket leaves loopback."""
     sound = fly(tmp_path, PLANS["short"])
