@@ -96,6 +96,6 @@ def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: 
     (phase,) = json.loads(done.stdout)["detumbling"]["periods"]
     assert phase["slowed"]
     page = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
-    stated, last = map(float, re.findall(r"it took: ([\d.]+) s, from 5.0 to ([\d.]+) deg/s", page)[0])
+    stated, last = map(float, re.findall(r"detumbling: ([\d.]+) s, from 5.0 to ([\d.]+) deg/s", page)[0])
     assert phase["duration_s"] == pytest.approx(stated, rel=0.05)
     assert math.degrees(phase["last_rate_rad_s"]) == pytest.approx(last, abs=0.05)
