@@ -54,7 +54,7 @@ console: $(READY) ## the demonstration flying in real time in the browser, with 
 	@rm -rf runs/console
 	$(RUN) -m flight console runs/console --fly config/step_demo.yaml --open
 
-quick: $(TOOLS) ## style, import arrows and the fast tests: under 90 s on two cores
+quick: $(TOOLS) ## style, import arrows and the fast tests: about 5 min on two hyperthreads
 	@$(MAKE) --no-print-directory lint arrows fast
 
 # The tests begin first: they wait for processes and sockets, and the other checks fill the pauses.
