@@ -514,7 +514,7 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
         power: sum of the squares of the weighted pixels.
 
     Raises:
-        FlightError: if the solver does not converge.
+        FlightError: if the equations are not positive definite, or the solver does not converge.
     """
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal / scale / scale[:, None]
@@ -522,7 +522,9 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
     scaled.reshape(-1)[:: len(scale) + 1] += _RIDGE
     # The LAPACK routines are called directly, because the argument checks of numpy take longer than the
     # routines.
-    factor, _ = lapack.dpotrf(scaled, lower=1)
+    factor, failed = lapack.dpotrf(scaled, lower=1)
+    if failed:
+        raise FlightError(f"brightnesses of {len(scale)} streaks: the equations are not positive definite")
     # The triangular system of k rows has the same least-squares solution as the system of all pixels.
     reduced, _ = lapack.dtrtrs(factor, right / scale, lower=1)
     try:

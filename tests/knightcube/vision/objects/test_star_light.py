@@ -7,11 +7,13 @@ import pytest
 from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.errors import FlightError
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.star_light import (
     Patch,
     StarLight,
     _brightest_path,
+    _brightnesses,
     _convolved,
     _counts_at,
     _fit_line,
@@ -200,3 +202,9 @@ def test_all_forms_return_the_same_counts_and_weights(saturation: float) -> None
     assert np.isfinite(saturation) == bool(
         np.any(_counts_at(image, pixels, 5.0, 4.0, 2.0, saturation)[1] == 0.0)
     )
+
+
+def test_equations_that_are_not_positive_definite_are_refused() -> None:
+    normal = np.array([[1.0, 2.0], [2.0, 1.0]])
+    with pytest.raises(FlightError, match="not positive definite"):
+        _brightnesses(normal, np.ones(2), 2.0)
