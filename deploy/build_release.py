@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
@@ -32,6 +32,7 @@ _BOARD_LOCK = "deploy/requirements.lock"
 _OURS = ("flight", "hal", "sim_hal", "knightcube", "knightcube*.dist-info")
 """Names of the packages of this repository in a release, which each release installs from its own sources."""
 _NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info", "__pycache__")
+"""Names in the source folder that are not sources, such as caches, which change while a release is used."""
 
 
 class Build:
@@ -162,10 +163,19 @@ class Build:
         options = self._options
         digest = hashlib.sha256(f"{options.python} {options.venv}\n".encode())
         for part in _PARTS:
-            for path in sorted([self._source / part, *(self._source / part).rglob("*")]):
-                if path.is_file() and path.suffix != ".pyc":
-                    digest.update(f"{path.relative_to(self._source)}\n".encode() + path.read_bytes())
+            for path in _source_files(self._source / part):
+                digest.update(f"{path.relative_to(self._source)}\n".encode() + path.read_bytes())
         return digest.hexdigest()
+
+
+def _source_files(path: Path) -> Iterator[Path]:
+    """Yield a file, or the files of a folder that a build copies, in the order of their names."""
+    if path.is_file():
+        yield path
+    elif path.is_dir():
+        names = sorted(os.listdir(path))
+        for name in sorted(set(names) - _NOT_BUILT(str(path), names)):
+            yield from _source_files(path / name)
 
 
 def _damaged_package(release: Path) -> str:

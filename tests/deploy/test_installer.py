@@ -99,6 +99,32 @@ def test_everything_is_put_in_its_place_once(image: Image) -> None:
     assert not list(image.root.rglob("knightcube*"))
 
 
+def test_a_release_is_built_again_for_changed_sources_but_not_for_caches(tmp_path: Path) -> None:
+    source, prefix, venv = (tmp_path / name for name in ("source", "prefix", "venv"))
+    for folder in ("deploy", "knightcube/__pycache__", "knightcube/build"):
+        (source / folder).mkdir(parents=True)
+    (venv / "bin").mkdir(parents=True)
+    (venv / "bin/python").symlink_to("/bin/true")
+    for name in ("build_release.py", "releases.py", "requirements.lock"):
+        shutil.copy(DEPLOY / name, source / "deploy")
+    (source / "pyproject.toml").write_text('version = "1.0"\n', encoding="utf-8")
+    (source / "knightcube/one.py").touch()
+
+    def build() -> str:
+        script = [sys.executable, "-B", str(source / "deploy/build_release.py"), str(prefix)]
+        words = [*script, "build", "--venv", str(venv)]
+        name = subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+        subprocess.run([*script, "switch", name], check=True)
+        return name
+
+    assert build() == "1.0+1"
+    for name in ("__pycache__/one.f-1.py311.nbi", "__pycache__/one.pyc", "build/one.py"):
+        (source / "knightcube" / name).write_text("x", encoding="utf-8")
+    assert build() == "1.0+1"
+    (source / "knightcube/one.py").write_text("x", encoding="utf-8")
+    assert build() == "1.0+2"
+
+
 def test_the_checksum_is_one_that_sha256sum_checks(image: Image) -> None:
     assert image.sum.read_text(encoding="ascii") == (
         f"{hashlib.sha256(TESTBED.read_bytes()).hexdigest()}  flight.yaml\n"
