@@ -8,7 +8,7 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     # The code that runs a flight later installs its own signal handler.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-# All matrices are small, so that multithreaded BLAS would slow them down.
+# Multithreaded BLAS would slow the computation down, because all matrices are small.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from flight.app.cli import main

@@ -205,7 +205,7 @@ def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> An
 
 
 def _dated(rig: Rig, config: Config) -> Rig:
-    """Return the rig with the earliest plausible date of the flight, by the two-line elements' epoch."""
+    """Return the rig with an earliest plausible date that follows from the two-line elements' epoch."""
     if isinstance(config, OrbitConfig) and config.elements is not None:
         with suppress(UsageError):  # invalid elements are reported when the body is built
             days = TwoLineElements(*config.elements).epoch - UNIX_EPOCH
@@ -240,7 +240,8 @@ def real_rig(config: Config, stack: ExitStack, patient: bool = False, exclusive:
 def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     """Open the bus of the coils, and switch the coils off before anything else can fail.
 
-    Raises ConfigError, and DeviceError for missing hardware unless the flight is `patient` and waits for it.
+    Raises ConfigError. Raises DeviceError for missing hardware, unless `patient` is true: the flight then
+    waits for the hardware.
     """
     rig, off = (
         real_rig(config, stack, patient, exclusive=True),
@@ -551,7 +552,7 @@ files_aravis: Callable[[Camera | WideCamera], Sequence[str]] = files_v4l2
 
 
 def _read_chips(rig: Rig, bus: int | str | None, register: int, *addresses: int) -> str:
-    """Read a register of each chip on an I2C bus. Raises NotResponding with the cure."""
+    """Read a register of each chip on an I2C bus. Raises NotResponding with advice."""
     opened = rig.wires.i2c(bus)
     for address in addresses:
         try:

@@ -1,4 +1,4 @@
-"""The course of a flight, from its request to its result.
+"""The life cycle of a flight, from the request to the result.
 
 The coils are at zero when the function `fly` returns or raises an exception.
 
@@ -119,8 +119,8 @@ def open_flight(
         use_numpy_forms()
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
-    # The stored state is opened last, so that only a boot that reaches flight is counted, and is closed after
-    # the devices.
+    # The stored state counts the boots. It is opened last, so that a boot in which the start fails is not
+    # counted. The outer exit stack closes it after the devices.
     after_coils = stack.enter_context(ExitStack())
     guardian = start_guardian(rig, stack)
     devices = open_devices(config, rig, stack, patient)

@@ -1,11 +1,11 @@
-"""The flight as a service: configuration, retries of its start, signals, proof of its release, supervisors.
+"""A flight as a service: configuration, start attempts, signals, confirmation of the release, supervisors.
 
 Nobody can restart a flight or the link on a flight computer in orbit, so the start is retried until it
-succeeds. An invalid configuration ends the start, because waiting would not help. Other problems may be
-temporary: a disk error, a missing address or folder, or a bus that another flight uses. After each failed
-attempt, everything that was opened is closed, with the coils at zero. The first pause before the next attempt
-is 0.2 s, and each later pause is twice as long, up to 30 s. An unexpected exception ends the process, and the
-service manager starts a new process.
+succeeds. An invalid configuration aborts the start, because later attempts would fail as well. Other problems
+may be temporary: a disk error, a missing address or folder, or a bus that another flight uses. After each
+failed attempt, everything that was opened is closed, with the coils at zero. The first pause before the next
+attempt is 0.2 s, and each later pause is twice as long, up to 30 s. An unexpected exception ends the process,
+and the service manager starts a new process.
 
 A flight uses the accepted configuration file or, if this file is damaged, the last flown configuration. The
 script `deploy/install.sh` writes the SHA-256 checksum of an accepted configuration beside its file. A flight
@@ -92,7 +92,7 @@ class StoppedError(FlightError):
 
 
 class StartRetry:
-    """Waits between the attempts of a start, reports their problems, and triggers the watchdog."""
+    """Waits between attempts to start, reports why they failed, and triggers the watchdog."""
 
     def __init__(self, interrupted: Callable[[], bool], clock: Clock | None = None) -> None:
         """`interrupted` is a function that returns whether a signal has arrived."""
@@ -156,7 +156,7 @@ def retried_start(
 
 
 def pauses() -> Iterator[float]:
-    """Yield the pauses (s) between the attempts of a start."""
+    """Yield the pauses (s) between attempts to start."""
     pause = FIRST_PAUSE_S
     while True:
         yield pause
@@ -219,10 +219,10 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class EndingSignals:
-    """A context manager, within which a signal ends the flight after the running cycle.
+    """A context manager within which a signal ends the flight after the current control cycle.
 
-    A signal during the opening ends the flight at its first cycle; a second signal interrupts the opening. If
-    the process ignores SIGHUP, as under nohup, SIGHUP stays ignored.
+    A signal that arrives before the control loop exists ends the flight at its first cycle; a second such
+    signal raises KeyboardInterrupt. If the process ignores SIGHUP, as under nohup, SIGHUP stays ignored.
     """
 
     def __init__(self) -> None:
@@ -337,8 +337,9 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 def settle_memory() -> None:
     """Set the heap's thresholds, and replace the automatic garbage collection by a `Collector`.
 
-    The function `settle_memory` is called when the flight has been built. All present objects are exempt from
-    garbage collection, because examining all modules and tasks would take tens of ms in a control cycle.
+    The function `settle_memory` is called once, after all devices and tasks have been created. All present
+    objects are exempt from garbage collection, because examining all modules and tasks would take tens of ms
+    in a control cycle.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -352,9 +353,9 @@ def settle_memory() -> None:
 class Collector:
     """Collects the garbage since its last call, and exempts the surviving objects from later collections.
 
-    Only failures create garbage that needs a collection. If the collector is called every few seconds, a
-    collection examines few objects and takes at most 2 ms. The first call only exempts the objects that the
-    start of the flight created.
+    Only errors create reference cycles, which reference counting cannot free. If the collector is called
+    every few seconds, a collection examines few objects and takes at most 2 ms. The first call collects
+    nothing, and only exempts the objects that the start created from later collections.
     """
 
     def __init__(self) -> None:
@@ -371,7 +372,8 @@ class Collector:
 _THROTTLE_NS = 1_000_000_000
 """Shortest time (ns) between events of one kind; a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""Time (ns, three periods) without a run of the coil driver's job after which heartbeats are withheld."""
+"""Time (ns) of three periods of the coil driver's job. If the job does not run for this time, heartbeats are
+withheld."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,

@@ -7,7 +7,7 @@ from knightcube.vision.frame_job import StreakEstimator
 
 
 def corner_estimator(camera: Camera) -> StreakEstimator:
-    """Return the estimator by corner detectors that a camera configures.
+    """Return the streak estimator with the corner detector that the configuration of a camera names.
 
     Args:
         camera: configuration of a camera whose `estimator` is the name of a corner detector.

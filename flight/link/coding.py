@@ -289,7 +289,7 @@ class CltuStream:
 
     The start sequence may also have one wrong bit. The length of the frame is read from the frame's header,
     so that the frame is complete before the tail sequence arrives. The search for the next start sequence
-    continues behind the last valid codeblock, so that each byte is decoded only once.
+    continues after the last valid codeblock, so that each byte is decoded only once.
     """
 
     def __init__(self, kind: str | None, count: Callable[[int], object]) -> None:
@@ -441,8 +441,8 @@ class LinkCodes:
     """Codes of both directions of a link.
 
     Attributes:
-        telemetry: code of telemetry.
-        commands: code of telecommands.
+        telemetry: coding of telemetry frames.
+        commands: coding of telecommand frames.
     """
 
     def __init__(

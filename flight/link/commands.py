@@ -5,11 +5,10 @@ command, for example the sender's UTC, so that a packet duplicated by the networ
 Ground and satellite check the arguments of a command against the states and ranges in its packet definition.
 The words of the command `knightcube command` follow from the same definitions.
 
-The receive queue of a socket is short, so that an unknown sender could fill it between two polls, and
-commands from known senders would be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel
-drop datagrams that come from unknown senders or do not begin with the packet identifier of a command. The
-data that the filter can inspect begin with the UDP header for UDP sockets, and with the payload for UNIX
-sockets.
+The receive queue of a socket is short. An unknown sender could fill the queue between two polls, and commands
+from known senders would then be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel drop
+datagrams that come from unknown senders or do not begin with the packet identifier of a command. The data
+that the filter can inspect begin with the UDP header for UDP sockets, and with the payload for UNIX sockets.
 """
 
 from __future__ import annotations
@@ -475,7 +474,7 @@ def _in_radians(word: str, stored: bool) -> str:
 
 
 def words_of(command: Command) -> str:
-    """Return the line for which `command_of_words` returns the given command, with numbers of 10 digits."""
+    """Return a command as a line that `command_of_words` converts back. Numbers have 10 digits."""
     words = [command.packet.name]
     if isinstance(command, Point):
         target = command.target

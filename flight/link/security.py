@@ -1,11 +1,12 @@
 """Link security (CCSDS 355.0-B-2): stored keys and counters, encryption, authentication, replay protection.
 
-Frames in both directions are protected by AES-256-GCM. A protected frame contains the SPI (2 bytes), the IV
-(12 bytes), the ciphertext and the MAC (16 bytes). Telemetry may also be authenticated without encryption. The
-IV is the nonce, which must never repeat under the same key. The IV consists of a salt of 32 random bits,
-which each sender draws at its start, and of a counter of 64 bits. The counter increases from frame to frame,
-and the receiver ignores the salt. If a folder of keys is restored from a backup, counters are used again, but
-with another salt. The MAC covers the virtual channel, the SPI and the data, as in Yamcs.
+Frames in both directions are protected by AES-256-GCM. A protected frame contains the SPI (security parameter
+index, 2 bytes), the IV (12 bytes), the ciphertext and the MAC (16 bytes). Telemetry may also be authenticated
+without encryption. The IV is the nonce, which must never repeat under the same key. The IV consists of a salt
+of 32 random bits, which each sender draws at its start, and of a counter of 64 bits. The counter increases
+from frame to frame, and the receiver ignores the salt. If a folder of keys is restored from a backup,
+counters are used again, but with another salt. The MAC covers the virtual channel, the SPI and the data, as
+in Yamcs.
 
 The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
 CRC-32. Both files are overwritten in place, one after the other, so that a full disk does not prevent the
@@ -14,12 +15,12 @@ higher counter is used. One folder holds the security associations of one end of
 folder's owner may read them.
 
 A folder of keys that was restored from a backup contains old counters, with which old commands would be
-executed again. The satellite therefore keeps a witness: a second folder that no backup may contain, with the
-newest association of each SPI and the digests of all replaced keys. An association is outdated if the witness
-has the same key with a higher counter, or if its key was replaced. A new key that the witness does not know
-is accepted from any folder. If the association of the primary command SPI is outdated, its commands are
-refused until a command of the reserve SPI sets a new key. The other SPIs continue with the key and counter in
-the witness.
+executed again. The satellite therefore keeps a reference folder (argument `witness`), which no backup may
+contain. The reference folder holds the newest association of each SPI and the digests of all replaced keys.
+An association is outdated if the reference folder has the same key with a higher counter, or if its key was
+replaced. A new key that is not in the reference folder is accepted from any folder. If the association of the
+primary command SPI is outdated, its commands are refused until a command of the reserve SPI sets a new key.
+The other SPIs continue with the key and counter in the reference folder.
 
 A gate checks the CRC, spacecraft, SPI, MAC and counter of a frame in this order. A refused frame has no
 effect except on the count of refusals by cause. The counter of an accepted frame is stored durably before the
@@ -174,7 +175,7 @@ class Vault:
     def __init__(self, folder: Path, witness: Path | None = None) -> None:
         """Open a folder. Raises UsageError if it does not exist or if other users may read its files.
 
-        A satellite gives the folder of its `witness`, which is created if possible.
+        On a satellite, `witness` is the path of the reference folder, which is created if possible.
         """
         self._folder = folder
         self._witness = None if witness is None else _Witness(witness)
@@ -228,8 +229,8 @@ class Vault:
     def read(self, name: int | str) -> Association | None:
         """Return the newest valid copy of an association, None if both copies are missing or damaged.
 
-        If the copy is older than its record in the second folder (the witness), the record is returned. For
-        an outdated primary command SPI, the result is None, because its counters could be repeated.
+        If both copies are older than the association in the reference folder, the latter is returned. For an
+        outdated primary command SPI, the result is None, because its counters could be repeated.
         """
         newest = max(self._copies(name), default=None)
         if newest is None or self._witness is None or not self._witness.outdates(newest):
@@ -290,9 +291,9 @@ _MOST_IDS_BYTES = 1 << 16
 
 
 class _Witness:
-    """Folder with the newest association of each SPI and the digests of replaced keys.
+    """Reference folder with the newest association of each SPI and the digests of replaced keys.
 
-    Errors of the disk are ignored, because a link without a witness is better than no link.
+    Disk errors are ignored, because a link without a reference folder is better than no link.
 
     Attributes:
         known: newest association of each SPI.
@@ -411,8 +412,9 @@ class Gate:
     ) -> None:
         """Accept frames of the given SPIs and restore lost copies of their associations.
 
-        If `store_every` is above 1, the counter is stored only once per `store_every` counts. The ground uses
-        a value above 1 for telemetry. Telemetry can be authenticated without being `encrypted`.
+        If `store_every` is above 1, the counter is stored only once per `store_every` counts. The ground
+        station receives telemetry with such a value of `store_every`. Telemetry can be authenticated without
+        being `encrypted`.
         """
         self._vault = vault
         self._parse = parse
@@ -518,7 +520,10 @@ class Gate:
 
 
 class Sealer:
-    """Sender that protects frames of one SPI. A counter is reserved on disk before it is used in a frame."""
+    """Sender that protects frames with the key of one security parameter index (SPI).
+
+    A counter is reserved on disk before it is used in a frame.
+    """
 
     def __init__(
         self,

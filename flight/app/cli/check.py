@@ -189,7 +189,10 @@ def _fly(verdict: CheckResult) -> None:
 
 
 def flight_problems(result: RunResult) -> list[str]:
-    """Return the problems of a flight. Events and alarms are problems only if no faults are injected."""
+    """Return a text for each problem in the result of a flight.
+
+    Events and alarms are problems only if no faults were injected.
+    """
     ending = result.ending
     problems = [text for text in (result.log_error, result.restart, ending.coil_error) if text]
     if result.interrupted:

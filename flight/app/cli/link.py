@@ -165,7 +165,7 @@ def _judge(config_path: Path, log: Path) -> _JudgedLink:
 def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
     """Open keys and lines after the separation inhibit.
 
-    Raises UsageError, FlightError, DeviceError or OSError for problems that may pass.
+    Raises UsageError, FlightError, DeviceError or OSError for problems that may be temporary.
     """
     if judged.problem:
         _say(judged.problem)
@@ -200,9 +200,10 @@ def _open(log: Path, inhibit: SeparationInhibit, judged: _JudgedLink, stack: Exi
 
 
 def _witness(keys: Path) -> Path:
-    """Return the folder of the witness, which reveals outdated keys (`flight.link.security`).
+    """Return the path of the reference folder, whose records reveal outdated keys.
 
-    The folder is the second state folder of a service, or otherwise a folder beside the keys.
+    The module `flight.link.security` describes this folder. A service uses its second state folder, and any
+    other process uses a folder beside the keys.
     """
     folders = os.environ.get("STATE_DIRECTORY", "").split(":")
     return Path(folders[1]) if len(folders) > 1 else keys.absolute().parent / "witness"

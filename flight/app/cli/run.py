@@ -1,4 +1,4 @@
-"""The command `knightcube run`, which flies a configuration and prints a summary of the flight."""
+"""The command `knightcube run`, which runs a flight with a configuration and prints a summary of it."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def run(options: argparse.Namespace) -> int:
     progress = None if options.archive and not sys.stderr.isatty() else progress_on(sys.stderr)
     try:
         result = fly(request, progress)
-    except StoppedError as error:  # a signal ended the start of the service
+    except StoppedError as error:  # a signal interrupted the service's start
         sys.stderr.write(f"knightcube: {error}\n")
         return 0
     except OSError as error:
@@ -177,7 +177,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
-    """Return a function that shows progress: in one line of a terminal, or else a new line every 10 s."""
+    """Return a function that shows progress in one line of a terminal, or otherwise as a line every 10 s."""
     terminal = stream.isatty()
     period, before, after = (0.2, "\r\x1b[K", "") if terminal else (10.0, "", "\n")
     last = time.perf_counter()

@@ -87,7 +87,7 @@ _NAN3 = [math.nan] * 3
 
 
 class OrbitView:
-    """Packets and texts of the satellite; implements `flight.loop.body.BodyView`."""
+    """Telemetry packets and status texts of the satellite; implements `flight.loop.body.BodyView`."""
 
     def __init__(
         self,
@@ -218,7 +218,7 @@ _BELOW = 0.8
 
 
 class SatelliteEstimation(BodyEstimation):
-    """Estimation of the satellite: attitude filter, orbit, Sun sensing and horizon cameras."""
+    """State estimation of the satellite: attitude filter, orbit, Sun sensing and horizon cameras."""
 
     uses_readings_without_rate = True
 
@@ -400,7 +400,7 @@ class SatelliteControl(BodyControl):
         self._objects.accept(tracks, now_ns)
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first start time from `from_ns` on of an exposure during which no coil is switched."""
+        """Return the first time (ns) from `from_ns` at which an exposure without coil switching can start."""
         return self._pauses.calm(from_ns, exposure_ns)
 
 
@@ -610,7 +610,8 @@ def _coil_monitor(config: OrbitConfig, environment: EstimatedEnvironment) -> Coi
         density = 0.0 if state is None else mean_density(float(np.linalg.norm(state.position)))
         return float(dipole + air * density)
 
-    # The field is 16 times weaker than the testbed's, so a coil's torque takes longer to detect.
+    # The Earth's magnetic field is 16 times weaker than the testbed's field, so a coil's torque takes longer
+    # to detect.
     response = ResponseSettings(
         inertia,
         config.coils.map().dipoles,

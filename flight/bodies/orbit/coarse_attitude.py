@@ -1,12 +1,13 @@
 """Coarse attitude from solar cells and magnetic field, and from the horizon cameras.
 
-The measured directions start the filter without a star fix, and update it until the attitude is fine.
+The measured directions start the attitude filter without a star fix, and update it until star fixes make the
+estimate accurate.
 
 The covariance of an attitude from magnetic field and solar cells (`FieldAndStrings`) includes every rotation
 that is possible if any one cell has failed. Errors of solar cells, lenses and the assumed height of the limb
 may last for minutes. A measurement is therefore used only if it is more accurate than the estimate, so that
-repeated measurements do not make the filter overconfident. If several measurements in a row contradict an
-estimate that star fixes have not made fine, the filter is restarted.
+repeated measurements do not make the filter overconfident. If several consecutive measurements contradict an
+estimate that no star fix has made accurate, the filter is restarted.
 """
 
 from __future__ import annotations
@@ -59,10 +60,10 @@ Readings of working cells differ by noise.
 SUNLIT = 0.99
 """Visible fraction of the solar disc above which the solar cells are expected to measure the Sun."""
 CONTRADICTED = 3
-"""Number of contradicting measurements in a row after which a coarse estimate is discarded."""
+"""Number of consecutive contradicting measurements after which a coarse estimate is discarded."""
 GATE = 30.7
-"""Chi-square threshold (3 degrees of freedom, false alarm probability 1e-6) of the test whether a measured
-attitude contradicts the estimate."""
+"""Chi-square threshold (3 degrees of freedom, false alarm probability 1e-6) above which a measured attitude
+contradicts the estimate."""
 START_SIGMA = np.radians(5.0)
 """Largest standard deviation (rad) of the rotation about the field direction at which the filter starts."""
 STRENGTH_SIGMA = 5.0
@@ -379,7 +380,10 @@ def _contradicts(sight: VectorObservation, turn: FloatArray, claim: FloatArray) 
 
 
 def _says_more(sight: VectorObservation, claim: FloatArray) -> bool:
-    """Return whether a direction improves an attitude of covariance `claim` about at least one axis."""
+    """Return whether a direction makes an attitude estimate more accurate about at least one axis.
+
+    The matrix `claim` (3, 3), rad^2, is the covariance of the attitude estimate.
+    """
     across = tangent_basis(sight.observed)
     rows = across @ np.cross(sight.observed, np.eye(3)).T
     known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T

@@ -135,7 +135,8 @@ class SunAcquisitionLaw(_MagneticLaw):
 
 _NOTHING: FloatArray = np.zeros(3)
 _LARGEST_COIL_ERROR = 0.3
-"""Largest compensated error of an element of the coil matrix, which keeps the matrix invertible."""
+"""Largest error of an element of the coil matrix that is compensated; the limit keeps the matrix
+invertible."""
 
 
 def commanded(dipole: FloatArray, coils: FloatArray) -> FloatArray:

@@ -5,11 +5,12 @@ environment is predicted for about 20 s at once, which takes 2 ms, and then inte
 whole revolution belong in a worker process, because they take 0.3 ms of computing time per 10 s of orbit. The
 class `StuckFieldCheck` detects a magnetometer that repeats the same field.
 
-A GPS fix that contradicts the elements or the previous fixes is refused. Refused fixes that are consistent
-with one orbit for `CONFIRMED` seconds replace the contradicted knowledge, unless the magnetometer or the Sun
-contradicts them. Fixes that agree with inaccurate elements are used only after `CONFIRMED` seconds. Fixes
-that agree with accurate elements are used at once, but their stated accuracy is trusted only after
-`CONFIRMED` seconds. Spoofed GPS signals cannot be detected if they consistently simulate a possible orbit.
+A GPS fix that contradicts the elements or the previous fixes is refused. If refused fixes are consistent with
+one orbit for `CONFIRMED` seconds, this orbit replaces the orbit known before, unless the magnetometer or the
+Sun contradicts the new orbit. Fixes that agree with inaccurate elements are used only after `CONFIRMED`
+seconds. Fixes that agree with accurate elements are used at once, but their stated accuracy is trusted only
+after `CONFIRMED` seconds. Spoofed GPS signals cannot be detected if they consistently simulate a possible
+orbit.
 """
 
 from __future__ import annotations
@@ -50,10 +51,11 @@ SPEED_GATE, ORBITAL_RATE = 20.0, 1.2e-3
 """Deviation (m/s) up to which a fix's velocity is always accepted, and orbital rate (rad/s) of the lowest
 orbit."""
 CONFIRMED = 420.0
-"""Time (s) over which refused fixes must be consistent with one orbit to replace contradicted knowledge."""
+"""Time (s) over which refused fixes must be consistent with one orbit to replace the orbit known before."""
 _LEAST_FIXES, _SEQUENCES, _LONGEST_GAP = 5, 4, 200.0
-"""Minimum number of fixes that replace contradicted knowledge, maximum number of fix sequences (candidate
-orbits), and longest time (s) between two fixes of one sequence.
+"""`_LEAST_FIXES` is the minimum number of fixes that replace the orbit known before. `_SEQUENCES` is the
+maximum number of fix sequences, each of which is a candidate orbit. `_LONGEST_GAP` is the longest time (s)
+between two fixes of one sequence.
 """
 FIRST_FIXES, TIGHT = 3, 1e4
 """Number of consistent fixes that start an orbit without elements, and largest standard deviation (m) of
@@ -62,8 +64,8 @@ elements with which a single fix starts an orbit.
 UNCONFIRMED_SIGMA = 1e6
 """Standard deviation (m) of a position that follows from a few fixes without elements."""
 EXACT, STEEPEST = 3e3, 3.0
-"""Position error (m) whose effect on the field is below the error of the field model, and gradient of the
-field times the radius, as a fraction of the field.
+"""`EXACT` is a position error (m) that changes the magnetic field by less than the error of the field model.
+`STEEPEST` is the largest ratio between a relative change of the field and the relative change of the radius.
 """
 LOWEST_ORBIT = 1.01 * EARTH_RADIUS
 """Minimum radius (m) of a satellite's position and perigee."""
@@ -74,8 +76,9 @@ TIME_GATE_NS, CLOCK_DRIFT = SECOND_NS // 2, 1e-4
 UNKNOWN_SIGMA, UNKNOWN_VELOCITY_SIGMA = 100.0, 1.0
 """Standard deviations of position (m) and velocity (m/s) per axis if the receiver does not know them."""
 WITNESS_GATE, LATEST_WITNESS_NS = 4.0, 20 * SECOND_NS
-"""RMS deviation (standard deviations) of the field strength above which an orbit is refuted, and largest age
-(ns) of the measurements used."""
+"""`WITNESS_GATE` is the RMS deviation of the measured field strength from an orbit's prediction, in standard
+deviations, above which the field contradicts the orbit. `LATEST_WITNESS_NS` is the largest age (ns) at which
+a measurement is compared with an orbit."""
 _SHORTEST = 1.0
 
 
@@ -108,13 +111,13 @@ class FixSequence:
         self.joined = 1
         self._offset_ns = offset_ns
         self._offered = 1
-        self._strength = np.zeros(3)  # sums of squared field deviations, both orbits, and their number
+        self._strength = np.zeros(3)  # sum of squared field deviations from each orbit; their number
         self._is_refuted = False
         self._shadowed = np.zeros(2)  # sunlit fixes at which each orbit predicts shadow
 
     @property
     def confirmed(self) -> bool:
-        """Whether the fixes agree long enough to replace contradicted knowledge."""
+        """Whether the fixes agree long enough to replace the orbit known before."""
         span = (self._newest.julian_date - self.first.julian_date) * DAY
         return span >= CONFIRMED and self.joined >= max(_LEAST_FIXES, self._offered // 2)
 
@@ -147,7 +150,7 @@ class FixSequence:
         return True
 
     def compare(self, witness: Witness, here: OrbitState, known: OrbitState) -> None:
-        """Compare field and Sun with the position of the newest fix and the previously known position."""
+        """Compare the measured field and Sun with predictions for the newest fix and for the known orbit."""
         states = here, known
         if witness.field is not None:
             strengths = [float(np.linalg.norm(field(here.julian_date, one.position))) for one in states]
@@ -161,13 +164,13 @@ class FixSequence:
 
 
 _DARK = 0.01
-"""Visible fraction of the solar disc below which the solar cells measure no Sun."""
+"""Visible fraction of the solar disc below which the solar cells cannot detect the Sun."""
 
 
 def _agree(known: GpsFix | TwoLineElements, fix: GpsFix, least: float) -> bool:
-    """Return whether a fix agrees with a known orbit; deviations in position up to `least` (m) agree.
+    """Return whether a fix agrees with a known orbit; a position deviation up to `least` (m) is accepted.
 
-    Any fix agrees with elements that give no orbit at the time of the fix.
+    Every fix is accepted if the elements cannot be propagated to the time of the fix.
     """
     found = fix.at(fix.julian_date)
     try:
@@ -192,7 +195,7 @@ class EstimatedEnvironment:
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
         """`elements` are the two-line elements; without them the orbit is unknown until the first fixes."""
         self._elements = elements
-        self._enlarged = 1.0  # factor of the elements' standard deviation, above 1 after fixes refuted them
+        self._enlarged = 1.0  # factor of the elements' standard deviation: above 1 after a contradiction
         self._clock = clock
         self._fix: GpsFix | None = None
         self._is_confirmed = False  # whether the newest fix belongs to a confirmed orbit
@@ -221,7 +224,11 @@ class EstimatedEnvironment:
 
     @property
     def clock_doubt(self) -> str:
-        """Why the host's clock is wrong according to the elements, or an empty text after the first fix."""
+        """The reason to doubt the host's clock, or an empty text.
+
+        Before the first fix, the clock is doubted if its date is more than `EARLIEST` days before the
+        elements' epoch.
+        """
         if self._utc_offset_ns is not None or self._elements is None:
             return ""
         early = self._elements.epoch - UNIX_EPOCH - self._clock.utc_ns() / (DAY * SECOND_NS)
@@ -232,7 +239,8 @@ class EstimatedEnvironment:
     def julian_date(self, now_ns: int) -> float:
         """Return the Julian date (UTC) at a time of the host's clock.
 
-        The date is that of the GPS receiver, or before the first fix that of the host's clock.
+        After the first fix, the date follows the GPS receiver. Before it, the date is that of the host's
+        clock.
         """
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
@@ -328,7 +336,10 @@ class EstimatedEnvironment:
         return None
 
     def _unconfirmed(self, state: OrbitState) -> OrbitState:
-        """Return a state from a few fixes; its standard deviation covers the distance from the elements."""
+        """Return a state from a few fixes with an increased standard deviation.
+
+        The increase covers the distance between the state and the position predicted by the elements.
+        """
         sigma = UNCONFIRMED_SIGMA
         if self._elements is not None:
             with suppress(OrbitError):
@@ -404,7 +415,7 @@ class EstimatedEnvironment:
         return False
 
     def _is_begun(self, sequence: FixSequence, last: GpsFix | None) -> bool:
-        """Return whether a sequence begins an orbit, or continues an orbit based on few fixes."""
+        """Return whether a fix sequence starts an orbit estimate, or continues one based on few fixes."""
         first = FIRST_FIXES if self._elements is None else 1
         known = self._elements is None or self._is_tight(sequence.first.julian_date)
         if not known or self._is_doubted or sequence.refuted or sequence.joined < first:
@@ -442,12 +453,19 @@ class EstimatedEnvironment:
         return False
 
     def _agrees_with_elements(self, fix: GpsFix) -> bool:
-        """Return whether a fix agrees with the elements; refuted elements are not compared."""
+        """Return whether a fix agrees with the elements.
+
+        True is returned without a comparison if the elements are missing, or if confirmed fixes contradicted
+        them.
+        """
         elements = self._elements
         return elements is None or self._enlarged > 1.0 or _agree(elements, fix, LEAST_GATE)
 
     def _has_false_time(self, fix: GpsFix, time_ns: int) -> bool:
-        """Return whether a fix agrees with the elements at the known time, but not at the fix's own time."""
+        """Return whether only the time stated by a fix contradicts the elements.
+
+        With the time known before instead of the stated time, such a fix agrees with the elements.
+        """
         if self._elements is None or self._agrees_with_elements(fix):
             return False
         known = self.julian_date(time_ns - GPS_DELAY_NS)
@@ -465,7 +483,8 @@ class EstimatedEnvironment:
 
 
 STUCK, FIELDS_CONTRADICTED = 20, 4
-"""Number of equal magnetic fields in a row, and of contradicting fields in a row, that indicate a fault."""
+"""Number of consecutive equal field measurements, and of consecutive contradicting ones, that show a
+fault."""
 
 
 class StuckFieldCheck:
@@ -489,7 +508,7 @@ class StuckFieldCheck:
     def text(self, refused: int) -> str:
         """Return why the magnetometer is rejected, or an empty text.
 
-        The number `refused` counts the magnetic fields in a row that contradict the estimate.
+        The number `refused` counts consecutive field measurements that contradict the estimate.
         """
         if self.stuck:
             return "the magnetometer gives the same field in every reading"

@@ -51,8 +51,8 @@ _LONGEST = 2.0
 _KNOWN_RATE = 0.01
 """Largest standard deviation (rad/s) of a rate from the magnetometer with which a direction is propagated."""
 _MEASURED_SIGMA = 0.7
-"""Standard deviation (rad) of the attitude below which the filter's linear update by a measured attitude
-holds."""
+"""Standard deviation (rad) of the attitude below which a measured attitude updates the estimate linearly
+instead of restarting the filter."""
 _NEGLIGIBLE = 1e-9
 """Current (A) below which a coil is not driven."""
 _EYE: FloatArray = np.eye(3)
@@ -122,7 +122,7 @@ class StepReplay:
         self.refused_gyros = self.refused_fields = self.contradicted = 0
         self.contradictions: list[str] = []
         self._checks = {name: PriorCheck() for name in states.LEARNED}
-        self._innovation = "body", 0.0  # states tested by the newest gyro innovation; its square
+        self._innovation = "body", 0.0  # states that the newest gyro innovation tests; its normalised square
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
@@ -136,7 +136,7 @@ class StepReplay:
                 self._check_learned(step.end_ns / SECOND_NS)
 
     def _check_learned(self, time: float) -> None:
-        """Learn states again if the gyro contradicts them consistently in the steps up to `time` (s)."""
+        """Estimate learned states again if the gyro samples up to `time` (s) consistently contradict them."""
         name, square = self._innovation
         if self._checks[name].add(time, square):
             self.contradictions.append(f"the motion contradicts the learned {name}, which are learned again")
@@ -146,8 +146,8 @@ class StepReplay:
     def follow_gyro(self) -> None:
         """Process the last two steps again with unknown dipoles if the gyro contradicts the dipoles.
 
-        The earlier of the two steps is included, because the deviation may have begun within it, so that its
-        mean rate shows only half of the deviation.
+        The earlier of the two steps is included, because the deviation may have begun during that step. The
+        mean rate of the step then shows only a part of the deviation.
         """
         steps, refused = self.steps, self.refused_gyros > 0
         now_ns = steps[-1].end_ns
@@ -264,7 +264,7 @@ class StepReplay:
         return field, step.gyro
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
-        """Return the rotation (4,) of the body between two times by the gyro, or None beyond the history."""
+        """Return the body's rotation (4,) between two times from gyro data, or None beyond the history."""
         if to_ns < from_ns:
             back = self.turned(to_ns, from_ns)
             return None if back is None else conjugate(back)
@@ -283,7 +283,7 @@ class StepReplay:
     def take_again(self, first: int) -> set[int]:
         """Return to the start of step `first`, and process all steps again from there.
 
-        Return the identities of the late measurements used.
+        Return the object IDs of the late measurements used.
         """
         while first < len(self.steps) and self.steps[first].before is None:
             first += 1
@@ -295,7 +295,7 @@ class StepReplay:
         return self.take_on(first)
 
     def take_on(self, first: int) -> set[int]:
-        """Process the steps from index `first` on; return the identities of the late measurements used."""
+        """Process the steps from index `first` on; return the object IDs of the late measurements used."""
         used: set[int] = set()
         for k in range(first, len(self.steps)):
             step = self.steps[k]
@@ -375,7 +375,7 @@ class StepReplay:
 FIELD_STRENGTH = 5e-5
 """Largest magnetic field (T) in a low orbit."""
 REFUSALS_TO_RESTART = 3
-"""Number of contradicting attitudes in a row after which a fine estimate is restarted."""
+"""Number of consecutive contradicting attitudes after which an accurate estimate is restarted."""
 
 
 class OrbitFilter:
@@ -433,7 +433,7 @@ class OrbitFilter:
 
     @property
     def runs(self) -> bool:
-        """Whether the filter accepts measurements, which it does also while the attitude is lost."""
+        """Whether the filter has started and accepts measurements, even if the attitude is lost."""
         return self._free.started
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
@@ -442,7 +442,7 @@ class OrbitFilter:
         return self._replay.newest_field()
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
-        """Return the rotation (4,) of the body between two times by the gyro, or None beyond the history."""
+        """Return the body's rotation (4,) between two times from gyro data, or None beyond the history."""
         self._close()
         return self._replay.turned(from_ns, to_ns)
 
@@ -458,7 +458,7 @@ class OrbitFilter:
 
     @property
     def refused(self) -> int:
-        """The number of measurements rejected by their gates, also counted again in repeated steps."""
+        """The number of rejections by gates. A rejection in a repeated step is counted again."""
         return self._free.refused
 
     @property
@@ -600,7 +600,7 @@ class OrbitFilter:
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times.
+        """Apply measurements that arrive after later measurements were applied.
 
         The callback `applied` receives, for each measurement, whether the measurement passed the gate.
         """
@@ -630,7 +630,8 @@ class OrbitFilter:
             self._refused_attitudes = 0 if was else self._refused_attitudes + 1
             if was:
                 self._placed_ns = m.time_ns
-            # A fine estimate restarts after several contradicting attitudes, a coarse one after the first.
+            # An accurate (fine) estimate restarts after several contradicting attitudes, a coarse one after
+            # the first.
             patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
             if self._refused_attitudes >= patience:
                 self.begin(m, doubted=True)

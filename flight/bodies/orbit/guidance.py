@@ -6,8 +6,8 @@ periodically, because the orbit prediction loses accuracy and a free roll angle 
 of the body.
 
 During a slew, the rest of the slew is planned again every few seconds from the newest estimate, with the
-estimated inertia, residual dipole and torques. The running path is followed until the new path begins. A new
-path that arrives late is followed from its point for the present time on.
+estimated inertia, residual dipole and torques. The running path is followed until the new path begins. If a
+new path arrives late, the satellite skips the part of the path that lies in the past.
 
 A satellite that follows an object points to the search direction first, then to the track of the object.
 Without a track, the boresight stays at the search direction. If there are several tracks, the satellite
@@ -121,10 +121,11 @@ class PointingPaths:
     def offer(
         self, table: PointingTable, target: PointingTarget, origin_ns: int, *, continues: bool = False
     ) -> str:
-        """Follow the part of a new path table that has permitted rates.
+        """Follow the part of a new path table in which the body rate does not exceed the limit.
 
-        Return why the path is rejected, or an empty text if the path is followed. A table that continues a
-        running slew (`continues`) is followed from its first time on, and other tables are followed at once.
+        Return why the path is rejected, or an empty text if the path is followed. A table that continues the
+        present slew (`continues`) is followed from the first time of the table. Other tables are followed at
+        once.
         """
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
@@ -149,9 +150,10 @@ class PointingPaths:
         return ""
 
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
-        """Accept the rotation (3,) between path and body and the rate (3,) of the body.
+        """Record how far the body is from its path, and return whether the body still follows the path.
 
-        Return whether the body continues to follow the path.
+        The argument `turn` is the rotation vector (3,), rad, between path and body, and `rate` is the body
+        rate (3,), rad/s.
         """
         self.off = float(np.linalg.norm(turn))
         self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
@@ -232,7 +234,7 @@ class PointingTargetLaw:
 
 
 def target_of(target: Target) -> PointingTarget:
-    """Return the pointing target of a satellite's numbered target."""
+    """Return the `PointingTarget` that a satellite's `Target` contains."""
     law = target.law
     assert isinstance(law, PointingTargetLaw), "the planner accepts only targets of a satellite"
     return law.target
@@ -360,7 +362,8 @@ class ObjectAim:
     def directed(self, job: PointingJob) -> PointingJob:
         """Return the planner's job for a target.
 
-        If the target is an object, the job points to the search direction or the track.
+        If the target is an object, the planned path points the boresight at the track of the object. Without
+        a track, it points the boresight in the search direction.
         """
         sensor = self._sensor
         self.moved = False
@@ -383,7 +386,7 @@ class ObjectAim:
         return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
-        """Report an event if the object leaves the field of view along the path of a table."""
+        """Report an event if the object will leave the field of view on the path that `table` holds."""
         sensor, sight = self._sensor, job.sight
         if sensor is None or sight is None or not sight.velocity.any():
             return
@@ -438,7 +441,7 @@ _SMALLEST = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedBody:
-    """The estimates of the filter that the planner uses.
+    """Properties of the body, estimated by the filter, that the planner uses.
 
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
@@ -452,9 +455,11 @@ class LearnedBody:
 
 
 ACROSS = 0.03
-"""Largest dipole moment of a slew normal to the plane of two remaining coils, relative to the weakest coil.
+"""Largest dipole moment normal to the plane of two usable coils in a slew, as a fraction of the weakest
+coil's.
 
-The limit costs little torque: each torque of two coils needs only moments in the plane of these coils.
+The limit reduces the torque little, because a dipole moment in the plane of the two coils can produce nearly
+every possible torque.
 """
 
 
@@ -573,7 +578,7 @@ class PointingPlanner:
             self._after_ns = now_ns + REST_AGAIN_NS
 
     def _new_job(self, estimate: Estimate, goal: PointingTarget, now_ns: int) -> PointingJob | None:
-        """Return the job of a slew to a goal from an estimate, or None while the orbit is unknown.
+        """Return the planner's job for a slew from an estimate to a goal, or None while the orbit is unknown.
 
         Raises UsageError if the coils that are not isolated are parallel.
         """

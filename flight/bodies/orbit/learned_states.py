@@ -3,11 +3,12 @@
 The learned states are stored for the next boot in three parts, without the cross-covariance of different
 parts. The part `attitude-errors` holds the biases and matrices of gyro and magnetometer and the misalignment
 of the star camera. The part `attitude-torques` holds the residual dipole in shadow and in sunlight and the
-torques. The part `body` holds the inertia and the matrix of the coils. The matrix of the coils refers to the
-dipoles that the coil monitor has corrected. Signs and gains of the coils are therefore stored too, in the
-entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s) for which the learned states were
-estimated. At the next boot, the covariance of each state grows by its random walk over the elapsed time, and
-by a fraction of its initial covariance, because switching a sensor off and on changes its bias.
+torques. The part `body` holds the inertia and the matrix of the coils. The matrix of the coils applies to
+dipoles that were computed with the signs and gains from the coil monitor. These signs and gains are therefore
+stored too, in the entry `coil-factors`. Another entry, `learned-at`, is the time (UTC, s) for which the
+learned states were estimated. At the next boot, the covariance of each state grows by its random walk over
+the elapsed time, and by a fraction of its initial covariance, because switching a sensor off and on changes
+its bias.
 """
 
 from __future__ import annotations

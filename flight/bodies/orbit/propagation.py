@@ -98,7 +98,7 @@ class PropagatedEstimate(Estimate):
     _known: FloatArray | Callable[[], FloatArray]
 
     def __init__(self, covariance: FloatArray | Callable[[], FloatArray], **values: Any) -> None:
-        """`covariance` is the matrix or its function, `values` the other attributes of `Estimate` by name."""
+        """`covariance` is a matrix or a function that returns it; `values` are the other attributes."""
         for name, value in {**values, "_known": covariance}.items():
             object.__setattr__(self, name, value)
 

@@ -55,10 +55,11 @@ class DipoleHistory:
         return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
 
     def impulse(self, from_ns: int, to_ns: int) -> FloatArray:
-        """Return the dipole integral (3,), A m^2 s, to the end of an interval, averaged over its start times.
+        """Return the mean over t of the integral (3,), A m^2 s, of the dipole from a time t to `to_ns`.
 
-        The torque of this impulse is the difference of the angular momentum at the end of the interval
-        `from_ns` to `to_ns` from its mean over the interval.
+        The mean is taken over all times t from `from_ns` to `to_ns`. The cross product of the result and the
+        magnetic field is the angular momentum at `to_ns` minus the mean angular momentum from `from_ns` to
+        `to_ns`.
         """
         first, last = bisect.bisect_right(self._times, from_ns), bisect.bisect_left(self._times, to_ns)
         knots = np.array([from_ns, *self._times[first:last], to_ns])
@@ -67,7 +68,7 @@ class DipoleHistory:
         return np.asarray((sums[-1] - mean) / SECOND_NS)
 
     def at_rest_since(self) -> int | None:
-        """Return the time (ns) since which the dipole is zero, or None if it is not zero."""
+        """Return the time (ns) since which the dipole has been zero, or None if it is not zero."""
         if not self._dipoles:
             return 0
         return self._times[-1] if self._dipoles[-1] == _NOTHING else None

@@ -176,7 +176,7 @@ def law_of(target: Target) -> ThreadLaw:
 
 _AGAIN_NS = 1_000_000_000
 _ARRIVED_NS = 100_000_000
-"""Time (ns) before the goal time from which on a new plan holds the target."""
+"""Remaining time (ns) to the goal time up to which a new plan only keeps the body at the target."""
 _MAX_HORIZON = 60.0
 """Longest planning horizon (s) of a path."""
 
@@ -443,7 +443,7 @@ class TimedStep:
 
 
 class ThreadTargets:
-    """The configured and commanded steps of the testbed; implements `flight.loop.body.BodyTargets`."""
+    """The configured and commanded targets of the testbed; implements `flight.loop.body.BodyTargets`."""
 
     def __init__(
         self, steps: Sequence[TimedStep], reader: ThreadReader, guidance: PathGuidance, planning: Planning
@@ -460,7 +460,7 @@ class ThreadTargets:
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`, which requests the q2 `wanted`.
+        """Return the target of command `number`, which requests the quaternion component q2 = `wanted`.
 
         Raises UsageError if q2 is beyond its limit.
         """
@@ -603,7 +603,7 @@ class CageField:
             )
 
     def at(self, now_ns: int) -> FloatArray:
-        """Return the field (3,), T, in reference axes at a time of the clock."""
+        """Return the magnetic field (3,), T, in reference axes at the time `now_ns` of the host's clock."""
         near = self._near
         seconds = math.inf if near is None else (self._date(now_ns) - near.julian_date) * DAY
         if near is None or not 0.0 <= seconds <= AHEAD:
@@ -681,7 +681,7 @@ class CageTracker:
     ) -> None:
         """`inner` is a tracker for the constant field of `plant`.
 
-        `dipole` is the number of turns times the area of each coil, m^2.
+        `dipole` is the dipole moment of each coil per ampere: the number of turns times the area, m^2.
         """
         self._inner = inner
         self._read = reader.read

@@ -113,7 +113,7 @@ class Ranges:
 
     @property
     def total(self) -> int:
-        """Number of bytes in the set."""
+        """Total number of bytes in all ranges."""
         return sum(self._ends) - sum(self._begins)
 
     def cover(self, size: int) -> bool:
@@ -615,8 +615,8 @@ NOBODY = Origin()
 class Progress:
     """Progress of a file transfer.
 
-    The attribute `condition` is None while the transfer is open, and `said` is the text about the transfer's
-    end, or states that the transfer is suspended.
+    The attribute `condition` is None while the transfer is open. The attribute `said` is a text that
+    describes how the transfer ended, or that it is suspended.
     """
 
     outgoing: bool

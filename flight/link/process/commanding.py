@@ -106,7 +106,7 @@ def report(sent: Sent, stage: Stage, text: str) -> Report:
 
 
 def final_mode(command: Command) -> Mode | None:
-    """Return the mode that completes a command, None for a command that is completed at once."""
+    """Return the mode whose entry completes a command, or None for a command that is completed at once."""
     match command:
         case ChangeMode(mode):
             return mode

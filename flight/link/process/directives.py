@@ -28,9 +28,10 @@ LONGEST_COMMAND = 96
 """Maximum length (bytes) of a command in words, including the terminating zero byte."""
 _LONGEST_UTC = 32
 _PORTION_BYTES, _MOST_PORTIONS = 72, 8
-"""Bytes of a packet in one portion, which fits into a frame of 128 bytes, and maximum number of portions."""
+"""Bytes of a packet in one segment (class `Portion`), which fits into a frame of 128 bytes, and maximum
+number of segments."""
 LONGEST_IN_PORTIONS = _PORTION_BYTES * _MOST_PORTIONS
-"""Length (bytes) of the longest packet that can be sent in portions."""
+"""Length (bytes) of the longest packet that can be sent in segments."""
 
 _ENTITY = Field(
     "entity", "u2", "-", "receiving entity", states=((GROUND, "ground"), (FOREIGN, "another-ground-station"))
@@ -218,7 +219,7 @@ class Activate:
 
 @dataclass(frozen=True, slots=True)
 class _OnRenewal:
-    """Directive about the renewal of one kind of artefact, which `kind` gives as an index of `KINDS`."""
+    """Directive about the trial of an update. The attribute `kind` is an index of `KINDS`."""
 
     kind: int
 
@@ -295,7 +296,7 @@ class NewKey:
 
 @dataclass(frozen=True, slots=True)
 class Portion:
-    """Directive that carries the portion `number` of the `total` portions of a packet."""
+    """Directive that carries one segment of a packet: the segment `number` of `total` segments."""
 
     total: int
     number: int
@@ -306,15 +307,15 @@ class Portion:
 
 
 class Joiner:
-    """Buffer that joins the portions of a packet."""
+    """Buffer that joins the segments of a packet."""
 
     def __init__(self) -> None:
         self._portions: list[Portion] = []
 
     def add(self, portion: Portion) -> bytes:
-        """Return the packet after its last portion, and an empty value before.
+        """Return the packet after its last segment, and an empty value before.
 
-        Raises CommandError for a portion that does not follow the portion received before.
+        Raises CommandError if an earlier segment is missing.
         """
         before, self._portions = self._portions, []
         if portion.number == 1 and 2 <= portion.total <= _MOST_PORTIONS:
@@ -363,7 +364,7 @@ class Listing:
 
 FileDirective = ListFiles | SendFile | CancelFile | SuspendFile | ResumeFile | UseFile | DeleteFile
 Privileged = Activate | Confirm | Withdraw | Restart
-"""Directives that the privileged part of the renewal executes."""
+"""Directives that the privileged program `deploy/renewal.py` executes."""
 Executable = Play | Stop | NewKey | Scheduled | Deletion | Listing | Privileged | FileDirective
 Directive = Portion | Executable
 
@@ -418,9 +419,9 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
-    """Yield the portions of a packet, each as a packet with a unique time (UTC, ns) from `utc_ns` on.
+    """Yield the segments of a packet, each as a packet with a unique time (UTC, ns) from `utc_ns` on.
 
-    Raises CommandError for a packet that is longer than eight portions.
+    Raises CommandError for a packet that is longer than eight segments.
     """
     total = -(-len(packet) // _PORTION_BYTES)
     if len(packet) > LONGEST_IN_PORTIONS:

@@ -76,7 +76,8 @@ class LogFollower:
         """The newest packet `run` of the present run as bytes; empty until a run is found."""
         self._is_read = False
         self.is_live = False
-        """Whether the newest packets are live: whether the reader has reached the end of the log before."""
+        """Whether the newest packets are live: the reader had reached the end of the log before reading
+        them."""
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:
@@ -244,7 +245,7 @@ class Downlink:
     """Generator of telemetry frames at the data rate of the line.
 
     Attributes:
-        sent: number of telemetry frames made.
+        sent: number of generated telemetry frames.
         displaced: number of queued reports that were replaced by newer reports.
         played_ns: mission time (ns) that the playback has reached.
     """

@@ -173,9 +173,7 @@ class Filing:
         self, path: Path, name: str, entity: int, done: Report, utc_ns: int, now_ns: int
     ) -> list[Report]:
         origin = Origin(done.spi, done.counter, *done.request)
-        kind = (
-            MODULAR if entity == FOREIGN else CRC32
-        )  # CRC-32 is not used for other ground stations, which may not support it
+        kind = MODULAR if entity == FOREIGN else CRC32  # other ground stations may not support CRC-32
         one = self._entity.send(path, name, entity, kind, utc_ns, now_ns, origin)
         text = f"{name}: {one.size} bytes, transfer {one.number}"
         return [replace(done, stage=Stage.STARTED, text=text)]

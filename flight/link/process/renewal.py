@@ -1,4 +1,4 @@
-"""Requests for a renewal in orbit (docs/fly/renewal.md), and reports of their execution, in the link process.
+"""Requests to update release or configuration in orbit (docs/fly/renewal.md), and reports of the execution.
 
 The privileged program `deploy/renewal.py` reads the requests and the record `contact` in the folder of this
 module, and writes the status file that this module reads.
@@ -42,12 +42,12 @@ def decoded(data: bytes) -> Any:
 
 
 class Renewal:
-    """Interface to the privileged part of the renewal, with which it exchanges files."""
+    """Interface to the privileged program `deploy/renewal.py`, with which it exchanges files."""
 
     def __init__(self, folder: Path, status: Path, command_loss: float) -> None:
         """Use `folder` for requests and records, and read the reports in the file `status`.
 
-        The time `command_loss` (s) without an authentic frame is passed on to the privileged part.
+        The time `command_loss` (s) without an authentic frame is passed on to this program.
         """
         self._folder = folder
         self._status = status

@@ -1,7 +1,7 @@
 """Link process: communication lines to the ground, and the loop that receives frames and sends telemetry.
 
 The communication lines use UDP, TCP or a serial port. The loop runs at 50 Hz in one thread, and no call on a
-line blocks. A flood of received frames is processed in portions, so that telemetry is not delayed. The
+line blocks. A flood of received frames is processed in several steps, so that telemetry is not delayed. The
 counter of an accepted frame is stored before the command in the frame is executed. A link process that is
 killed at any moment therefore executes no command twice.
 """
@@ -234,7 +234,7 @@ class _Connection:
 
 
 class TcpLine:
-    """TCP server on which each frame follows a sync marker, or has the configured code.
+    """TCP server for frames that follow sync markers, or are coded as configured.
 
     Connections that have sent an authentic frame are limited to four, other connections to 256. A further
     connection replaces the oldest connection of the same kind, so that unauthenticated clients displace only
@@ -249,7 +249,7 @@ class TcpLine:
         Args:
             address: own address, HOST:PORT.
             peers: networks from which connections are accepted, None to accept all connections.
-            framing: form of the frames in the stream, None for plain frames.
+            framing: form of the frames in the stream; None for uncoded frames, each after a sync marker.
 
         Raises UsageError if the address cannot be bound.
         """
@@ -380,7 +380,10 @@ class TncLine:
         """Do nothing, because all telemetry is sent to the TNC."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames in KISS frames. Frames are discarded without a connection, or if the TNC is slow."""
+        """Send telemetry frames, each as the data of one KISS frame.
+
+        Frames are discarded without a connection, or if the TNC is slow.
+        """
         if self._socket is None and now_ns >= self._next_ns:
             self._next_ns = now_ns + _RECONNECT_NS
             self._stream = self._framing.stream()
@@ -408,12 +411,12 @@ class TncLine:
 
 
 class SerialLine:
-    """Serial line to a radio, on which each frame follows a sync marker, or has the configured code."""
+    """Serial line to a radio for frames that follow sync markers, or are coded as configured."""
 
     def __init__(self, name: str, port: SerialPort, framing: Framing | None = None) -> None:
         """Use an open serial port, which reopens automatically if the device is lost.
 
-        Without a `framing`, plain frames follow sync markers.
+        Without a `framing`, frames are not coded, and each frame follows a sync marker.
         """
         self.name = name
         self._port = port
@@ -449,7 +452,7 @@ def host_port(address: str) -> tuple[str, int]:
 
 
 def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
-    """Change a key as a command of an SPI requests. Return the problem, or an empty text on success."""
+    """Change a key on request of a command that arrived under `spi`. Return the problem, or "" on success."""
     if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
         return f"there is no SPI {change.spi}"
     if not may_change(spi, change.spi):
@@ -493,7 +496,7 @@ class StationSettings:
         renewal: status file that `deploy/renewal.py` writes.
         idle_rate: data rate (bytes/s) up to which frames of idle data are sent.
         encrypted: whether telemetry is encrypted in addition to its authentication.
-        codes: codes of the lines, which count the corrected errors.
+        codes: encoders and decoders of the lines; the decoders count corrected errors.
     """
 
     spacecraft: int
@@ -678,9 +681,9 @@ class Station:
         self._hand_over(sent, admitted.data, now_ns)
 
     def _joined(self, admitted: Admitted) -> Admitted:
-        """Return a frame's content; after the last portion of a packet, the content has the whole packet.
+        """Return the content of a frame, or the whole packet if the frame contains its last segment.
 
-        Raises CommandError for a portion that does not follow the portion before it.
+        Raises CommandError if an earlier segment is missing.
         """
         if is_unit(admitted.data, UP) or not isinstance(portion := directives.unpack(admitted.data), Portion):
             return admitted
@@ -710,7 +713,7 @@ class Station:
         request = request_of(admitted.data)
         done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
         self._report(replace(done, stage=Stage.ACCEPTED))
-        # Nothing is executed after a portion of a packet whose last portion has not arrived.
+        # A packet in segments is executed only after its last segment has arrived.
         reports = [done] if isinstance(directive, Portion) else self._executed(directive, done)
         own = [one.stage for one in reports if (one.spi, one.counter) == (done.spi, done.counter)]
         self._refused_commands += Stage.FAILED in own
@@ -734,7 +737,7 @@ class Station:
                 return self._filing.obey(directive, done, self._utc_ns(), self._clock.now_ns())
 
     def _renew(self, directive: Privileged, done: Report) -> list[Report]:
-        """Hand a directive over to the privileged part, which reports its completion."""
+        """Hand a directive over to the privileged `deploy/renewal.py`, which reports its completion."""
         request = partial(self._renewal.request, directive, done, self._clock.now_ns())
         handed_over = replace(done, stage=Stage.STARTED, text=f"{directive}: handed over")
         if isinstance(directive, Activate):
@@ -756,9 +759,10 @@ class Station:
             self._downlink.live(self._log.label)
 
     def _follow_utc(self, label: bytes, mission_offset_ns: int) -> None:
-        """Update the newest run packet, and the offset (ns) of mission time from the host's clock.
+        """Update the newest run packet, and the offset (ns) of the flight's UTC from the host's clock.
 
-        Packets are written to the log with a delay, so the largest difference is the most accurate one.
+        Each packet gives an offset that is too small by the packet's delay in the log, so the largest offset
+        is the most accurate one.
         """
         if label != self._label:
             self._label, self._utc_offset_ns = label, None

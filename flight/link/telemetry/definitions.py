@@ -58,13 +58,13 @@ TABLES: States = ((0, "configuration"), (1, "loaded"))
 MODES: States = tuple((int(mode), mode.label) for mode in Mode)
 SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
-"""States of the use of the coils (`flight.loop.body.SteeringState`)."""
+"""How the control loop uses the coils (`flight.loop.body.SteeringState`)."""
 STREAMS: States = tuple(
     enumerate(("not-fitted", "never", "stale", "invalid", "slow", "good", "no-reading-yet"))
 )
-"""States of the quality of a stream of readings (`flight.loop.facts.StreamState`)."""
+"""Quality levels of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
-"""States of the quality of the attitude estimate (`flight.bodies.orbit.body`)."""
+"""Accuracy levels of the attitude estimate (`flight.bodies.orbit.body`)."""
 COILS: States = tuple(enumerate(COIL_NAMES))
 """Torque coils in the order of the configuration."""
 STAGES: States = tuple(enumerate(("accepted", "refused", "started", "completed", "failed", "repeated"), 1))
