@@ -38,7 +38,8 @@ _COMPILING = (
     f"({_SWITCH}=0 avoids it)"
 )
 _helpers: list[Callable[..., Any]] = []
-"""Functions that loop forms call and that numba has not compiled yet."""
+"""Functions that numba has not compiled yet and that are called by loop forms (plain Python loops for
+numba)."""
 
 
 class HotFunction(Generic[Parameters, Result]):
@@ -94,17 +95,18 @@ def compiled_form_of(
     """Return the decorator that combines a loop form with its numpy form.
 
     The loop form has only positional arguments, which are arrays and numbers. It may call only numpy
-    functions that numba supports, and functions of the same module that `loop_helper` decorates. It must not
-    use constants of other modules, because numba renews the cached compiled form only if the module of the
-    loop form changes.
+    functions that numba supports, and functions of the same module that `loop_helper` decorates. The loop
+    form must not use constants of other modules: numba compiles a cached function again only if the
+    function's own module changes, so the cached function would keep an outdated constant.
     """
     return lambda loop_form: HotFunction(numpy_form, loop_form)
 
 
 def loop_helper(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a function that loop forms of the same module call, and return it unchanged.
+    """Return `function` unchanged, after marking it for compilation with the loop forms of the same module.
 
-    The compiled form of a helper may compute sums in any order.
+    A loop form is a function with plain Python loops that numba compiles, and may call marked functions. The
+    compiled form of a marked function may compute sums in any order.
     """
     _helpers.append(function)
     return function

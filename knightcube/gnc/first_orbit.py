@@ -148,8 +148,9 @@ class FirstOrbit:
             orbit are not included.
         distance: distance of the object from the observer at the time of the state, m.
         interval: ends of the 95 % confidence interval of the distance, m.
-        lasts: whether this most likely orbit is bound to the Earth and does not hit the Earth. If `lasts` is
-            false, another orbit in the distance interval is bound and does not hit the Earth.
+        lasts: whether the orbit `state`, the most likely one, is bound to the Earth and does not hit the
+            Earth. If `lasts` is false, at least one other orbit with a distance in `interval` satisfies both
+            conditions.
         chi_square: chi-square of the sightings, with `degrees` degrees of freedom.
         degrees: number of degrees of freedom of the chi-square.
     """
@@ -215,8 +216,9 @@ def _within(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the interval of distances in which chi-square is less than `_DEGREES_95` above its minimum.
 
-    The first result is the pair of the outermost scanned distances inside the interval, and the second result
-    is the pair of the interpolated ends of the interval.
+    The arguments are the `logarithms` of the tried distances and the chi-square at each of them. The first
+    result contains the smallest and the largest tried logarithm inside the interval. The second result
+    contains the two ends of the interval, interpolated between tried logarithms.
     """
     excess = chi_square - chi_square.min() - _DEGREES_95
     first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])
@@ -233,8 +235,8 @@ def _within(
 def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -> str:
     """Return the message for an arc (s) that is too short.
 
-    The argument `lasting` contains the logarithms of the distances whose orbits are bound to the Earth and do
-    not hit the Earth.
+    The argument `lasting` contains the logarithms of those tried distances at which the fitted orbit is bound
+    to the Earth and does not hit the Earth.
     """
     low, high = (1e-3 * math.exp(end) for end in interval)
     text = f"the arc of {arc:.0f} s is too short: the distance is {low:.3g} to {high:.3g} km (95 %)"
@@ -316,7 +318,7 @@ class _ArcFit:
         for _ in range(_FINAL_ROUNDS):
             residual, jacobian = self._linear(unknowns[None])
             (step,), (covariance,) = _solved(residual, jacobian)
-            # Shorten steps for which the fit is not linear in the logarithm of the distance.
+            # Shorten long steps of the logarithm of the distance, over which the fit is not linear.
             unknowns = unknowns - step * min(1.0, 0.3 / max(abs(float(step[5])), 1e-12))
             if abs(float(step[5])) < 1e-4 * math.sqrt(float(covariance[5, 5])):
                 break

@@ -29,7 +29,7 @@ The solvers are:
   and Mortari, Quaternion attitude estimation using vector observations, Journal of the Astronautical Sciences
   48 (2000).
 
-- FOAM: The attitude matrix follows from a closed formula (Michalski, section 3.4.6). The reference is
+- FOAM: The attitude matrix follows from a closed-form expression (Michalski, section 3.4.6). The reference is
   Markley, Attitude determination using vector observations: a fast optimal matrix algorithm, Journal of the
   Astronautical Sciences 41 (1993).
 
@@ -274,7 +274,7 @@ def predictive(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -
 
 
 def triad(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the TRIAD attitude of the best pair of directions, with the loss of all directions.
+    """Return the TRIAD attitude of the best pair of directions, with Wahba's loss summed over all directions.
 
     The arguments and exceptions are those of `Solver`.
     """

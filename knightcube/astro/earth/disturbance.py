@@ -126,7 +126,7 @@ def shapes(found: Pressures, to_body: FloatArray) -> FloatArray:
     """Return the derivatives (n, 3, 9) of the torque in body axes with respect to the torque components.
 
     Args:
-        found: pressures multiplied by the exposed areas.
+        found: pressure vectors of air and sunlight, each multiplied by the body's exposed area.
         to_body: (n, 3, 3) attitude matrices from ICRS to body axes.
     """
     torque = np.empty((len(to_body), 3, SIZES))

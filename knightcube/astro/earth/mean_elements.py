@@ -35,8 +35,9 @@ number of fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
 """Eccentricity of the initial guess, and relative step of the numerical derivatives.
 
-SGP4 replaces eccentricities below 1e-6, so that the derivatives of a circular orbit would be wrong. The fit
-parameters are the components of the eccentricity vector plus 1, so that their steps are 1e-6.
+SGP4 replaces eccentricities below 1e-6. Smaller steps would therefore give wrong derivatives for a circular
+orbit. The fit adds 1 to each component of the eccentricity vector, so that a relative step of 1e-6 is also an
+absolute step of 1e-6.
 """
 _SOON = 10.0
 """Time (s) after the first state at which a second position is extrapolated from its velocity."""

@@ -33,7 +33,8 @@ _NEWTON_STEPS, _EXACT = 60, 1e-9
 """Largest number of Newton steps for limited currents, and relative accuracy of the resulting dipole
 moment."""
 _SATURATED = 1e-4
-"""Weight in the Newton matrix of a coil at its current limit, relative to a coil below its limit."""
+"""Weight, in the Newton matrix, of a coil whose current is at the limit, relative to a coil below its
+limit."""
 
 
 def coil_field(moment: FloatArray, offset: FloatArray, area: float | None = None) -> FloatArray:
@@ -120,9 +121,9 @@ class CoilMap:
     def working(self, used: BoolArray, assumed: float = 0.5) -> CoilMap:
         """Return the map of the working coils, with the limits and the heating power of these coils.
 
-        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed. The
-        allocation replaces a dipole moment along the normal by adding a dipole moment along the magnetic
-        field, which causes no torque. Raises UsageError if all working coils are parallel.
+        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed. To
+        produce the same torque without a dipole moment along the normal, the allocation adds a dipole moment
+        along the magnetic field, which causes no torque. Raises UsageError if all working coils are parallel.
 
         Args:
             used: flags (n,), true for the working coils.
@@ -204,7 +205,7 @@ class CoilMap:
         return np.asarray(self.dipoles @ currents)
 
     def per_dipole(self, matrix: FloatArray) -> FloatArray:
-        """Convert derivatives with respect to currents (k, n) into derivatives by the dipole (k, 3)."""
+        """Return derivatives (k, 3) with respect to the dipole from those with respect to currents (k, n)."""
         if self._strength is not None:
             return np.asarray(matrix / self._strength)
         return np.asarray(matrix @ self._inverse)
@@ -242,9 +243,10 @@ class CoilMap:
         normals = np.array([np.cross(one, other) for one, other in combinations(units.T, 2)])
         normals = normals[np.linalg.norm(normals, axis=1) > _PARALLEL]
         reached = np.abs(normals @ self.dipoles) @ self.current_limits
-        # The product of `use` and the box is the extent of the box towards each face of the zonotope, divided
-        # by the distance of the face from the centre. Each iteration scales the multiplier of a face by this
-        # relative extent, as in iterative proportional fitting.
+        # Each element of `use @ box` belongs to a face of the zonotope of possible dipole moments. The
+        # element is the largest component, along the normal of the face, of a point of the box, divided by
+        # the distance of the face from the centre. Each iteration scales the multiplier of a face by this
+        # ratio, as in iterative proportional fitting.
         use = np.abs(normals) / reached[:, None]
         multipliers = np.full(len(use), 3.0 / len(use))
         for _ in range(_STEPS):

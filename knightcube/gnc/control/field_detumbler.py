@@ -19,9 +19,9 @@ The momentum plan stops the body in the minimum time with the predicted field. I
 momentum h obeys h' = m x B, where m is the dipole moment and B the field. The equation h' = m x B contains
 neither inertia nor attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum
 magnitude L and the direction of -B x y, where the costate y is a constant vector. The momentum can be reduced
-to at most r within the time T if and only if every vector y satisfies
+to at most r within the time T if and only if every vector y satisfies the inequality
 
-    h . y <= L integral of |B x y| over T + r |y|,
+    h . y <= L (integral of |B x y| over the time T) + r |y|.
 
 The minimum time is the smallest T for which every vector y satisfies this inequality, and the planned costate
 is the vector y for which both sides are equal. For the planned costate y, A(y) y is parallel to h, where A is
@@ -130,7 +130,7 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float | FloatA
 
 
 def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArray:
-    """Return the dipole moment (3,) without the component that increases a bounded quantity, as the rate.
+    """Return the dipole moment (3,) without the part that increases bounded quantities such as the rate.
 
     Each element (3,) of `grows` is the derivative of the growth rate of one quantity with respect to the
     dipole moment. The argument `grows` has at most two elements. No component of the result is larger than
@@ -145,7 +145,10 @@ def without_growth(dipole: FloatArray, grows: Sequence[FloatArray]) -> FloatArra
 
 
 def _orthogonal(dipole: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the part (3,) of a dipole moment orthogonal to a vector (3,), scaled to no larger components."""
+    """Return the part (3,) of a dipole moment that is orthogonal to a vector (3,).
+
+    The result is scaled down if one of its components would exceed the largest component of `dipole`.
+    """
     square = float(vector @ vector)
     if square == 0.0:
         return dipole
@@ -220,7 +223,7 @@ def _agree(predicted: FloatArray, measured: FloatArray) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FieldPreview:
-    """The predicted field of a momentum plan.
+    """The predicted magnetic field during a momentum plan, in the axes of the plan.
 
     Attributes:
         field: (n, 3) T.
@@ -281,11 +284,11 @@ LEFT = 0.9
 """Residual momentum of a plan, as a fraction of the momentum at which a body counts as detumbled."""
 FEW, SOON = 4.0, 5.0
 """Ratio of the momentum to the residual momentum of a plan, and duration (s), that define the last phase of
-detumbling. A momentum below FEW times the residual momentum of a plan is removed within SOON seconds if the
+detumbling. A momentum below 4 times (FEW) the residual momentum of a plan is removed within 5 s (SOON) if the
 momentum along the field is small."""
 KNOWN, KNOWN_SHARE = 2e-3, 0.1
-"""The upper bounds of rate and energy are set once the standard deviation of the least certain rate component
-is below KNOWN rad/s, or below KNOWN_SHARE of the rate."""
+"""Standard deviation of the least certain rate component below which the upper bounds of rate and energy are
+set: in rad/s (first value) or as a fraction of the rate (second value)."""
 _SECOND = 1e-9
 _ROUNDING = 1e-9
 """Relative rounding error of a scalar product that should be zero."""
@@ -328,7 +331,7 @@ class FieldDetumblerSettings:
 
 
 class FieldPrediction(NamedTuple):
-    """The magnetic field (n, 3), T, at the instants of a plan, in body axes or in other inertial axes."""
+    """The magnetic field (n, 3), T, predicted at the instants of a plan, in body axes or in inertial axes."""
 
     field: FloatArray
     in_body_axes: bool
@@ -417,7 +420,7 @@ class FieldDetumbler:
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole moment (3,), A m^2: zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
-        if self._filter.started:  # a filter that has not started is advanced by samples only
+        if self._filter.started:  # before the filter starts, only samples advance its time
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
@@ -431,7 +434,7 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Set the actual dipole moment (3,), A m^2, until the next command, if it is not as commanded."""
+        """Set the dipole moment (3,), A m^2, that actually acts until the next command."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole

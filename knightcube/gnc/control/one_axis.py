@@ -236,7 +236,8 @@ class ExcitationSettings:
 
     Attributes:
         current_share: largest current of the pulses and of the tracker, as a fraction of the coil's current
-            limit. At a fraction of one, the true current would differ from the commanded current.
+            limit. A fraction below 1 leaves a margin: at the current limit, the true current would differ
+            from the commanded current.
         largest_q2: largest quaternion component q2 to which the excitation may rotate the body.
         swing: duration of each free oscillation, s.
     """
@@ -312,7 +313,7 @@ class ExcitationController:
         return self._tracker.command(wanted, angle, rate, disturbance)
 
     def reset(self) -> None:
-        """Bring the body to rest again and abort a manoeuvre that has begun."""
+        """Abort a manoeuvre that has begun, and bring the body to rest again."""
         if self._phase is _Phase.MOVING:
             self._come_to_rest()
         self._resting = 0.0

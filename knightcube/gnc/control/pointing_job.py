@@ -77,7 +77,8 @@ PlanNear = Callable[[SlewTask, SlewPath], SlewPlan | None]
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Factor by which the dipole moment that has a cost of one is larger during a slew than otherwise."""
+"""Factor by which the dipole moment to which the linear-quadratic tracking assigns a cost of one is increased
+for slews."""
 LONGEST = 1_500.0
 """Longest duration of a slew, s. A slew must be shorter than a table, which also includes some time after the
 slew."""
@@ -90,10 +91,12 @@ END = 2_000.0
 lasts for this time. The weight is high because disturbance torques are poorly known before the slew, and the
 errors that they cause should be corrected by the end of the slew."""
 HOTTER = 1.1
-"""Largest ratio of the coil heat of a new plan to that of the present plan, for the remaining slew. A plan
-with more heat would correct a deviation for which the remaining time is too short."""
+"""Largest ratio of the coil heat of a new plan to that of the present plan, for the remaining slew. A new
+plan with more heat is rejected, because it would correct a deviation for which the remaining time is too
+short."""
 _INSIDE = 1e-6
-"""Angle (rad) by which a violated exclusion cone is narrowed in addition to the depth of the violation."""
+"""Additional angle (rad) by which a violated exclusion cone is narrowed, so that the path is outside the
+cone."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
 """If a slew rotates too fast, its duration is multiplied by the ratio of the rates and the first factor, but
 at most by the second factor. The third value is the largest number of trials."""
@@ -160,7 +163,7 @@ class RunningSlew:
 
     Attributes:
         path: path of the slew as last planned.
-        since: time (s) from the start of `path` to the origin of the job.
+        since: time (s) from the start of `path` to the job's time `origin_ns`.
     """
 
     path: SlewPath
@@ -222,9 +225,10 @@ def _task(
 def _slow_enough(
     wish: SlewRequest, task: SlewTask, fastest: float, near: SlewPath | None = None
 ) -> SlewPath | None:
-    """Return the path of a task, lengthened if the body would rotate too fast, or None if no path is found.
+    """Return a path of a task on which the body is slower than `fastest` rad/s, or None if none is found.
 
-    The search is warm-started from `near`, the path of a similar task.
+    The duration of the path is increased if necessary. The search is warm-started from `near`, the path of a
+    similar task.
     """
     plan, _ = wish.planners()
     for _ in range(_TRIALS):
@@ -389,7 +393,7 @@ def rest_table(job: PointingJob, wish: SlewRequest, running: RunningSlew) -> Poi
 
 
 def _propagated(job: PointingJob, running: RunningSlew) -> tuple[FloatArray, FloatArray]:
-    """Return the attitude (4,) and rate (3,), rad/s, predicted for LEAD s after the origin of a job.
+    """Return the attitude (4,) and rate (3,), rad/s, predicted for LEAD s after the job's time `origin_ns`.
 
     The body is expected to keep its present attitude error and rate error relative to the present path.
     """
@@ -438,7 +442,7 @@ does not depend on the duration of the initial guess."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectDirection:
-    """The direction (3,) of an object, ICRS, at the time `since` (s after a job's origin).
+    """The direction (3,) of an object, ICRS, at the time `since`, in s after the time `origin_ns` of the job.
 
     The vector `velocity` (3,), 1/s, is the relative velocity of the object divided by its distance, and zero
     for a fixed direction.
@@ -456,9 +460,10 @@ class ObjectDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingJob:
-    """A planning job from the orbit state, the attitude (4,) and the body rate (3,) rad/s at `origin_ns`.
+    """A planning job that begins with the given orbit state, attitude (4,) and body rate (3,), rad/s.
 
     Attributes:
+        origin_ns: time at which the orbit state, the attitude and the body rate are valid, ns.
         inertia: (3, 3) kg m^2.
         sizes: estimated components (9,) of the disturbance torques, N m.
         limit: mean dipole limit along each body axis, equal for all axes or (3,), A m^2.
@@ -497,7 +502,7 @@ def prepare() -> None:
 
 
 def run(job: PointingJob) -> PointingTable | None:
-    """Return the pointing table, whose times are in s after the origin of the job.
+    """Return the pointing table, whose times are in s after the job's time `origin_ns`.
 
     The result is None if the remaining part of a slew was to be replanned and the present plan should be
     kept. The computation takes about one second, two seconds with a slew, and a tenth of a second for the
@@ -525,7 +530,7 @@ def new_table(job: PointingJob) -> PointingTable:
     else:
         law = following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
     field, wanted = ahead.field_at(times), references(law, ahead, times)
-    # The initial guess lasts WAY times the time constant that follows from the weights.
+    # The duration of the initial guess is a multiple of the time constant that follows from the weights.
     strength = float(np.mean(np.linalg.norm(field, axis=1)))
     inertia = float(np.linalg.eigvalsh(job.inertia).max())
     square = strength * job.weights.dipole / (inertia * job.weights.turn)

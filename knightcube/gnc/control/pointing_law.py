@@ -1,4 +1,4 @@
-"""The pointing law, which computes a dipole moment from a table of gains, and the recovery from large errors.
+"""The pointing law (a dipole moment computed from a table of gains) and the recovery from large errors.
 
 The pointing law is linear in small rotations. With a large error, the pointing law would saturate the coils
 and could make a light body rotate faster than before. A new path is therefore planned if the body leaves the

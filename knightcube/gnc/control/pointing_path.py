@@ -79,7 +79,8 @@ class SweepCost:
         state: quadratic weights (n, 6, 6) of the errors.
         control: quadratic weights (n, controls) of the controls.
         state_slope, control_slope: linear weights of the errors (n, 6, columns) and of the controls (n,
-            controls, columns), with the columns of the error model's affine part.
+            controls, columns). Each column belongs to one source of errors, as in the affine part of the
+            error model.
     """
 
     state: FloatArray
@@ -108,8 +109,9 @@ def linearised(
 
     The magnetic field (n, 3), T, and the position (n, 3), m, are in ICRS axes. The dipole moment `dipole` (n,
     3), A m^2, is fixed in body axes, so the torque of this dipole depends on the rotation error. Each element
-    of `pressed` describes an aerodynamic or solar radiation torque by a vector (3,) in body axes (N m) and a
-    direction (n, 3) in ICRS axes, whose cross product is the torque.
+    of `pressed` describes an aerodynamic or solar radiation torque. The torque (N m) is the cross product of
+    the element's first part, a constant vector (3,) in body axes, and its second part, pressure directions
+    (n, 3) in ICRS axes.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -224,12 +226,12 @@ SWEEPS = 8
 """Largest number of linear-quadratic sweeps before the cost of a torque along the field is increased. After
 this number of sweeps, the best motion is used even if the sweeps have not converged."""
 SAVED = (0.05, 2e-3)
-"""Relative improvements of the cost by a sweep below which a stage ends. If a sweep improves the cost by less
-than the first value, the cost of a torque along the field is increased. If a sweep improves the cost by less
-than the second value, the sweeps at the largest cost end."""
+"""Relative improvements of the total cost by a sweep, below which a stage ends. If a sweep improves the total
+cost by less than the first value, the next stage begins, with an increased cost of a torque along the field.
+In the last stage, which has the cost `PROHIBITIVE`, the second value replaces the first value."""
 NEAR = math.radians(10.0)
-"""Largest angle (rad) between the first motion and the attitude law at which the sweeps do not need a torque
-along the field."""
+"""Angle (rad) between the first motion and the attitude law, up to which the linear-quadratic sweeps converge
+without an auxiliary torque along the field."""
 EXCESS = 3e-5
 """Amount (rad/s) by which the body rate exceeds the rate limit at a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
@@ -334,10 +336,11 @@ class PathCriterion:
     Attributes:
         state: weights (6, 6) of rotation and rate errors relative to the attitude law.
         dipole: weight of the squared dipole moment of each axis.
-        end: cost-to-go of following the attitude law after the path. The first column of the linear part of
-            `end` is for the attitude law and the expected torques, and each further column is for a unit of
-            one disturbance torque component.
-        shape: disturbance torques (n + 1, 3, 9) per unit of each component, axes of the commanded attitude.
+        end: cost-to-go of following the attitude law after the path. The linear part `end.slope` has one
+            column for the attitude law with the expected torques, and one further column per component of the
+            disturbance torques, per unit of that component.
+        shape: derivatives (n + 1, 3, 9) of the disturbance torque with respect to its 9 components, in the
+            body axes of the commanded attitude.
         fastest: rate above which the cost increases steeply (see `EXCESS`), rad/s.
     """
 
@@ -367,10 +370,10 @@ class PlannedMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGains:
-    """Feedback gains K (n, 4, 6) about a motion, and affine parts k (n, 4, columns) of the control.
+    """Feedback gains K (n, 4, 6) about a motion, and affine parts k (n, 4, columns) of the control law.
 
-    The first column of the affine parts is the change of the controls that improves the motion. Each further
-    column of the affine parts compensates a unit of one disturbance torque component.
+    The first column of k, subtracted from the controls of the motion, improves the motion. Each further
+    column of k compensates a unit of one component of the disturbance torques.
     """
 
     gain: FloatArray
@@ -424,7 +427,7 @@ def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) ->
 def _improved(
     expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> PlannedMotion:
-    """Return the best motion near a feasible motion, if a torque along the field has the cost `multiple`."""
+    """Return the best motion near a feasible motion; `multiple` is the cost of a torque along the field."""
     cost = _cost(expected, motion, criterion, multiple)
     enough = SAVED[multiple == PROHIBITIVE]
     for _ in range(SWEEPS):
@@ -445,7 +448,8 @@ def propagate(
 ) -> PlannedMotion | None:
     """Return the motion after applying the feedback gains and a fraction `share` of the computed change.
 
-    Returns None if the motion diverges, which unlimited torques along the field can cause far from `motion`.
+    Returns None if the motion diverges. Far from `motion`, the unlimited torques along the field can cause a
+    divergence.
     """
     count, step = len(motion.control), expected.step
     quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))
@@ -551,7 +555,7 @@ def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathC
 
 
 def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return the derivatives (n + 1, 6, 6) of attitude and rate errors with respect to changes of the motion.
+    """Return the derivatives (n + 1, 6, 6) of rotation and rate errors with respect to attitude and rate.
 
     The rotation block of the derivatives is the inverse left Jacobian of the rotation group, for scalar-last
     quaternions from inertial into body axes.

@@ -376,7 +376,7 @@ class PointingPreview:
             necessarily feasible.
         field, position: magnetic field (T) and position (m), each (m, 3), ICRS.
         pressures: pressure vectors of air and sunlight at the m instants.
-        sizes: present estimates (9,) of the components of the disturbance torques, N m.
+        sizes: presently estimated components (9,) of the disturbance torques, N m.
     """
 
     wanted: AttitudeReferences

@@ -138,8 +138,8 @@ class ResidualDipole:
 
 
 AGREES = 0.2
-"""Largest relative difference between the fields of two coil pauses, after correction for the body's
-rotation."""
+"""Largest relative difference between the magnetic fields measured in two successive coil pauses, after
+correction for the body's rotation."""
 ROLL = 150.0
 """Cost of a torque normal to the Sun direction, relative to the cost of a torque about the Sun direction."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010

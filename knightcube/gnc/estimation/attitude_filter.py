@@ -8,20 +8,20 @@ filter therefore stores the attitude at the start of an exposure until the expos
 estimate the age of the inertial unit's samples (module `mekf`). For a body that hangs on the testbed's
 thread, the filter uses only the component of each measurement about the thread. The torsion and the damping
 of the thread are either known or estimated by the filter. The filter can distinguish the thread's torques
-from the estimated disturbance, because these torques depend on the angle and the rate.
+from the estimated disturbance, because only the thread's torques depend on the angle and the rate.
 
 The class `CommandCheck` compares the gyro samples with the commands to check whether the coils carry the
 commanded currents. While a coil is broken, the model predicts an acceleration that does not occur. With a
-broken coil, the innovations of the gyro exceed their covariance within a few samples. While the coils work,
-the innovations of the gyro stay within their covariance. If the innovations exceed their covariance, the
-filter treats the coil currents as unknown and follows the gyro. The coil currents of the last half second
-before the detection are also treated as unknown. A change of the rate that no coil current can cause is not
-evidence of wrong coil currents, because the gyro may be faulty. The commands are trusted again when the rate
-follows the commands. The model z = b + g c is fitted to the gyro samples z of the last second, where c is the
-change of the rate that the commands should cause. The commands are confirmed if the response g is well
-determined and is 1 within its uncertainty, and if the residuals are white. While the coils are not driven,
-the response is not determined, so the commands cannot become trusted again. If the gyro is noisier than
-assumed, the check increases its limits and does not raise an alarm.
+broken coil, the innovations of the gyro become inconsistent with their covariance within a few samples. While
+the coils work, the innovations of the gyro remain consistent with their covariance. If the innovations are
+inconsistent, the filter treats the coil currents as unknown and follows the gyro. The coil currents of the
+last half second before the detection are also treated as unknown. A change of the rate that no coil current
+can cause is not evidence of wrong coil currents, because the gyro may be faulty. The commands are trusted
+again when the rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the last
+second, where c is the change of the rate that the commands should cause. The commands are confirmed if the
+response g is well determined and is 1 within its uncertainty, and if the residuals are white. While the coils
+are not driven, the response is not determined, so the commands cannot become trusted again. If the gyro is
+noisier than assumed, the check increases its limits and does not raise an alarm.
 """
 
 from __future__ import annotations
@@ -68,11 +68,13 @@ _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
 strong fault is detected in one sample, a weak fault only in the mean of many samples. In flights without a
 fault, the means of 1, 4 and 16 samples reach 2.8, 4.0 and 7.0 standard deviations."""
 _BEFORE_NS = 500_000_000
-"""Time (ns) before the first contradictory sample from which the currents are treated as unknown. The earlier
-start corrects the effects of a weak fault on the other states before its detection."""
+"""Time (ns) before the first contradictory sample from which the currents are treated as unknown. A weak
+fault affects the other states of the filter before it is detected. The time before the sample is included to
+correct these effects."""
 _MAXIMUM_CHANGE = 3.0
 """Largest innovation that a coil fault can explain, as a multiple of the largest change of the rate by the
-coils. A reversed coil causes twice the change of the rate, and the uncertain age of a sample adds to this."""
+coils. A reversed coil causes an innovation of twice the commanded change, and the uncertain age of a sample
+increases the innovation further."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
 """Bounds of the time (s) between gyro samples during which wrong coil currents may have acted. If wrong
 currents were assumed to act for a longer time, they could explain any innovation after a long gap."""
@@ -94,7 +96,7 @@ class CommandCheck:
     """Check of the commanded coil currents against the gyro samples.
 
     Attributes:
-        active: whether the coils are suspected to carry other currents than commanded.
+        active: whether the coil currents are suspected to differ from the commanded currents.
         ended_ns: time at which the commands last became trusted again, ns.
     """
 
@@ -112,7 +114,8 @@ class CommandCheck:
     def judge(self, newest: Checkpoint) -> int | None:
         """Return the time (ns) from which the currents are unknown, if the newest checkpoint raises an alarm.
 
-        Return None without an alarm, and for a checkpoint of a measurement other than a gyro rate.
+        Return None if no alarm is raised. A checkpoint of a measurement other than a gyro rate never raises
+        one.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
@@ -311,7 +314,7 @@ def first_checkpoint(
 ) -> Checkpoint:
     """Return the filter's first checkpoint, whose time is that of the later of the two measurements.
 
-    For a suspended body, only the angle about the thread is used of the measured attitude.
+    For a suspended body, the measured attitude is reduced to the angle about the thread.
     """
     suspended, free = model.body.suspended, free_axes(model.body)
     a, b, c, d = attitude.quaternion.tolist()
@@ -366,7 +369,7 @@ class AttitudeFilter:
     REJECTIONS_AT_THE_START = 3
     """Number of consecutive rejections that restarts the filter while few measurements have been accepted.
 
-    The number is small because the initial state may be wrong.
+    This number of rejections is small, because a wrong initial state should be discarded early.
     """
 
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
@@ -559,8 +562,8 @@ class AttitudeFilter:
         enough = min(max(accepted, self.REJECTIONS_AT_THE_START), self.REJECTIONS_TO_RESTART)
         if kind is not MeanRateMeasurement and in_a_row >= enough:
             self._history.restart(None)
-            # The measurements contradict the prior, which a filter before the last boot may have estimated
-            # wrongly.
+            # The measurements contradict the prior. The prior may be a wrong estimate from before the last
+            # boot.
             self._prior = slow_prior(self._model.body, self._settings)
             self._layout = error_state(self._model.body, self._settings, self._prior)
             self._refused_in_a_row = {}

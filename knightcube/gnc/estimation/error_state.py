@@ -42,7 +42,7 @@ class StateBlock:
         prior: initial standard deviations (n,) or initial covariance (n, n).
         walk: standard deviations (n,) of the random walk per sqrt(s); a single number applies to all
             elements.
-        role: treatment of the block.
+        role: whether the block is estimated, considered or fixed.
     """
 
     name: str
@@ -177,11 +177,11 @@ def reset(covariance: FloatArray, at: slice, rotation: Sequence[float]) -> None:
 def keep_scale(covariance: FloatArray, at: slice, values: FloatArray, change: FloatArray) -> None:
     """Preserve, in place, the uncertainty of the common scale of some states when these are corrected.
 
-    If no measurement depends on the common scale, the unobservable direction in state space is the direction
-    of the states themselves, which the correction `change` (n,) rotates. The covariance is therefore adjusted
-    to the corrected direction. Without this adjustment, each correction would reduce the uncertainty of the
-    scale. The slice `at` of the error state contains the scaled states, whose `values` (m,) are those before
-    the correction.
+    If no measurement depends on the common scale, the vector of the scaled states is itself the unobservable
+    direction in state space. The correction `change` (n,) of the error state changes this direction, so the
+    covariance is adjusted to the new direction. Without this adjustment, each correction would reduce the
+    uncertainty of the scale. The scaled states are the slice `at` of the error state, and had the `values`
+    (m,) before the correction.
     """
     along = values / (values @ values)
     covariance += np.outer(change, along @ covariance[at])
@@ -197,7 +197,7 @@ def joined(covariance: FloatArray, by_states: FloatArray, first: FloatArray) -> 
     """Return the initial covariance (n, n) if attitude and rate depend on the other states.
 
     The derivatives of the errors of attitude and rate with respect to the states are `by_states` (6, n). The
-    covariance of attitude and rate for exactly known other states is `first` (6, 6).
+    matrix `first` (6, 6) is the covariance of attitude and rate if all other states are known exactly.
     """
     whole = covariance.copy()
     whole[:6] = by_states @ covariance
@@ -216,7 +216,8 @@ def plausible(values: FloatArray, variances: FloatArray) -> BoolArray:
 
 
 CONTRADICTED, PAUSE = 60.0, 600.0
-"""Time (s) over which innovations are evaluated, and time (s) after a contradiction without evaluation."""
+"""Time (s) over which innovations are evaluated, and time (s) after a contradiction during which innovations
+are ignored."""
 _LARGEST, _MEAN, _LEAST = chi_square.bound(0.001, 3), 5.0, 40
 """Upper limit to which squared innovations are clipped, largest mean of consistent squared innovations, and
 minimum number of innovations."""
@@ -281,8 +282,8 @@ def _inverted(s: FloatArray) -> FloatArray:
 def with_role(blocks: Sequence[StateBlock], roles: Mapping[str, Role]) -> list[StateBlock]:
     """Return the blocks of an error state with some roles replaced.
 
-    The mapping `roles` contains the new role of a block by the block's name. Raises UsageError if no block
-    has one of these names.
+    The mapping `roles` assigns new roles to names of blocks. Raises UsageError if no block has one of the
+    names.
     """
     unknown = sorted(roles.keys() - {block.name for block in blocks})
     if unknown:

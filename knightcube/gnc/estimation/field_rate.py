@@ -312,7 +312,7 @@ class FieldRate:
         self._rate, self._field, self._change = _floats(rate), _floats(last), _NONE
         along = np.outer(last, last) / square
         across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
-        # The rate across the field rotates about the field, in body axes, between the samples.
+        # Between the samples, the spin about the field rotates the perpendicular rate component in body axes.
         across += (float(rate @ rate) * span) ** 2
         self._covariance[RATE, RATE] = (
             across * np.eye(3) + (settings.rate_start**2 + float(rate @ rate)) * along

@@ -216,7 +216,7 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s) of the errors of coils and field, modelled as white noise, for a body at rest."""
+"""Correlation time (s) of coil errors and field errors of a body at rest, for the equivalent white noise."""
 CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
@@ -379,7 +379,7 @@ class FreeFilter:
     ) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        The prior of the slow states is `slow`, and by default follows from the settings.
+        The prior of the slowly varying states is `slow`, or by default the one of the settings.
         """
         self.motion = FreeMotion(inertia)
         self.layout = settings.error_state(inertia)
@@ -495,8 +495,8 @@ class FreeFilter:
         The estimate and its copies `memories` are changed. The reset is necessary after the sign or the gain
         of the coil was corrected, because the estimated matrix refers to the dipole before the correction.
         The error of the corrected dipole becomes zero, and its correlations with other states are deleted.
-        The standard deviation of the corrected dipole becomes that of the settings, and along the coil at
-        least `deviation`.
+        The settings give the new standard deviation of the corrected dipole, which along the coil is at least
+        `deviation`.
 
         Args:
             direction: unit vector (3,) of the coil, body axes.
@@ -532,7 +532,7 @@ class FreeFilter:
             whole[at, at] = covariance if estimated else 0.0
 
     def widen(self, at: IntArray, memories: Sequence[FreeMemory] = (), *, drop: bool = False) -> None:
-        """Reset the covariance of the slow states with the indices `at` (k,) to that of the settings.
+        """Reset the covariance of the states with indices `at` (k,) to the prior of the settings.
 
         The estimate and its copies `memories` are changed. The reset is necessary if measurements contradict
         the estimated values. Implausible values are set to zero. If `drop` is true, the estimated errors of
@@ -629,7 +629,7 @@ class FreeFilter:
         doubt: float = 0.0,
         uneven: FloatArray | None = None,
     ) -> None:
-        """Propagate by one or two `seconds` under the mean commanded dipole (3,) A m^2, body axes.
+        """Propagate over the time `seconds`, with the mean commanded dipole (3,), A m^2, in body axes.
 
         The value `doubt` (A m^2) is the standard deviation per axis of a dipole that may differ from the
         command. If the dipole changes during `seconds`, `uneven` (3,), A m^2 s^2, is the double time integral

@@ -84,10 +84,10 @@ def rate_change(
 ) -> RateChange:
     """Return the angular acceleration at a sample from the modelled accelerations before and after it.
 
-    The arguments `before` and `after` are the accelerations one standard deviation of the age before and
-    after the sample. The two accelerations differ if a coil command begins or ends between their times. Half
-    the difference of the two accelerations, and the product of the errors of age and acceleration, are
-    treated as noise.
+    The arguments `before` and `after` are the accelerations at two times, which precede and follow the sample
+    by the standard deviation of its age. The two accelerations differ if a coil command begins or ends
+    between their times. Half the difference of the two accelerations, and the product of the errors of age
+    and acceleration, are treated as noise.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
@@ -230,7 +230,7 @@ def weigh_innovation(found: Innovation, covariance: FloatArray) -> Weighed:
 def correct(
     state: FilterState, covariance: FloatArray, found: Innovation, weighed: Weighed
 ) -> tuple[FilterState, FloatArray]:
-    """Return corrected state and covariance. The gain of `weighed` may differ from the optimal gain."""
+    """Return corrected state and covariance. The gain `weighed.gain` need not be optimal."""
     error = weighed.gain.dot(found.value).tolist()
     covariance = updated(covariance, weighed.gain, weighed.cross, weighed.spread)
     for first in (0, *range(SIZE, len(covariance), 3)):
@@ -254,7 +254,7 @@ def correct(
 def keep_attitude(
     state: FilterState, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[FilterState, FloatArray]:
-    """Return state and covariance with the present attitude appended for an exposure that begins now."""
+    """Return state and covariance extended by a copy of the present attitude, as an exposure begins now."""
     pick = [*range(len(covariance)), 0, 1, 2]
     kept = (*state.kept, (measurement, state.quaternion))
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]

@@ -37,7 +37,7 @@ class CommandHistory:
     """The recent coil commands in order of time; no coil is driven before the first command.
 
     Attributes:
-        idle: state of the coils when no coil is driven.
+        idle: dipole moment and magnetic field (`Torquing`) while no coil is driven.
     """
 
     def __init__(self, body: RigidBody, history_ns: int) -> None:
@@ -134,10 +134,11 @@ class _Step(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PropagationModel:
-    """Body, process noise, coil commands, and gate thresholds by the degrees of freedom of a measurement.
+    """The model that propagates a state: body, process noise, coil commands, longest step (s) and gate.
 
-    The last steps are stored, because the propagation to the next measurement often repeats a step of the
-    previous estimate.
+    The mapping `gate` assigns the threshold of the normalised squared innovation to each number of measured
+    components. The last steps are stored, because the propagation to the next measurement often repeats a
+    step of the previous estimate.
     """
 
     body: RigidBody
@@ -275,7 +276,7 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Additional length (ns) of the history at which old checkpoints are dropped in a batch."""
+"""Time (ns) by which the oldest checkpoint exceeds the length of the history before a batch is dropped."""
 _TIME = attrgetter("time_ns")
 
 

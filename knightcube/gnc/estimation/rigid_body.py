@@ -79,9 +79,9 @@ class Accelerated(NamedTuple):
 class Linearised(NamedTuple):
     """Angular acceleration w' (rad/s^2) and its derivatives.
 
-    `by_attitude`, `by_rate` and `by_current` (3, 3) are the derivatives with respect to a small rotation
-    about the body axes, the rate and the coil currents (A). `by_parameters` (3, 3) are the derivatives with
-    respect to torsion, damping and gain.
+    `by_attitude`, `by_rate` and `by_current` (3, 3) are the derivatives of the angular acceleration with
+    respect to a small rotation about the body axes, to the rate and to the coil currents (A). `by_parameters`
+    (3, 3) are its derivatives with respect to torsion, damping and gain.
     """
 
     acceleration: Vector
@@ -188,7 +188,7 @@ class RigidBody:
     def accelerate(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing
     ) -> Accelerated:
-        """Return the angular acceleration under `torquing` at attitude q."""
+        """Return the angular acceleration at the attitude `q` for the coil state `torquing`."""
         torsion, damping, gain = parameters
         cx, cy, cz = times(self._response, cross(torquing.dipole, times(matrix(q), torquing.field)))
         fx, fy, fz = times(self._response, self._gyroscopic(rate))
@@ -215,8 +215,9 @@ class RigidBody:
 LONGEST_STEP = 0.025
 """Default of the longest propagation step (s), equal to the control period of the testbed."""
 _UNKNOWN_FOR = 0.3
-"""Correlation time (s) of an unknown coil current, which is modelled as white noise. The correlation time
-exceeds the delay after which the guardian switches off the coils of a hung control loop."""
+"""Correlation time (s) of an unknown coil current, which gives the spectral density of an equivalent white
+noise. The correlation time exceeds the delay after which the guardian switches off the coils of a hung
+control loop."""
 
 
 class ProcessNoise(NamedTuple):

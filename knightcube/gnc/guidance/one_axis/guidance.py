@@ -78,7 +78,7 @@ class PathGuidance:
     """The guidance that follows accepted paths towards the current target."""
 
     def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
-        """Create a guidance that checks plans with the model `plant` and the acceptance rules.
+        """Set up the guidance, which checks plans with the model `plant` and the acceptance rules.
 
         If `arrives` is true, paths must end at the target attitude, which is then held. If `arrives` is
         false, later plans normally replace a path before its end, so the path may end at another attitude.
