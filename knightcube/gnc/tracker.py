@@ -51,8 +51,8 @@ class FrameSightings:
         covariance: covariance (n, 3, 3) of the directions due to errors of the image positions, ICRS axes,
             rad^2; the attitude error is not included.
         magnitudes: magnitudes (n,) of the objects, calibrated by the stars in the frame, or NaN if unknown.
-        attitude: covariance (3, 3) of the attitude error, which rotates all directions of the frame, ICRS
-            axes, rad^2.
+        attitude: covariance (3, 3) of the attitude error, ICRS axes, rad^2. The attitude error rotates all
+            directions of a frame together.
         observer: position (3,) of the observer from the Earth's centre, ICRS, m, or None on the ground or if
             unknown.
     """
@@ -78,8 +78,8 @@ class MotionModel:
             angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
         residual_wander: noise density of the residual acceleration divided by the range if the gravity
             gradient is known, 1/s^3.
-        bend: standard deviation of the unmodelled change per second of (range rate) / range on curved paths,
-            divided by the squared angular rate.
+        bend: standard deviation of the unmodelled rate of change of the ratio (range rate) / range on curved
+            paths, as a multiple of the squared angular rate of the object.
     """
 
     rate: float = 0.01

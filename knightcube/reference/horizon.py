@@ -43,7 +43,7 @@ from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT
 
 
 def high_average(lines: Image) -> FloatArray:
-    """Return the average high intensity (n,) of scan lines (n, m).
+    """Return the mean (n,) of the high intensities of each scan line (n, m).
 
     Meller et al. do not define a high intensity. In this implementation, an intensity is high if it is at
     least the mean of the line's minimum and maximum.

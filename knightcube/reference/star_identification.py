@@ -181,7 +181,7 @@ class ScaledField:
 
 
 def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField]:
-    """Yield the field at image scales that cover the uncertainty of its scale, the most likely scale first.
+    """Yield the field at several image scales within the uncertainty of the scale, most likely scale first.
 
     Raises FieldUnknown if more scales are needed than the settings allow.
     """
@@ -728,8 +728,9 @@ class Method:
     """Method of star identification.
 
     Attributes:
-        identify: function that returns the identification of a field with the guide star tables of the sky.
-            The methods other than the default method raise FieldUnknown if the image scale is too uncertain.
+        identify: function that identifies the stars of a field by comparison with the guide star tables of
+            the sky. The methods other than the default method raise FieldUnknown if the image scale is too
+            uncertain.
         source: publication of the method.
     """
 

@@ -295,7 +295,7 @@ def process_noise(body: RigidBody, settings: FilterSettings, layout: ErrorState)
 
 
 def slow_prior(body: RigidBody, settings: FilterSettings) -> SlowPrior:
-    """Return the prior of the slow states before any measurement."""
+    """Return the prior of the slowly varying states before any measurement."""
     thread = (settings.torsion_start**2, settings.damping_start**2) if body.suspended else (0.0, 0.0)
     return SlowPrior(
         bias_covariance=np.diag(settings.bias_start**2 * free_axes(body)),
@@ -375,7 +375,7 @@ class AttitudeFilter:
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
         """Create a filter that has not started.
 
-        By default, and after each restart, the prior of the slow states follows from the settings.
+        By default, and after each restart, the prior of the slowly varying states follows from the settings.
         """
         self._settings = settings
         self._prior = prior or slow_prior(body, settings)

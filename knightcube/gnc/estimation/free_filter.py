@@ -466,7 +466,7 @@ class FreeFilter:
 
     @property
     def slow(self) -> SlowStates:
-        """The slow states and their covariance."""
+        """The slowly varying states and their covariance."""
         return SlowStates(self._constants[SLOW].copy(), self.covariance[SLOW, SLOW].copy())
 
     def memory(self) -> FreeMemory:

@@ -8,9 +8,9 @@ diameter of the circle. The cornerness is therefore the minimum, over all direct
 squared intensity changes from the centre to both ends of a diameter. Between the ends of two neighbouring
 diameters, the intensity is interpolated linearly with a parameter t from 0 to 1. With the squared changes r
 and r' along two neighbouring diameters, the squared change between the diameters is A t^2 + 2 B t + C with C
-= r and A = r' - r - 2B. The coefficient B is a sum over the two pairs of neighbouring ends of the two
-diameters. The coefficient B1 printed in Sease, eq. 3.12, is corrected, because it combines the wrong pairs of
-ends.
+= r and A = r' - r - 2B. The coefficient B is a sum of two terms. Each term belongs to two neighbouring ends,
+one of each diameter. The coefficient B1 printed in Sease, eq. 3.12, is corrected, because it combines the
+wrong pairs of ends.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from knightcube.reference.corner_streaks.settings import StreakSettings
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.streak_ends import StructureTensor, harris_cornerness, smoothed, tensor_of
 
-# Offsets (x, y) from the centre pixel to one end of each diameter, by the number of neighbour pixels.
+# For 4 and for 8 neighbour pixels: offset (x, y) from the centre pixel to one end of each diameter. A
+# diameter is a line through the centre pixel that ends at two opposite neighbours.
 _DIAMETERS = {4: ((1, 0), (0, 1)), 8: ((1, 0), (1, 1), (0, 1), (-1, 1))}
 
 
@@ -85,7 +86,8 @@ def trajkovic_response(
 def simple_response(image: FloatArray, neighbours: int) -> FloatArray:
     """Return the simple cornerness: the minimum squared intensity change over the diameters.
 
-    The diameters connect opposite pixels among 4 or 8 neighbours (Sease, eq. 3.9 and 3.10).
+    A diameter is a line through a pixel that ends at two opposite pixels of its 4 or 8 neighbours (Sease, eq.
+    3.9 and 3.10).
     """
     return np.asarray(np.min([changes.squared for changes in _changes(image, neighbours)], axis=0))
 

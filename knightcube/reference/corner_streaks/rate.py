@@ -80,7 +80,8 @@ def estimate_rate(
         return in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
     typical = _typical_length(segmented.regions, settings)
     if typical < settings.least_length:
-        # The streaks are very short, so that apparent long streaks are blends of stars.
+        # Most streaks are very short. Regions that look like long streaks are therefore blends of several
+        # stars.
         return replace(result, status=StreakStatus.TOO_SHORT, length=typical)
     return result
 
@@ -88,7 +89,7 @@ def estimate_rate(
 def _rate(
     streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
 ) -> StreakResult:
-    """Return the streak result `seen` with the rate, whose sign is unknown, or with the reason of failure."""
+    """Return the streak result `seen`, completed by the rate without sign or by the reason of the failure."""
     seen = replace(
         seen,
         endpoints=streaks.endpoints,

@@ -22,10 +22,10 @@ class StreakSettings(EndpointSettings):
     Attributes:
         saturated_fraction: fraction of saturated pixels above which a frame is rejected.
         detector: name of the corner detector.
-        coarse_relative: threshold T1 of Trajkovic's detector, relative to the largest simple cornerness at
-            half scale.
-        fine_relative: threshold T2 of Trajkovic's detector, relative to the largest simple cornerness at full
-            scale.
+        coarse_relative: threshold T1 of Trajkovic's detector for the image at half scale, relative to the
+            largest value of `detectors.simple_response` in this image.
+        fine_relative: threshold T2 of Trajkovic's detector for the image at full scale, relative to the
+            largest value of `detectors.simple_response` in this image.
         endpoint_bias_sigma: uncertainty of `endpoint_bias`, which is an error common to all streaks, px.
         axis_tolerance: tolerated error of an endpoint in the search for the rotation axis, px.
         outlier_sigmas: number of robust standard deviations above which a streak is rejected.

@@ -277,7 +277,10 @@ def lgl_rule(count: int) -> LglRule:
 
 @dataclass(frozen=True, slots=True)
 class CubicPrey:
-    """The cubic prey path q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3, with t in s (Sease, eq. (5.35))."""
+    """A cubic path q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3, with t in s (Sease, eq. (5.35)).
+
+    The cubic is the initial guess of a path (the prey path of virtual motion camouflage).
+    """
 
     c0: float
     c1: float
@@ -294,11 +297,11 @@ class CubicPrey:
         return cls(start, start_slope, c2, c3)
 
     def q2(self, time: FloatArray) -> FloatArray:
-        """Return the prey path q_p (n,) at `time` (n,), s (Sease, eq. (5.35))."""
+        """Return the values q_p (n,) of the cubic at `time` (n,), s (Sease, eq. (5.35))."""
         return np.asarray(self.c0 + time * (self.c1 + time * (self.c2 + time * self.c3)))
 
     def q2_rate(self, time: FloatArray) -> FloatArray:
-        """Return the derivative q_p' (n,), 1/s, of the prey path at `time` (n,), s (Sease, eq. (5.36))."""
+        """Return the derivatives q_p' (n,), 1/s, of the cubic at `time` (n,), s (Sease, eq. (5.36))."""
         return np.asarray(self.c1 + time * (2.0 * self.c2 + time * 3.0 * self.c3))
 
 

@@ -48,14 +48,14 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
 )
 
 ProgramAt = Callable[[float], PathProgram]
-"""Function that returns the nonlinear program for a duration (s), with variables whitened about the prey path
-of this duration."""
+"""Function that returns the nonlinear program for a duration (s). The variables are whitened about the
+initial guess of this duration (the prey path of virtual motion camouflage)."""
 
 SHORTEST_COST = 7.0
-"""Time cost, relative to the largest coil power R Imax^2, with which the shortest duration is found. An
-infinite time cost would give the bang-bang path, whose energy is up to 1 % above the optimum for the same
-duration. With SHORTEST_COST, the duration is about 0.3 % longer than the shortest duration, and the energy is
-within 0.25 % of the optimum."""
+"""Time cost in the search for the shortest duration, relative to the largest coil power R Imax^2. An infinite
+time cost would give the bang-bang path, whose energy is up to 1 % above the optimum for the same duration.
+With SHORTEST_COST, the duration is about 0.3 % longer than the shortest duration, and the energy is within
+0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
 """Largest factor by which a search with SHORTEST_COST may extend a feasible requested duration."""
@@ -64,8 +64,7 @@ _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
 ALONG_LIMIT = 0.99
-"""Ratio of the largest current or |q2| of a path to its limit, above which the path counts as reaching the
-limit."""
+"""Ratio of the current or of |q2| to its limit, above which a path counts as reaching the limit."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
@@ -81,8 +80,8 @@ class HorizonSearch:
 
     Attributes:
         program_at: function that returns the nonlinear program for a duration, s.
-        warm: difference (N,), on the nodes, between an earlier path and its prey path, for a warm start, or
-            None if the search starts from the prey path.
+        warm: correction (N,), on the nodes, that a warm start adds to the initial guess, or None without a
+            warm start. The correction is the difference between an earlier path and its own initial guess.
         evaluations: number of evaluations of the cost so far.
     """
 
@@ -175,7 +174,7 @@ class HorizonSearch:
     def _continued(
         self, failed: PathProgram, asked: float, longest: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return a path over at least `asked` s, by continuation from durations at which a path was found.
+        """Return a path of `asked` s or longer, found from a path of another duration in small steps.
 
         If the torque of the suspension thread exceeds the torque of the coil, only durations that fit the
         free oscillation of the body are feasible. From a duration with a known path, the duration is changed
@@ -203,7 +202,10 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program over `time` s, and a path within limits found from prey path plus `apart`."""
+        """Return the nonlinear program of the duration `time` (s), and a path within the limits or None.
+
+        The search starts from the initial guess plus the difference `apart` (N,) on the nodes, if given.
+        """
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
@@ -282,7 +284,8 @@ class StepPlan:
         peak_current: largest absolute coil current along the path, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
-        nu: path control parameters (N,) of virtual motion camouflage, for the prey path over `horizon`.
+        nu: path control parameters (N,) of virtual motion camouflage, relative to the initial guess (prey
+            path) of the duration `horizon`.
         node_times: (N,) s.
         node_q2: (N,).
     """
@@ -386,12 +389,13 @@ def plan(
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
-    """Return the difference (N,), on the nodes, between the remaining path of `last` and its prey path.
+    """Return the difference (N,), on the nodes, between the rest of the path `last` and its initial guess.
 
-    The result is None if nothing of the path remains.
+    The initial guess is the cubic with the same end states as the rest of the path. The result is None if
+    nothing of the path remains.
 
-    If the returned difference is added to a second prey path, the sum has the boundary states of the second
-    prey path.
+    If the returned difference is added to the initial guess of another path, the sum has the boundary states
+    of the other path.
     """
     if last is None:
         return None

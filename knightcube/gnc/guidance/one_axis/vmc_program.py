@@ -1,16 +1,17 @@
 """The nonlinear programs of virtual motion camouflage (Sease, eqs. (5.8) to (5.14)), solved with SLSQP.
 
-A path has the values q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey path and q_r the reference
-point (Sease, eqs. (5.10) to (5.12)). A path is the polynomial of degree N - 1 through the values on the
-nodes, so q2', q2'' and the current are also exact between nodes. The path control parameter v is 1 at both
-ends. The path control parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q, with the
+A path has the values q2 = q_r + v (q_p - q_r) on N nodes (Sease, eqs. (5.10) to (5.12)). In the terms of
+virtual motion camouflage, q_p is the prey path, which serves as the initial guess, q_r is the reference
+point, and v are the path control parameters. A path is the polynomial of degree N - 1 through the values on
+the nodes, so q2', q2'' and the current are also exact between nodes. The path control parameter v is 1 at
+both ends. The path control parameters v_2 and v_(N-1) follow from the boundary rates by q' = D q, with the
 differentiation matrix D (Sease, eq. (5.11), corrected). N - 4 path control parameters are free.
 
-The prey path is an affine function of the duration T (`horizon`), and for a fixed prey path the path is an
+The initial guess q_p is an affine function of the duration T (`horizon`), and for a fixed q_p the path is an
 affine function of v - 1. Paths are therefore parametrised as prey(T) + M y with a matrix M and parameters y.
-Each column of the matrix M is a whitened change of the path, scaled by (q_p - q_r), that preserves the values
-and slopes at both ends. Paths are therefore affine functions of the optimisation variables, and the
-optimisation is well conditioned.
+Each column of the matrix M is a change of the path that preserves the values and slopes at both ends. The
+changes are combined so that the energy has about a unit Hessian (whitening). Paths are therefore affine
+functions of the optimisation variables, and the optimisation is well conditioned.
 
 Two programs have the same energy and limits: one minimises the energy for a fixed duration, the other
 minimises the energy plus the time cost of a free duration. The limits hold at every time and not only at the
@@ -111,19 +112,21 @@ class BoundaryStates:
     end_slope: float
 
     def prey(self, horizon: float) -> CubicPrey:
-        """Return the cubic prey path between the boundary states over `horizon` s."""
+        """Return the cubic initial guess (prey path) between the boundary states over `horizon` s."""
         return CubicPrey.between(self.start, self.start_slope, self.end, self.end_slope, horizon)
 
 
 @dataclass(frozen=True, slots=True)
 class PathFamily:
-    """The paths still + T * drift + basis @ y of duration T between two states on N nodes, parameters y.
+    """A family of paths between two states, given on N nodes as affine functions of duration and parameters.
+
+    The path of duration T with the parameters y has the values `still` + T `drift` + `basis` y.
 
     Attributes:
         grid: pseudospectral discretisation of the paths.
-        still: part (N,) of the prey path with zero slopes at both ends, which does not depend on the
-            duration.
-        drift: change (N,) of the prey path per second of duration, due to the slopes at both ends.
+        still: values (N,), on the nodes, of the initial guess (prey path) with zero slopes at both ends,
+            which do not depend on the duration.
+        drift: change (N,) of the initial guess per second of duration, due to the slopes at both ends.
         basis: change (N, N - 4) of the values on the nodes per unit of each parameter.
     """
 
@@ -134,7 +137,7 @@ class PathFamily:
 
     @classmethod
     def around(cls, boundary: BoundaryStates, horizon: float, reference: float, count: int) -> PathFamily:
-        """Return the VMC paths around a prey path of `horizon` s, with parameters y = v - 1 at nodes."""
+        """Return the family of paths about the initial guess of `horizon` s, with parameters y = v - 1."""
         grid = discretisation(count)
         fraction = 0.5 * (grid.rule.nodes + 1.0)
         still = CubicPrey.between(boundary.start, 0.0, boundary.end, 0.0, 1.0).q2(fraction)
@@ -153,7 +156,7 @@ class PathFamily:
         return float(np.abs(self.still[[0, -1]]).max())
 
     def remixed(self, mixing: FloatArray) -> PathFamily:
-        """Return the family with new parameters y_new, where y_old = mixing (N - 4, N - 4) @ y_new."""
+        """Return the same paths with parameters y_new, where y_old = `mixing` (N - 4, N - 4) @ y_new."""
         return PathFamily(self.grid, self.still, self.drift, self.basis @ mixing)
 
     def nodes(self, parameters: FloatArray, horizon: float) -> FloatArray:
@@ -168,7 +171,7 @@ class PathFamily:
 
 @dataclass(frozen=True, slots=True)
 class ObservedFamily:
-    """A path family at m points: q2 and its derivatives by scaled time, affine in duration and parameters."""
+    """A family of paths at m points: q2 and the derivatives of q2 with respect to the scaled time."""
 
     still: FloatArray
     drift: FloatArray
@@ -181,8 +184,8 @@ class ObservedFamily:
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
         """Return the derivative (3, m) of q2, q2' and q2'' with respect to the duration.
 
-        A longer duration changes the prey path, and reduces the factors that convert derivatives with respect
-        to the scaled time s to time derivatives.
+        A longer duration changes the initial guess, and reduces the factors that convert derivatives with
+        respect to the scaled time s to time derivatives.
         """
         slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
         return np.asarray(self.drift + slower * trajectory)
@@ -254,7 +257,7 @@ class PathProgram:
     """The nonlinear program for a plant and a family of paths between two states, with cost and limits.
 
     Attributes:
-        family: paths between the two states, with parameters whitened about the prey path of the given
+        family: paths between the two states, with parameters whitened about the initial guess of the given
             duration.
         evaluations: number of evaluations of the cost, over all solutions.
     """
@@ -292,14 +295,14 @@ class PathProgram:
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
-        """Return the prey path over `horizon` s, for which all path control parameters are one."""
+        """Return the initial guess of `horizon` s, for which all path control parameters are one."""
         return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
         """Return the path family, rescaled so that the energy has a unit Gauss-Newton Hessian.
 
-        SLSQP starts with a unit matrix as Hessian, so the first step is the Gauss-Newton step at the prey
-        path.
+        SLSQP starts with a unit matrix as Hessian, so the first step from the initial guess (prey path) is
+        the Gauss-Newton step.
         """
         observed = family.observed(family.grid.cost)
         prey = observed.trajectory(np.zeros(family.size), horizon)
@@ -342,7 +345,10 @@ class PathProgram:
     def excess(
         self, limits: ImposedLimits, points: ObservedFamily, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return excesses (m,) over limits, their gradients (m, N - 4), and derivatives (m,) by duration."""
+        """Return the excesses (m,) over limits at m points, and the derivatives of the excesses.
+
+        The derivatives are (m, N - 4) with respect to the parameters and (m,) with respect to the duration.
+        """
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
         value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
@@ -360,11 +366,11 @@ class PathProgram:
         return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
 
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
-        """Return the sum of the prey path and the difference `apart` (N,) on the nodes."""
+        """Return the path that differs by `apart` (N,), on the nodes, from the initial guess."""
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def from_prey(self, trial: Trial) -> FloatArray:
-        """Return the difference (N,) on the nodes between a path and the prey path of the same duration."""
+        """Return the difference (N,) on the nodes between a path and the initial guess of its duration."""
         return np.asarray(self.family.basis @ trial.parameters)
 
     def unlimited(self, start: Trial) -> Trial | None:
@@ -468,7 +474,8 @@ class _Variables:
 
     Attributes:
         first: initial values of the variables.
-        root: scale factor of the logarithm of the duration; zero for a fixed duration.
+        root: change of log(T/T0) per unit of the variable that describes a free duration T; zero for a fixed
+            duration.
     """
 
     def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:
@@ -493,7 +500,11 @@ class _Variables:
 
 
 def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return chain-rule gradients (m, n) from slopes (3, m) by q2, q2', q2'', and the slopes of these."""
+    """Return the gradients (m, n) of functions of q2, q2' and q2'' at m points, by the chain rule.
+
+    The array `slopes` (3, m) contains the derivatives of the functions with respect to q2, q2' and q2''. The
+    array `basis` (3, m, n) contains the derivatives of q2, q2' and q2'' with respect to n parameters.
+    """
     return np.asarray((slopes[:, :, None] * basis).sum(axis=0))
 
 

@@ -10,7 +10,7 @@ about the first direction.
 The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
 `across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
 the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
-If the roll is free, the roll of the body when the attitude law begins is kept.
+If the roll is free, the body keeps the roll that it has when the attitude law begins.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def sun(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
 
 
 def inertial(vector: FloatArray) -> Direction:
-    """Return the function for a direction (3,) that is fixed in inertial axes."""
+    """Return the function of time that gives a direction (3,) fixed in inertial axes."""
     fixed = _unit(np.asarray(vector, dtype=float))
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
@@ -172,7 +172,10 @@ def inertial(vector: FloatArray) -> Direction:
 
 
 def orbital(vector: FloatArray) -> Direction:
-    """Return the function for a direction (3,) in orbital axes (along-track, minus normal, nadir)."""
+    """Return the function of time that gives a direction (3,) fixed in orbital axes.
+
+    The orbital axes are the along-track direction, the negative orbit normal and the nadir direction.
+    """
     fixed = _unit(np.asarray(vector, dtype=float))
 
     def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
@@ -182,7 +185,7 @@ def orbital(vector: FloatArray) -> Direction:
 
 
 def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
-    """Return the function for the direction to a point on the ground.
+    """Return the function of time that gives the direction from the satellite to a point on the ground.
 
     The geodetic coordinates are `latitude` and `longitude`, rad, and `height`, m above the WGS 84 ellipsoid.
     Raises UsageError for values out of range.
@@ -334,7 +337,7 @@ class BodyAxes:
 def law_of(
     target: PointingTarget, axes: BodyAxes, quaternion: FloatArray, ephemeris: Ephemeris, time: float
 ) -> Attitudes:
-    """Return the attitude law of a target; a free roll follows from an attitude (4,) at `time`, s."""
+    """Return the attitude law of a target. A free roll angle is taken from the attitude (4,) at `time`, s."""
     if target.goal is Goal.INERTIAL:
         fixed = normalise(np.array(target.numbers))
         return lambda _, times: np.broadcast_to(fixed, (len(times), 4))

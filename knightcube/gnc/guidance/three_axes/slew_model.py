@@ -127,9 +127,10 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the second derivatives (n, 4, 4), by q, of the scalar products of `pull` (n, 3) and A(q) v.
+    """Return the second derivatives (n, 4, 4) with respect to q of the scalar products of `pull` and A(q) v.
 
-    The second derivatives are twice Davenport's matrices.
+    The arguments are the vectors `pull` (n, 3) and v = `vector` (n, 3). The second derivatives are twice
+    Davenport's matrices.
     """
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
@@ -143,9 +144,10 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
 class SlewDynamics:
     """The equations of motion of a satellite at n times, with times in `scale` s and dipoles in `unit` A m^2.
 
-    The state derivative x' is a constant plus the quadratic form z^T H z / 2 of z = (m + residual, b, e, w,
-    q), where b and e are quadratic in q. A single matrix product therefore gives the derivatives at all
-    times.
+    The derivative x' of the state x = (q, w) is a constant plus the quadratic form z^T H z / 2 of z = (m +
+    residual, b, e, w, q). The dipole m, the magnetic field b, the scaled position direction e and the rate w
+    are in body axes, and b and e are quadratic in the attitude q. A single matrix product therefore gives the
+    derivatives at all times.
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
@@ -187,7 +189,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def curvature(self, x: FloatArray, m: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the second derivatives (n, 10, 10), by state and dipole, of x' weighted with `y` (n, 7)."""
+        """Return the second derivatives (n, 10, 10) of y^T x' with respect to states and dipoles."""
         z, turned = self._quantities(x, m)
         bend = (y @ self._quadratic.reshape(7, -1)).reshape(-1, _Z, _Z)
         parts = self._by_unknowns(turned)
@@ -198,7 +200,7 @@ class SlewDynamics:
         return np.asarray(result)
 
     def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return z = (m + residual, b, e, w, q) (n, 16), and the derivatives (n, 6, 4) of b and e by q."""
+        """Return the vectors z (n, 16), and the derivatives (n, 6, 4) of b and e with respect to q."""
         z, q = np.empty((len(x), _Z)), x[:, :4]
         turned = (self._forms.reshape(-1, 24, 4) @ q[:, :, None]).reshape(-1, 6, 4)
         z[:, _M], z[:, _W], z[:, _Q] = m + self._residual, x[:, 4:], q
@@ -224,7 +226,7 @@ _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
 def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
-    """Return second derivatives (n, 3, 4, 4), by attitude, of the accelerations due to air and sunlight."""
+    """Return second derivatives (n, 3, 4, 4), with respect to attitude, of air and sunlight accelerations."""
     count = len(around.field)
     result = np.zeros((count, 3, 4, 4))
     if around.pressures is not None:
@@ -285,7 +287,11 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return each time's fraction of its interval, and the interval's length, values and end slopes."""
+        """Return, for each time, the fraction of its interval before the time, and data of the interval.
+
+        The interval lies between two knots of the curve. The data are the length, the first value, the change
+        of the value, and the slopes at both ends.
+        """
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]
@@ -478,7 +484,7 @@ class EndConditions:
         return result
 
     def curvature(self, pull: FloatArray) -> FloatArray:
-        """Return the second derivatives (4, 4), by q, of the sum of the errors weighted with `pull`."""
+        """Return the second derivatives (4, 4) with respect to q of the errors' sum weighted with `pull`."""
         return np.asarray(np.tensordot(pull, self._forms, 1))
 
 

@@ -123,7 +123,7 @@ _DENSE = 16
 """Number of times, between a node and the next midpoint of a path, at which cones are checked."""
 _ROOM = math.radians(0.005)
 """Minimum angle (rad) between camera axis and exclusion cone at the checked times. Between two checked times,
-the angle to a cone decreases by less than this minimum."""
+the camera axis approaches a cone by less than this angle, and therefore does not enter the cone."""
 
 _OVER = 1.001
 """Largest ratio of the dipole to the dipole limit along an accepted path, after the correction."""
@@ -272,7 +272,7 @@ def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPla
 
 
 def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the angles (cones, n), rad, by which a path stays outside each cone at n close times."""
+    """Return the angles (cones, n), rad, from each cone to the camera axis at n closely spaced times."""
     dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
     shown = path.references(dense).quaternion
     return np.array([cone.clearance(shown, dense) for cone in task.cones]).reshape(-1, len(dense))
@@ -294,9 +294,9 @@ LEAD = 2.0 * DIFFERENCE
 """Time (s) by which the ephemeris must begin before the earliest start of a slew and end after the latest
 end, because rates are computed by central differences."""
 WINDOW_RANGE = (0.0, 2e4)
-"""Permitted range of the duration of the window of start times, s."""
+"""Shortest and longest permitted time window (s) in which a slew may begin."""
 _BEGINS = 12
-"""Number of equal intervals into which the compared start times divide a window."""
+"""Number of equal intervals between the start times that are compared in a window."""
 _COARSE = 12
 """Number of collocation intervals of the coarse plans by which start times are compared."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
@@ -310,7 +310,7 @@ class SlewOrder:
         craft: model of the satellite, in body axes.
         axes: body axis that points to the targets, and body axis from which a roll is measured.
         camera: body axis (3,) that stays outside the exclusion cones.
-        start: pointing target that is held until the slew begins; a free roll is set to zero.
+        start: pointing target that is held until the slew begins, with a roll of zero if its roll is free.
         goal: pointing target at the end; if its roll is free, only the direction of the target is an end
             condition.
         horizon, longest: requested and longest permitted duration of the slew, s.
@@ -349,7 +349,7 @@ class OrderedSlew:
         plan: planned path of the slew.
         begin: start of the slew, in s after the start of the ephemeris. In results of `knightcube.plan_slew`,
             `begin` is measured from the argument `time`.
-        compared: number of start times that were planned.
+        compared: number of start times for which a plan was attempted.
     """
 
     order: SlewOrder
@@ -383,7 +383,8 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
         except PlanningError as error:
             failed = error
         else:
-            # Plans are compared first by the extension of the duration, then by the cost.
+            # Plans are compared first by the duration, if it exceeds the requested duration, and then by the
+            # cost.
             if order.time_cost is None:
                 value = (plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0, plan.energy)
             elif math.isinf(order.time_cost):
@@ -420,7 +421,10 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
 
 
 def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: float) -> EndLaw:
-    """Return the end conditions by duration, for slews from `begin` s after the start of the ephemeris."""
+    """Return the end conditions as a function of the duration, for slews that begin at the time `begin`.
+
+    The time `begin` is in s after the start of the ephemeris.
+    """
     axis = axes.pointing
     if goal.goal is not Goal.INERTIAL and goal.roll is None:
         direction, _ = directions_of(goal)
@@ -482,7 +486,7 @@ def plan_slew(
         heat: heating power of the coils per squared dipole moment (3, 3), W/(A m^2)^2, or its diagonal (3,).
         elements: two lines of the two-line element set of the orbit.
         time: UTC at the start of the slew or of the window, as a datetime without a time zone.
-        start: pointing target that is held until the slew begins; a free roll is set to zero.
+        start: pointing target that is held until the slew begins, with a roll of zero if its roll is free.
         goal: pointing target at the end; if its roll is free, only the direction of the target is an end
             condition.
         duration: requested duration of the slew, s.

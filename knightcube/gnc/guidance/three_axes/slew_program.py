@@ -62,7 +62,8 @@ class BandLayout:
         end: indices (ends,) of the multipliers of the end conditions.
         begins: indices (k + 1,) of the first element of each interval and of the last node.
         places: indices, in the flattened band matrix, of the elements to which the intervals contribute.
-        entries: indices, in the flattened matrix block of one interval, of the elements copied to `places`.
+        entries: indices of those elements of the flattened matrix block of one interval that are copied to
+            `places`.
     """
 
     states: IntArray
@@ -371,10 +372,11 @@ class SlewLimits:
         return np.concatenate(found)
 
     def stiffness(self, at: Trajectory, stiff: FloatArray, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return second derivatives of the barrier by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
+        """Return the second derivatives of the barrier with respect to states and with respect to dipoles.
 
-        The weights of the products of first derivatives of the inequalities g are `stiff`, and the weights of
-        the second derivatives of g are `bent`.
+        The shapes are (2 k + 1, 7, 7) for the states and (k + 1, 3) for the dipoles. The second derivatives
+        of the barrier are weighted sums over the inequalities g. The products of the first derivatives of g
+        have the weights `stiff`, and the second derivatives of g have the weights `bent`.
         """
         dipoles, cones = self._parts(stiff, at)
         _, weights = self._parts(bent, at)
@@ -460,7 +462,7 @@ class SlewProgram:
         self.steps = 0
 
     def factors(self, point: Iterate) -> Factors:
-        """Return the factors of the Newton matrix of the smallest path change that removes the residuals.
+        """Return the factorised Newton matrix for the smallest change of a path that removes all residuals.
 
         The matrix omits the second derivatives of the equations, because a matrix with these derivatives
         would permit large steps near a flat optimum. Raises PlanningError if the matrix is singular.
@@ -579,7 +581,7 @@ class SlewProgram:
 
 
 class NewtonRun:
-    """An interior point iteration from an initial guess that can be interrupted and resumed.
+    """An interior point iteration that starts from an initial guess, and can be interrupted and resumed.
 
     Attributes:
         point: newest iterate of the interior point method.

@@ -65,8 +65,8 @@ _STEPS_FREE = 25
 """Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
 """Stages of an iteration with all limits: the number of Newton steps of each stage, and the constraint
-violation above which the iteration is abandoned after the stage. The bound of the first stage abandons half
-of the iterations that would fail, but only one in twenty of the iterations that would succeed."""
+violation above which the iteration is abandoned after the stage. After the first stage, half of the
+iterations that would fail are abandoned, but only one in twenty of the iterations that would succeed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -322,7 +322,7 @@ def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
 
 
 class _MomentumFit:
-    """A Levenberg-Marquardt fit of the modes of momentum curves, simultaneously from many random starts."""
+    """A Levenberg-Marquardt fit of mode amplitudes of momentum curves, from many random initial guesses."""
 
     def __init__(
         self,
@@ -386,7 +386,7 @@ class _MomentumFit:
         return to_rotation_vector(multiply(np.broadcast_to(end.quaternion, last.shape), conjugate(last)))
 
     def _cone_violations(self, q: FloatArray) -> FloatArray:
-        """Return the depths (m, cones * n) of m paths inside the cones, as differences of cosines."""
+        """Return the violations (m, cones * n) of the cones by m paths, as differences of cosines."""
         return np.maximum(0.0, _ROOM - self._kept.values(q[:, None, 1:])).reshape(len(q), -1)
 
     def _propagated(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -418,9 +418,9 @@ ENOUGH = 3
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors by which the requested duration is multiplied, one after the other, until a path is found."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Ratios of successive durations while a slew is shortened: in the first step, and at which shortening ends.
-The three pairs are for the coarse grid, for the fine grid, and for slews without a time cost on the fine
-grid."""
+"""Ratio by which the first step shortens a slew (first value), and ratio between the shortest duration with a
+path and the longest duration without a path below which the shortening ends (second value). The three pairs
+are for the coarse grid, for the fine grid, and for slews without a time cost on the fine grid."""
 _CROSSED = 1.3
 """Angle by which a cone that a path crosses between two points is widened, relative to the depth of the path
 inside the cone."""
@@ -430,8 +430,8 @@ _BETWEEN = 16
 """Number of intervals of an intermediate grid, used if a path from the coarse grid does not converge directly
 on the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
-"""Ratio of the integrated dipole to the dipole limit above which a path is abandoned, and additional factor
-by which the duration of other paths above the limit is extended."""
+"""Ratio of the dipole to the dipole limit above which an integrated path is abandoned (first value). The
+second value is an additional factor for the duration of a path whose dipole exceeds the limit by less."""
 _PEAK = 0.9
 """Ratio of the largest dipole to the dipole limit for which the first duration of the continuation is
 chosen."""
@@ -490,7 +490,7 @@ class HorizonContinuation:
         ]
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path for wider cones, found from a path that crosses cones between its points, or None.
+        """Return a path outside widened cones, found from a path that enters cones between points, or None.
 
         The array `depths` (cones, 2 nodes), rad, contains the largest depth inside each cone between two
         neighbouring points. The cones at the last point of the path are not widened.
@@ -565,7 +565,7 @@ class HorizonContinuation:
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
     def _begins(self, start: SolvedPath, shortest: float) -> list[float]:
-        """Return the durations, s, at which a continuation may begin, in increasing order."""
+        """Return the durations, s, at which the continuation of the path `start` may begin, ascending."""
         time = max(self._fastest(start), shortest)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
         if start.horizon == self._task.horizon and self._task.time_cost is None and start.horizon in times:
@@ -586,9 +586,9 @@ class HorizonContinuation:
 
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
 """Number of collocation intervals of each successive search, and its budget of work. When the work, measured
-in Newton steps times intervals, exceeds the budget, no further guess is tried. A work of 1,000 takes about
-0.1 s. Ten intervals are too coarse for paths around exclusion cones, because coarse paths around cones differ
-too much from paths on the fine grid."""
+in Newton steps times intervals, exceeds the budget, no further guess is tried. A search with a work of 1,000
+(in this unit) takes about 0.1 s. Ten intervals are too coarse for paths around exclusion cones, because
+coarse paths around cones differ too much from paths on the fine grid."""
 _WALKS = 1.8
 """Work, relative to the budget of a search, after which the continuation ends and returns the best path so
 far."""
@@ -597,12 +597,13 @@ _MAXIMUM_TRIED = 16
 _LOOK = 8
 """Number of Newton steps from a guess after which the constraint violation is checked for the first time."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
-"""Further stages of the iteration from a guess: the number of Newton steps of each stage, and the constraint
-violation above which the guess is deferred instead of starting the stage. After eight steps, the violation is
-below 1.5 for four of five successful guesses, and above 1.5 for three of four unsuccessful guesses (320
-guesses, seed 41 of the bench `orbit_slews`)."""
+"""Further stages of the iteration from a guess: the number of Newton steps of each stage, and the upper limit
+of the constraint violation at the start of the stage. If the violation is larger, the guess is deferred.
+After eight steps, the violation is below 1.5 for four of five successful guesses, and above 1.5 for three of
+four unsuccessful guesses (320 guesses, seed 41 of the bench `orbit_slews`)."""
 _STEPS_WITHOUT_PATH = 120
-"""Number of Newton steps without a path after which the remaining guesses for a duration are deferred."""
+"""Number of Newton steps after which, if no path was found, the remaining guesses for the same slew duration
+are deferred."""
 _WIDENED = 4
 """Maximum number of corrections of one path by widening cones or reducing dipoles."""
 
@@ -709,7 +710,7 @@ class SlewSearch:
             yield batch
 
     def _late(self, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield paths without the dipole limit from deferred guesses, the smallest violation first."""
+        """Yield paths found, without the dipole limit, from the deferred guesses, least violation first."""
         for descent in sorted(deferred, key=lambda descent: descent.lack):
             if self.solver.work > self._budget:
                 break

@@ -1,9 +1,10 @@
 """The planner of three-axis slews by virtual motion camouflage, solved with NLopt.
 
 The planner applies the method of Sease 2013, eqs. (5.8) to (5.15), to the three modified Rodrigues parameters
-of the attitude relative to the middle of a prey path. Each parameter is x = r + v (p - r), with the prey path
-p, a constant reference point r, and path control parameters v on N Legendre-Gauss-Lobatto nodes. Attitude and
-rate are given at both ends, so N - 4 path control parameters per axis are free.
+of the attitude, relative to the middle of an initial guess. Each parameter is x = r + v (p - r), with the
+initial guess p (the prey path of virtual motion camouflage), a constant reference point r, and path control
+parameters v on N Legendre-Gauss-Lobatto nodes. Attitude and rate are given at both ends, so N - 4 path
+control parameters per axis are free.
 
 The torque that a path needs is computed by inverse dynamics. Coils cause no torque along the magnetic field,
 so an equality constraint sets the component of the needed torque along the field to zero on all nodes. Of all
@@ -12,7 +13,7 @@ heat. Limits of the dipole moment and exclusion cones are imposed at those quadr
 previous solution exceeded a limit. When the dipole limit is reached, the planner does not reduce the largest
 component by adding a dipole moment along the field.
 
-The prey paths are the smooth rotation about the eigenaxis and the guesses of `slew_search`. The module
+The initial guesses are the smooth rotation about the eigenaxis and the guesses of `slew_search`. The module
 `slew_plan` corrects and integrates a solution in the same way as a path found by collocation, but the
 optimiser of the collocation is not used. Modified Rodrigues parameters are described by Schaub and Junkins,
 Analytical Mechanics of Space Systems, chapter 3.
@@ -71,16 +72,17 @@ Numbers = NDArray[Any]
 NODES = 28
 """Number of nodes of a path."""
 _REFERENCE = 2.0
-"""Reference point r of each modified Rodrigues parameter, which exceeds the parameters of all prey paths."""
+"""Reference point r of each modified Rodrigues parameter, which exceeds the parameters of all initial
+guesses."""
 _TRIED = 3
-"""Number of guesses of `slew_search` that serve as prey paths for one duration."""
+"""Number of guesses of `slew_search` that serve as initial guesses for one duration."""
 _AXES = np.arange(3)
 _STEP = 1e-30
 """Imaginary step of the complex-step derivatives, which have no rounding error."""
 _NEAR, _LOST, _EASED = 0.9, 1.1, 4
-"""Ratio of the dipole to the usable limit above which the limit is imposed (first value), ratio of the
-integrated dipole to the limit above which a path is abandoned (second value), and largest number of
-integrations with reduced usable limits (third value)."""
+"""The limit of the dipole is imposed at points where the dipole exceeds the first value times the usable
+limit. A path is abandoned if, after integration, its dipole exceeds the second value times the limit. The
+third value is the largest number of integrations; the usable limit is reduced after each of them."""
 _BESIDE = math.radians(0.1)
 """Angle (rad) by which exclusion cones are widened, because cones are not imposed between quadrature
 points."""
@@ -96,8 +98,8 @@ largest accepted excess over a limit (third value)."""
 def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     """Return the plan of least heat found for a slew task by virtual motion camouflage.
 
-    If `near`, the path of a similar task with the same duration, is given, it is the first prey path, and a
-    plan found with this prey path is returned immediately. Raises PlanningError with the reason if no path is
+    If `near`, the path of a similar task with the same duration, is given, it is the first initial guess, and
+    a plan found from this guess is returned immediately. Raises PlanningError with the reason if no path is
     found, and for a task with a time cost, because the planner does not optimise the duration.
     """
     plan = None if near is None else plan_near(task, near)
@@ -119,7 +121,7 @@ def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 
 
 def plan_near(task: SlewTask, near: SlewPath) -> SlewPlan | None:
-    """Return the plan found with the prey path `near`, which has the duration of the task, or None.
+    """Return the plan found from the initial guess `near`, which has the duration of the task, or None.
 
     Raises PlanningError for invalid values and for a task with a time cost.
     """
@@ -137,7 +139,7 @@ def _check(task: SlewTask) -> None:
 
 
 def prey_paths(task: SlewTask, horizon: float) -> Iterator[FloatArray]:
-    """Yield prey paths as states (n, 7) at equal steps, with rates in units of 1/`horizon`."""
+    """Yield initial guesses as states (n, 7) at equal time steps, with rates in units of 1/`horizon`."""
     search = SlewSearch(task, *GRIDS[0])
     equations = search.solver.equations(horizon, GRIDS[0][0])
     kept = search.solver.kept(equations)
@@ -166,7 +168,7 @@ def _end_attitude(end: End, near: FloatArray) -> FloatArray:
 
 
 def _planned(task: SlewTask, horizon: float, prey: FloatArray) -> SlewPlan | None:
-    """Return the integrated plan within all limits that is found with a prey path (n, 7), or None."""
+    """Return the integrated plan within all limits that is found from an initial guess (n, 7), or None."""
     try:
         program = VmcProgram(task, horizon, prey)
         parameters = program.solved(np.zeros(program.size))
@@ -219,7 +221,7 @@ def mrp_slopes(p: FloatArray, rate: FloatArray) -> FloatArray:
 
 
 class ObservedPaths:
-    """The paths about a prey path at n points: dipole moments, torques along the field, and cones."""
+    """A family of paths at n points: dipole moments, torques along the field, and distances from cones."""
 
     def __init__(
         self,
@@ -252,10 +254,10 @@ class ObservedPaths:
         return np.asarray(self._still + (self._basis @ y).transpose(0, 2, 1))
 
     def values(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return values (n, 4 + cones) of a path, and derivatives (n, 4 + cones, k) by the parameters y.
+        """Return values (n, 4 + cones) of a path, and their derivatives (n, 4 + cones, k) with respect to y.
 
-        The columns are the three dipole components, the dipole equivalent of the needed torque along the
-        field, and the values of the cones, which are positive outside the cones.
+        The columns are the three dipole components, the needed torque along the field divided by the field
+        strength, and a measure of the distance from each exclusion cone, which is positive outside the cone.
         """
         key = y.tobytes()
         if self._last is None or self._last[0] != key:
@@ -297,13 +299,13 @@ class ObservedPaths:
 
 
 class VmcProgram:
-    """The nonlinear program of a slew of `scale` s about a prey path; `evaluations` counts cost values."""
+    """The nonlinear program of a slew of `scale` s. The attribute `evaluations` counts cost evaluations."""
 
     def __init__(self, task: SlewTask, scale: float, prey: FloatArray, count: int = NODES) -> None:
-        """Set up the paths on `count` nodes about the prey path, which is given as states (n, 7).
+        """Set up a family of paths on `count` nodes about the initial guess `prey`, given as states (n, 7).
 
-        The attitudes and rates at both ends are those of the task. The parameters are whitened, so that the
-        heat has about a unit Hessian at the prey path.
+        The attitudes and rates at both ends are those of the task. The parameters are whitened: at the
+        initial guess, the Hessian of the heat is close to the unit matrix.
         """
         end = task.end(scale)
         q = prey[:, :4] * np.sign(prey[0, :4] @ task.quaternion)
@@ -352,7 +354,7 @@ class VmcProgram:
 
     @property
     def _along(self) -> float:
-        """The factor that makes the dipole equivalent of a torque along the field comparable to heat."""
+        """The square root of the mean heat per squared dipole, which weights the torque along the field."""
         return math.sqrt(float(np.trace(self._heat)) / 3.0)
 
     def trajectory(self, y: FloatArray, share: FloatArray) -> tuple[FloatArray, FloatArray]:
