@@ -69,7 +69,7 @@ ADDED = (
 
 
 def read(path: Path) -> Source:
-    """Return the columns of the parquet file `path`, or of the one in the Python wheel. Raises UsageError."""
+    """Return the columns of a parquet file, which may be a member of a Python wheel. Raises UsageError."""
     try:
         import pyarrow  # noqa: PLC0415 - needed for the build only, not on board
         import pyarrow.parquet  # noqa: PLC0415

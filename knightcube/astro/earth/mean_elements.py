@@ -35,9 +35,9 @@ number of fits."""
 _FIRST_ECCENTRICITY, _DIFFERENCE = 1e-3, 1e-6
 """Eccentricity of the initial guess, and relative step of the numerical derivatives.
 
-SGP4 replaces eccentricities below 1e-6. Smaller steps would therefore give wrong derivatives for a circular
-orbit. The fit adds 1 to each component of the eccentricity vector, so that a relative step of 1e-6 is also an
-absolute step of 1e-6.
+SGP4 replaces eccentricities below 1e-6. Steps below 1e-6 would therefore give wrong derivatives for a
+circular orbit. The fit adds 1 to each component of the eccentricity vector, so that a relative step of 1e-6
+is also an absolute step of 1e-6.
 """
 _SOON = 10.0
 """Time (s) after the first state at which a second position is extrapolated from its velocity."""

@@ -77,8 +77,7 @@ PlanNear = Callable[[SlewTask, SlewPath], SlewPlan | None]
 RESERVE = 0.8
 """Fraction of the coils' limit that a planned slew may use; the remainder is for the correction of errors."""
 STIFFER = 5.0
-"""Factor by which the dipole moment to which the linear-quadratic tracking assigns a cost of one is increased
-for slews."""
+"""Ratio of a dipole moment during a slew to the dipole moment that has the same cost at other times."""
 LONGEST = 1_500.0
 """Longest duration of a slew, s. A slew must be shorter than a table, which also includes some time after the
 slew."""
@@ -95,7 +94,7 @@ HOTTER = 1.1
 plan with more heat is rejected, because it would correct a deviation for which the remaining time is too
 short."""
 _INSIDE = 1e-6
-"""Additional angle (rad) by which a violated exclusion cone is narrowed, so that the path is outside the
+"""Additional reduction (rad) of the half angle of a violated exclusion cone, so that the path is outside the
 cone."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
 """If a slew rotates too fast, its duration is multiplied by the ratio of the rates and the first factor, but

@@ -203,7 +203,7 @@ def best_course(
 
 @dataclass(eq=False)
 class _Merit:
-    """The merit function by which motions are compared: the cost plus the weighted defects.
+    """The merit function for the comparison of motions: the cost plus the weighted defects.
 
     The errors of a step have the weights `state` (6, 6), and the dipole moment has the weight `dipole`. The
     defects of a step have the weights `dear` (6,).

@@ -379,7 +379,7 @@ class FreeFilter:
     ) -> None:
         """Use the assumed inertia tensor `inertia` (3, 3), kg m^2, body axes.
 
-        The prior of the slowly varying states is `slow`, or by default the one of the settings.
+        The prior of the slowly varying states is `slow`, or by default the prior of the settings.
         """
         self.motion = FreeMotion(inertia)
         self.layout = settings.error_state(inertia)

@@ -276,7 +276,8 @@ class Replay:
 
 
 _SPARE_NS = 1_000_000_000
-"""Time (ns) by which the oldest checkpoint exceeds the length of the history before a batch is dropped."""
+"""Excess (ns) of the age of the oldest checkpoint over the length of the history, above which all checkpoints
+older than the history are dropped."""
 _TIME = attrgetter("time_ns")
 
 

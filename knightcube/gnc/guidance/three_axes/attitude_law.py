@@ -41,7 +41,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTar
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 """Function that returns unit vectors (n, 3), ICRS, for an ephemeris and times (n,), s."""
 DIFFERENCE = 1.0
-"""Time step (s) of the central differences by which rate and acceleration are computed."""
+"""Time step (s) of the central differences from which rate and acceleration are computed."""
 MINIMUM_SINE = 1e-3
 """Smallest permitted sine of the angle between the two directions, because nearly parallel directions do not
 determine the roll."""

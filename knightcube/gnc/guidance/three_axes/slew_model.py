@@ -14,12 +14,12 @@ because A(q) v is a quadratic form of q whose second derivatives are twice Daven
 Paths are cubic Hermite curves (de Boor 1978, chapter IV). This module evaluates the curves, because
 scipy.interpolate would need 20 MiB of memory in each process that executes or plans a slew.
 
-The end of a slew is either an attitude, which gives three equations, or the direction of a boresight with a
-free roll, which gives two equations. The body rate at the end gives three more equations. All end conditions
-are quadratic in the quaternion. An exclusion cone is a cone about a direction, such as the direction to the
-Sun, that a body axis must not enter during the slew. Field, position, and the cones of Sun, Earth and Moon
-are computed along a predicted orbit. Times of a slew are relative to the start of the slew, which is `begin`
-s after the start of the ephemeris.
+The end of a slew is either an attitude, which gives three equations, or the direction of a boresight with an
+arbitrary roll, which gives two equations. The body rate at the end gives three more equations. All end
+conditions are quadratic in the quaternion. An exclusion cone is a cone about a direction, such as the
+direction to the Sun, that a body axis must not enter during the slew. Field, position, and the cones of Sun,
+Earth and Moon are computed along a predicted orbit. Times of a slew are relative to the start of the slew,
+which is `begin` s after the start of the ephemeris.
 """
 
 from __future__ import annotations
@@ -189,7 +189,10 @@ class SlewDynamics:
         return np.asarray(result)
 
     def curvature(self, x: FloatArray, m: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the second derivatives (n, 10, 10) of y^T x' with respect to states and dipoles."""
+        """Return the second derivatives (n, 10, 10) of y^T x' with respect to states and dipoles.
+
+        The vectors `y` (n, 7) are the weights of the components of the state derivatives x'.
+        """
         z, turned = self._quantities(x, m)
         bend = (y @ self._quadratic.reshape(7, -1)).reshape(-1, _Z, _Z)
         parts = self._by_unknowns(turned)
@@ -231,7 +234,8 @@ def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
     result = np.zeros((count, 3, 4, 4))
     if around.pressures is not None:
         for size, pressure in ((craft.air, around.pressures.air), (craft.light, around.pressures.light)):
-            rows = np.linalg.solve(craft.inertia, cross_matrices(size[None])[0])  # by the direction
+            # The rows are the derivatives of the acceleration with respect to the pressure vector.
+            rows = np.linalg.solve(craft.inertia, cross_matrices(size[None])[0])
             for row, pull in enumerate(rows):
                 result[:, row] += shown_curvature(np.broadcast_to(pull, (count, 3)), pressure)
     return result
@@ -379,7 +383,10 @@ class Cone:
     angle: float
 
     def clearance(self, q: FloatArray, times: FloatArray) -> FloatArray:
-        """Return the angles (n,) rad by which the axis lies outside the cone at attitudes (n, 4)."""
+        """Return the angles (n,), rad, from the cone to the axis at attitudes (n, 4).
+
+        The angle is negative if the axis lies inside the cone.
+        """
         cosine = shown(q, self.direction(times)) @ self.axis / np.sum(q * q, axis=1)
         return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)) - self.angle)
 
@@ -437,7 +444,7 @@ class AttitudeEnd:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoresightEnd:
-    """End of a slew at which body `axis` (3,) points to `direction` (3,), ICRS, with a free roll.
+    """End of a slew at which body `axis` (3,) points to `direction` (3,), ICRS, with an arbitrary roll.
 
     The body rate at the end, with all three components, is `rate` (3,), rad/s, ICRS axes.
     """
@@ -484,7 +491,10 @@ class EndConditions:
         return result
 
     def curvature(self, pull: FloatArray) -> FloatArray:
-        """Return the second derivatives (4, 4) with respect to q of the errors' sum weighted with `pull`."""
+        """Return the second derivatives (4, 4), with respect to q, of the weighted sum of the errors.
+
+        The weights are the elements of `pull` (n,).
+        """
         return np.asarray(np.tensordot(pull, self._forms, 1))
 
 

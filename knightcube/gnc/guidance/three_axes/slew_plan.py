@@ -272,7 +272,10 @@ def integrated(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPla
 
 
 def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the angles (cones, n), rad, from each cone to the camera axis at n closely spaced times."""
+    """Return the angles (cones, n), rad, from each cone to the camera axis at n closely spaced times.
+
+    The times cover the path. An angle is negative if the camera axis lies inside the cone.
+    """
     dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
     shown = path.references(dense).quaternion
     return np.array([cone.clearance(shown, dense) for cone in task.cones]).reshape(-1, len(dense))
@@ -298,7 +301,7 @@ WINDOW_RANGE = (0.0, 2e4)
 _BEGINS = 12
 """Number of equal intervals between the start times that are compared in a window."""
 _COARSE = 12
-"""Number of collocation intervals of the coarse plans by which start times are compared."""
+"""Number of collocation intervals of the coarse plans that serve to compare start times."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
 
 

@@ -645,7 +645,7 @@ class NewtonRun:
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:
-    """Return the largest fraction of `change`, at most one, by which positive `values` remain positive."""
+    """Return the largest fraction, at most one, of `change` that leaves the positive `values` positive."""
     falling = change < 0.0
     if not falling.any():
         return 1.0
