@@ -3,15 +3,15 @@
     found = detect_objects(image, camera, rate, exposure)
 
 In camera axes, all stars rotate about the same axis by the same angle. Three indicators show that a streak is
-not that of a star: the perpendicular bisector of its chord misses the common centre of rotation, the streak
-subtends a different angle at this centre, or its residual in the Optimal Linear Attitude Estimator (OLAE) is
-large (Sease, eq. (4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the boresight,
-the centre of rotation is almost at infinity in the image. If the centre of rotation is farther away than
-`_FARTHEST_CENTRE`, the slope and the length of the chord are used instead of the centre and the angle. In a
-wide field, the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is
-therefore compared with the indicator of a star at the same position, in units of the expected error of an
-endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the image (Sease, text at Table
-4.4), and also a minimum threshold, which was measured in images without objects.
+not the image of a star: the perpendicular bisector of its chord misses the common centre of rotation, the
+streak subtends a different angle at this centre, or its residual in the Optimal Linear Attitude Estimator
+(OLAE) is large (Sease, eq. (4.11) to (4.15), with corrections). If the rotation axis is nearly normal to the
+boresight, the centre of rotation is almost at infinity in the image. If the centre of rotation is farther
+away than `_FARTHEST_CENTRE`, the slope and the length of the chord are used instead of the centre and the
+angle. In a wide field, the pinhole projection changes slopes and lengths by far more than their errors. Each
+indicator is therefore compared with the indicator of a star at the same position, in units of the expected
+error of an endpoint. An indicator must exceed 2.5 standard deviations over the streaks of the image (Sease,
+text at Table 4.4), and also a minimum threshold, which was measured in images without objects.
 
 A streak with a large indicator may also be the overlapping streaks of two stars, or a segment of a faint
 star's streak ("overlapping streak" in Sease, Table 4.4). The class `Judge` tests whether stars alone explain
@@ -69,7 +69,7 @@ from knightcube.vision.objects.streak_ends import (
 from knightcube.vision.objects.streak_images import at_mid_exposure, star_path, star_paths
 
 INDICATORS = ("centre", "displacement", "residual")
-"""Names of the three indicators of a streak that is not that of a star."""
+"""Names of the three indicators of a non-stellar streak."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,8 @@ class Indicators:
     """The three indicators of n streaks, in the order of `INDICATORS`.
 
     Attributes:
-        endpoints: ends of the streaks (n, 2, 2), px, in the order in time that is valid for a star.
+        endpoints: ends of the streaks (n, 2, 2), px, in the order in which a star at the same position
+            reaches them.
         deviations: differences of the three indicators from those of a star at the same position (n, 3), in
             standard deviations.
         fired: which of the three indicators of each streak exceed their thresholds (n, 3).
@@ -165,7 +166,7 @@ def evaluate(
     bounds: tuple[float, float, float],
     strict: float = 2.5,
 ) -> Indicators:
-    """Return the indicators of streaks for a given rotation of the camera.
+    """Return the indicators of non-stellar streaks for a given rotation of the camera.
 
     Args:
         endpoints: ends of the streaks (n, 2, 2), px, corrected for bias, in any order.
@@ -344,15 +345,16 @@ _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided to compare their brightness.
 _PARTS = 12
 # Limits of the excess of chi-square (over its expected value) that remains with an object, relative to the
-# decrease of chi-square by the object. The first value limits the excess of chi-square beside every object.
-# The second value is a stricter limit for a uniform streak that resembles the streak of a star.
+# decrease of chi-square by the object. The first limit applies to every object. The second limit is stricter,
+# and applies to a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
 # Fraction of the required decrease of chi-square above which the light may be a part of an object's streak.
 _PART = 0.6
-# Largest relative excess of chi-square beside an object before its ends are located.
+# Largest excess of chi-square over its expected value, relative to the decrease of chi-square by a possible
+# object, for which the ends of the object are located.
 _HOPELESS = 4.0
-# Additional distance from a star's path, beyond its Gaussian profile, within which its light may exceed the
-# noise, in standard deviations of the PSF.
+# Margin (standard deviations of the PSF) added to the distance from a star's path at which the Gaussian
+# profile of the star falls below the noise.
 _DIM_SIGMAS = 2.0
 # Minimum distance (px) of the ends of a region from the image border for the region to be inside the image.
 _BORDER_PX = 2
@@ -385,7 +387,7 @@ def _light_beside_numpy(
         light: counts of the pixels (m,).
         ends: ends of the path (2, 2), px.
         half: displacement (2,) of the middle of the path from the middle of the chord, px.
-        reach: distance (px) from the path above which a pixel lies beside it.
+        reach: distance (px) from the path above which a pixel does not belong to the path.
     """
     chord = ends[1] - ends[0]
     length = max(float(np.linalg.norm(chord)), 1.0)
@@ -500,7 +502,7 @@ class Judge:
         return other >= self.objects.point_significance * noise * float(np.sqrt(count + 1.0))
 
     def _stars_fill(self, label: int) -> bool:
-        """Return whether few stars near the axis of a region explain all light of the region."""
+        """Return whether a few stars near the axis of a region explain all light of the region."""
         region = self._pixels_of(label)
         weight = np.maximum(self.segmented.signal[region[:, 1], region[:, 0]], 0.0).astype(np.float64)
         weight /= weight.sum()
@@ -522,10 +524,11 @@ class Judge:
     def merged(self, settled: IntArray, strange: IntArray, explained: IntArray) -> list[SpaceObject]:
         """Return the objects in regions in which objects and stars may be merged.
 
-        If few stars do not explain all light of a region, its stars are fitted. If the fitted stars do not
-        explain all light either, they are subtracted, and the brightest remaining light of the region is
-        tested. Regions whose label is in `settled` are not examined. Regions whose label is in `strange` are
-        examined first. Regions whose label is in `explained` contain only stars, and count as examined.
+        If a few trial stars do not explain all light of a region, stars are fitted to the region. If the
+        fitted stars do not explain all light either, they are subtracted, and the brightest remaining light
+        of the region is tested. Regions whose label is in `settled` are not examined. Regions whose label is
+        in `strange` are examined first. Regions whose label is in `explained` contain only stars, and count
+        as examined.
         """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
@@ -575,10 +578,11 @@ class Judge:
             return None
 
     def _only_stars(self, few: StarLight, enough: float) -> bool:
-        """Return whether few trial stars explain the pixels; then more trial stars need not be tested.
+        """Return whether a few trial stars explain the pixels; then more trial stars need not be tested.
 
-        Few stars explain the pixels if no object can decrease chi-square by `enough`. A good fit of stars and
-        an object has a chi-square of about one per pixel, so that the possible decrease is limited.
+        The trial stars explain the pixels if an additional object cannot decrease chi-square by `enough`. A
+        good fit of stars and an object has a chi-square of about one per pixel, so that the possible decrease
+        is limited.
         """
         calm = few.chi_square <= self.objects.worst_fit * few.pixels
         return few.chi_square - few.pixels < enough and calm
@@ -607,8 +611,8 @@ class Judge:
 
         If a streak differs from the streak of a star only near its ends, stars without an object fit most of
         its length nearly as well. For a `uniform` streak, it is therefore sufficient that the object explains
-        nearly all light that stars do not explain. A line that explains only a small part of the light
-        without stars is rejected.
+        nearly all light that stars do not explain. A line is rejected if it explains only a small part of the
+        light that remains after subtraction of the stars.
         """
         gained = self._gained(light, found)
         remains = found.chi_square - light.expected
@@ -636,11 +640,11 @@ class Judge:
         stars: Sequence[FloatArray],
         improvement: float,
     ) -> SpaceObject | None:
-        """Return the object between `ends`; its ends are in the order of the slower motion among the stars.
+        """Return the object between `ends`, with the order of its ends that gives the slower motion.
 
-        The ends are located by all light of the streak. If the known `stars` leave light along the streak,
-        the stars of the region are fitted. Returns None if the located streak is that of a star, or if stars
-        explain its pixels.
+        The motion is that relative to the stars. The ends are located from the light along the whole streak.
+        If the fit of the object along the streak is poor, the stars of the region are fitted and included.
+        Returns None if the located streak is that of a star, or if stars explain its pixels.
         """
         rough = light.explain(ends)
         gained = self._gained(light, rough)
@@ -689,11 +693,11 @@ class Judge:
         return best, light, found
 
     def begins_a_star(self, ends: FloatArray, flux: float) -> bool:
-        """Return whether a line between `ends` (2, 2), px, may be the part of a star beside other stars.
+        """Return whether a line between `ends` (2, 2), px, may be a segment of the streak of one star.
 
-        A line may be the part of a star if it lies on the path of a star that begins or ends at one end of
-        the line. The whole path must be at least about as bright as the line of `flux` counts, because other
-        stars cover the rest of the path.
+        A star is possible if its path begins or ends at one end of the line, and contains the other end. The
+        line has `flux` counts. The other segments of the star's streak may overlap other stars, so that the
+        whole path must be at least about as bright as the line.
         """
         length = max(float(np.linalg.norm(ends[1] - ends[0])), 1.0)
         directions = self.pinhole.unit_vectors(ends[[0, 0, 1, 1]])

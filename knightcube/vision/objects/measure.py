@@ -136,7 +136,8 @@ def _fit_object(
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])
     rows, columns = patch.light.shape
     for _ in range(_ROUNDS):
-        # The array `light` is the modelled image, and `by_unknown` (k, pixels) its derivatives by k unknowns.
+        # The array `light` is the modelled image, and `by_unknown` (k, pixels) contains its derivatives with
+        # respect to the k unknowns.
         path, share = _trail(unknowns[:2] - patch.corner, unknowns[2:4])
         both = np.stack([np.ones(len(share)), share])
         shape, *slopes = spread_with_slopes(path, both, columns, rows, patch.psf)
@@ -332,7 +333,7 @@ def measure_objects(
         exposure: exposure time, s.
         epoch: Julian year of the positions of the stars.
         velocity: velocity of the camera (3,), m/s, to correct aberration, or None for no correction.
-        detection: settings of the survey of the image.
+        detection: settings of the detection of bright areas in the image.
         settings: settings of the measurement of objects.
     """
     sky = solution.sky_map(velocity)
@@ -473,15 +474,15 @@ def measure_points(
     settings: ObjectMeasurementSettings,
     detection: DetectionSettings,
 ) -> FieldPoints:
-    """Return the points of light in a frame (rows, columns); objects may be marked as moving.
+    """Return the points of light in a frame, with moving objects marked if the stars are streaks.
 
     Args:
-        pixels: counts of the frame.
+        pixels: counts of the frame (rows, columns).
         camera: camera of the frame.
         exposure: exposure time, s.
         motion: motion of the camera over the exposure, from the streaks of the frame.
         settings: settings of the measurement of objects.
-        detection: settings of the survey of the frame.
+        detection: settings of the detection of bright areas in the frame.
     """
     moves = motion.status is StreakStatus.RATE and motion.rate is not None and motion.length >= STREAK_PX
     if moves and isinstance(motion, MotionResult) and motion.rate is not None:

@@ -17,7 +17,8 @@ class EndpointSettings:
     Attributes:
         threshold_sigmas: threshold for the sum of 3 x 3 pixels, in standard deviations of this sum; with 0
             the threshold is the image mean, as in Sease.
-        least_area: minimum number of pixels in a region. A noise peak fills nine pixels of the 3 x 3 sum.
+        least_area: minimum number of pixels in a region. A noise peak in one pixel raises the 3 x 3 sums of
+            nine pixels.
         most_streaks: maximum number of bright regions that are measured; the strongest are measured.
         saturation: counts at which a pixel saturates, or None for the maximum of the integer type.
         gain: electrons per count.

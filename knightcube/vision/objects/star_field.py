@@ -40,7 +40,7 @@ MOST_STARS = 600
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedFrame:
-    """The attitude of a frame relative to the stars of earlier frames, and which of its points are stars.
+    """The attitude of a frame relative to the stars of earlier frames, and a mask of the stars in the frame.
 
     Attributes:
         quaternion: attitude (4,) of the camera relative to the field.
@@ -66,11 +66,11 @@ class StarField:
         self._frame = self._failures = 0
 
     def locate(self, found: FieldPoints, predicted: FloatArray, sigma: float) -> LocatedFrame:
-        """Return the attitude of a frame relative to the field, and which of its points are stars.
+        """Return the attitude of a frame relative to the star field, and a mask of the stars in the frame.
 
         If fewer than three points are stars of the field, the field is not updated, and all points are
-        treated as stars. After three successive frames with fewer than three stars of the field, the field is
-        cleared and begins with a new frame.
+        treated as stars. If three successive frames have fewer than three stars of the field, all stars of
+        the field are removed, and the points of the third frame become the new field.
 
         Args:
             found: points of light in the frame.
@@ -146,8 +146,8 @@ class StarField:
 def _common_rotation(there: FloatArray, stars: FloatArray, quaternion: FloatArray) -> FloatArray:
     """Return the attitude (4,) corrected by the rotation that most pairs of directions (n, 3) have in common.
 
-    Each of the pairs proposes the smallest rotation that unites its two directions. The proposal that leaves
-    the smallest median distance is refined by least squares over the nearer half of the pairs.
+    Each pair proposes the smallest rotation that aligns its two directions. The proposal that leaves the
+    smallest median distance is refined by least squares over the nearer half of the pairs.
     """
     proposals = np.cross(there, stars)
     moved = there[None] + np.cross(proposals[:, None], there[None])
@@ -157,8 +157,8 @@ def _common_rotation(there: FloatArray, stars: FloatArray, quaternion: FloatArra
     turn = proposals[best]
     if np.count_nonzero(near) >= 2:
         first, second = there[near], stars[near]
-        # The variable `turn` is the least-squares solution of stars = there + e x there for the rotation
-        # vector e.
+        # The rotation vector e from the directions `first` in the frame to the directions `second` of the
+        # stars is the least-squares solution of second = first + e x first.
         normal = len(first) * np.eye(3) - first.T @ first
         turn = np.linalg.lstsq(normal, np.cross(first, second).sum(axis=0), rcond=1e-9)[0]
     return multiply(quaternion, from_rotation_vector(turn))

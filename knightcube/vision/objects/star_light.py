@@ -49,7 +49,7 @@ from knightcube.vision.objects.streak_images import (
 )
 
 PATHS_PER_LENGTH = 8
-"""Number of trial star paths per length of a star path, along a bright region."""
+"""Density of trial star paths along a bright region: the number of paths in one path length."""
 # Maximum length of a chain of successive star streaks in a bright region, in path lengths.
 _LONGEST_CHAIN = 5.0
 # Largest distance (px) between two paths that count as the same path.
@@ -59,7 +59,8 @@ _ROUNDS = 5
 # Minimum length (px) beyond each end of a streak over which its light is followed: in the first rounds, and
 # in later rounds.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
-# Distance (px) between an end and the end of the followed light above which the end is moved before the fit.
+# Distance (px) between the assumed end of a streak and the point where its light stops, above which the fit
+# of the ends starts from this point.
 _FOLLOWED = 1.5
 # Maximum number of Gauss-Newton steps of the ends in a round, and the step (px) that ends the fit.
 _END_FITS, _END_CONVERGED = 3, 0.05
@@ -128,12 +129,13 @@ class StarLight:
         gain: electrons per count.
         saturation: counts at which a pixel saturates; pixels within 5 % of this value have no weight.
         known: paths (m, 2), px, of known stars whose light also falls on the pixels.
-        per_length: number of trial star paths along the region, per length of a star path.
+        per_length: density of trial star paths along the region, as the number of paths in one path length.
 
     Attributes:
         chi_square: chi-square of the best-fitting sum of star streaks.
         pixels: number of pixels near the trial star paths and the lines between corners.
-        expected: expected chi-square of a correct model, which is below `pixels` where light is bright.
+        expected: expected chi-square of a correct model. For bright light it is less than `pixels`, because
+            the weights of bright pixels also allow for model errors.
 
     Raises:
         FlightError: if the least-squares solution of the brightnesses does not converge.
@@ -292,7 +294,8 @@ class StarLight:
         usual = float(np.median(light[inner])) if inner.any() else 0.0
         if usual <= 0.0:
             return None
-        # Twice the logarithm of the likelihood ratio of the usual brightness to darkness.
+        # Twice the logarithm of the likelihood ratio, at each point of the path, of light with the median
+        # brightness of the path to no light.
         gain = share * usual * (2.0 * light - usual)
         gain[light > _BRIGHTER * usual + 3.0 / np.sqrt(np.maximum(share, 1e-300))] = 0.0
         if len(self._known):
@@ -353,10 +356,10 @@ class StarLight:
         return LocatedEnds(ends, sigma, misfit)
 
     def excess(self, region: IntArray) -> float:
-        """Return the excess of chi-square of pixels and region over its expected value, without an object.
+        """Return chi-square of stars alone minus its expected value, on pixels near paths and in a region.
 
-        The light of pixels of the `region` (m, 2), px, in ascending rows and columns, that are not near any
-        trial path is not explained by stars.
+        The pixels of the `region` (m, 2), px, are in ascending order of rows and columns. The model of the
+        stars is zero on those pixels of the region that are not near any trial path.
         """
         columns = self._segmented.signal.shape[1]
         near, own = (each[:, 1] * columns + each[:, 0] for each in (self._near, region))
@@ -378,7 +381,7 @@ class StarLight:
         return brightness, min(chi_square, self.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
-        """Return the weighted image of a streak of one count along `path` (m, 2), px, on p pixels, (p,)."""
+        """Return the weighted image (p,) of a streak with one count in total along `path` (m, 2), px."""
         image = streak_images(self._near, path[None], self._psf_sigma, False)[0, 0]
         return np.asarray(image * self._weight)
 
@@ -415,8 +418,8 @@ def _around(inside: BoolArray, middle: int) -> IntArray:
 def _end_of_light(gain: FloatArray) -> tuple[float, float]:
     """Return the expected value of the last index with light, and its standard deviation.
 
-    The array `gain` (n,) contains twice the logarithm of the likelihood ratio of light to darkness at each
-    index.
+    The array `gain` (n,) contains, for each index, twice the logarithm of the likelihood ratio of light to no
+    light.
     """
     total = np.cumsum(gain)
     likelihood = np.exp(0.5 * (total - total.max()))
@@ -472,7 +475,8 @@ def _counts_at_numpy(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the counts (p,) above the background and the weights (p,) of pixels, and expected chi-square.
 
-    The expected chi-square is the sum of the shares of pixel noise and photon noise in the variances.
+    Each pixel contributes to the expected chi-square the fraction of its variance that is due to background
+    noise and photon noise.
 
     Args:
         image: counts above the background (rows, columns).
@@ -601,8 +605,8 @@ class Patch:
     def excess(self, left: FloatArray) -> float:
         """Return the excess of chi-square of the counts `left` in the region over its expected value.
 
-        The array `left` (rows, columns) is the signal without the light of a model. The returned value is
-        approximately the largest decrease of chi-square by any further model.
+        The array `left` (rows, columns) contains the counts that remain after a model is subtracted. The
+        returned value is approximately the largest decrease of chi-square by any further model.
         """
         weight = self.weight[self.mask]
         variance = self.noise**2 + np.maximum(self.signal[self.mask], 0.0) / self.gain
@@ -732,7 +736,7 @@ def _brightest_path_numpy(
 ) -> tuple[float, int, int]:
     """Return the result of `_brightest_path`."""
     rows, columns = seen.shape
-    # The image is framed by the values beyond it, so that no step leaves the array.
+    # The image is padded with the values `beyond`, so that all pixels of a path lie in the array.
     x, y = np.abs(steps).max(axis=0)
     framed = np.empty((rows + 2 * y, columns + 2 * x))
     framed[:y], framed[y + rows :] = beyond[0], beyond[1]
@@ -759,14 +763,15 @@ def _brightest_path(
 ) -> tuple[float, int, int]:
     """Return the largest minimum of an image along a path, and the column and row of the path's middle.
 
-    Returns minus infinity, -1 and -1 if the minimum is below the threshold for each position of the path.
+    Returns minus infinity, -1 and -1 if the minimum along the path is below the threshold at all positions of
+    the path.
 
     Args:
         seen: image (rows, columns).
         steps: pixels (x, y) of the path relative to its middle (k, 2).
-        factor: factors of the image at the pixels of the path (k,).
+        factor: factors by which the image is multiplied at the pixels of the path (k,).
         beyond: values above, below, left and right of the image (4,).
-        threshold: least minimum.
+        threshold: smallest accepted minimum along the path.
     """
     rows, columns = seen.shape
     best, best_column, best_row = -np.inf, -1, -1
@@ -851,7 +856,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 
 
 def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the ends (2, 2), px, of a line fitted by Gauss-Newton to the light `left` by the stars."""
+    """Return the ends (2, 2), px, of a line fitted by Gauss-Newton to the counts `left` without stars."""
     if np.any(ends[0] != ends[1]):
         return fitted_line(left, patch.weight, ends - patch.corner, patch.psf_sigma) + patch.corner
     size, reach = np.array(left.shape[::-1]), int(np.ceil(_WIDE_REACH * patch.psf_sigma))

@@ -8,8 +8,8 @@ intensity. The equations are those of Sease, where eq. (3.5), (3.15), (3.17) and
 the errata. Images have the shape (rows, columns), and points are (x, y) in px.
 
 The Gaussian kernels displace the peaks of the Harris response along the streak by a constant that depends on
-the point spread function. The function `extend` compensates the displacement of measured streak ends by the
-corner detector.
+the point spread function. The function `extend` moves the measured streak ends outward to compensate the
+displacement of the peaks.
 """
 
 from __future__ import annotations
@@ -372,9 +372,9 @@ def _corners_of_regions(
     relative: float,
     half_width: int,
 ) -> tuple[FloatArray, IntArray]:
-    """Return the corners (x, y) of n regions (m, 2), px, by their Harris response, and their numbers (n,).
+    """Return the positions (m, 2), px, of all corners in n regions, and the number of corners in each, (n,).
 
-    The response is computed near the pixels of the regions only.
+    Corners are peaks of the Harris response, which is computed only near the pixels of the regions.
 
     Args:
         signal: counts above the background (rows, columns).
@@ -662,7 +662,7 @@ def gaussian_kernel(sigma: float, radius: int) -> FloatArray:
 
 
 def gaussian_derivative_kernel(sigma: float, radius: int) -> FloatArray:
-    """Return the correlation kernel (2 radius + 1,) of the derivative of an image smoothed by `sigma` px.
+    """Return the kernel (2 radius + 1,), for correlation, that smooths by `sigma` px and differentiates.
 
     The outer product of the returned kernel and `gaussian_kernel` is the kernel of Sease, eq. (3.4), mirrored
     from convolution to correlation.

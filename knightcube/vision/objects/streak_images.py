@@ -32,7 +32,8 @@ _BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole: Pinhole) -> FloatArray:
     """Return points (m, 2), px, along the path of a star during the exposure.
 
-    The star is in the direction `direction` (3,), camera axes, after the fraction `start` of its path.
+    The argument `direction` (3,), camera axes, is the direction of the star when it has covered the fraction
+    `start` of its path.
     """
     return np.asarray(star_paths(direction[None], rotation, np.array([start]), pinhole)[0])
 
@@ -42,8 +43,8 @@ def star_paths(
 ) -> FloatArray:
     """Return points (n, m, 2), px, along the paths of n stars during the exposure.
 
-    Each star is in its direction of `directions` (n, 3), camera axes, after the fraction of `starts` (n,) of
-    its path. All paths have the number of points that the longest path requires.
+    The array `directions` (n, 3), camera axes, contains the direction of each star when it has covered the
+    fraction `starts` (n,) of its path. All paths have the number of points that the longest path requires.
     """
     return _paths_on_circles(directions, rotation, starts, pinhole.focal_length, *pinhole.centre)
 
@@ -139,9 +140,9 @@ def path_among_stars(
 ) -> FloatArray:
     """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
 
-    The assumed order of the ends in time is that of the slower motion relative to the stars. The points are
-    those after the given fractions `parts` (m,) of the motion from the first end to the second, or evenly
-    spaced points from the first end to the second.
+    The motion may begin at either end. The slower of the two possible motions relative to the stars is
+    assumed. The array `parts` (m,) contains the position of each point as a fraction of the motion, counted
+    from the first of the `ends`. If `parts` is None, the points are evenly spaced.
     """
     if parts is None:
         steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
@@ -246,7 +247,8 @@ def _pixels_near_numpy(points: FloatArray, reach: float, rows: int, columns: int
     points = points[inside].astype(np.int64)
     first = points.min(axis=0, initial=columns + rows) - r
     width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
-    # A map of the points is widened along its rows, and combined with shifted copies of itself to discs.
+    # The map of the points is widened along the rows by each half-width of a disc. Shifted along the columns
+    # and combined, the widened maps mark a disc around each point.
     lit = np.zeros((height, width), dtype=np.bool_)
     lit[points[:, 1] - first[1], points[:, 0] - first[0]] = True
     marked = np.zeros_like(lit)
@@ -345,7 +347,7 @@ _LEAST_POINTS = 4
 
 
 def streak_at(pixels: IntArray, path: FloatArray, sigma: float) -> FloatArray:
-    """Return the image of a streak of one count along `path` (m, 2), px, on the given pixels (p, 2), (p,).
+    """Return the image (p,), on `pixels` (p, 2), of a streak with one count in total along `path` (m, 2), px.
 
     See `streak_images`.
     """
@@ -431,7 +433,7 @@ def _add_streak_numpy(image: FloatArray, pixels: IntArray, path: FloatArray, sig
 
 @compiled_form_of(_streak_images_numpy)
 def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: bool) -> FloatArray:
-    """Return the images of streaks of one count along k paths, on p pixels, (k, 1, p) or (k, 3, p).
+    """Return images (k, 1, p) or (k, 3, p), on p pixels, of k streaks with one count in total each.
 
     The count is distributed evenly over the points of the path. The image is the product of the profiles
     across and along the path, which are blurred by a Gaussian with the standard deviation `sigma`, px, and by
@@ -442,8 +444,8 @@ def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: boo
         pixels: pixels (p, 2), row by row, on which the images are computed.
         paths: points of the paths (k, m, 2), px.
         sigma: standard deviation of the PSF, px.
-        slopes: whether the result contains, after the image of each path, its derivatives, 1/px, by
-            displacements of the whole path along x and along y.
+        slopes: whether the image of each streak is followed by its two derivatives, 1/px, with respect to a
+            displacement of the whole path along x and along y.
     """
     images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
     for k in range(len(paths)):
@@ -501,7 +503,10 @@ def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: 
 
 @loop_helper
 def _interval(x: float, grid: FloatArray, guess: int) -> int:
-    """Return the interval of an ascending grid that contains `x`, or the nearest interval, from a guess."""
+    """Return the index of the interval of an ascending grid that contains, or is nearest to, the value `x`.
+
+    The search starts at the interval with the index `guess`.
+    """
     last = len(grid) - 2
     k = min(max(guess, 0), last)
     while k > 0 and x < grid[k]:
@@ -513,11 +518,13 @@ def _interval(x: float, grid: FloatArray, guess: int) -> int:
 
 @loop_helper
 def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
-    """Return the nodes of a path (m, 2), whose chord has the direction (x, y), as rows (9, c).
+    """Return coordinates and derivatives (9, c) at c nodes of a path (m, 2), px.
+
+    The chord of the path has the unit vector (`x`, `y`).
 
     The first three rows are the coordinates along and across the chord and the arc length. The next three
     rows are the middle, slope and spacing of the c - 1 intervals between nodes. The last three rows are the
-    derivatives of arc length, slope and spacing by the coordinate along the chord.
+    derivatives of arc length, slope and spacing with respect to the coordinate along the chord.
     """
     m = len(path)
     count = min(_NODES, m)
@@ -544,7 +551,7 @@ def _nodes_of(path: FloatArray, x: float, y: float) -> FloatArray:
 
 @loop_helper
 def _first_from(pixels: IntArray, row: float) -> int:
-    """Return the index of the first of the pixels (p, 2), which are given row by row, from a row on."""
+    """Return the index of the first of the `pixels` (p, 2), sorted by row, that lies in `row` or after it."""
     low, high = 0, len(pixels)
     while low < high:
         middle = (low + high) // 2
@@ -609,12 +616,13 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineImage:
-    """Image of a straight streak of one count on p pixels, with its derivatives by displacements of the ends.
+    """Image on p pixels of a straight streak with one count in total, and the derivatives of this image.
 
     Attributes:
         pixels: flat indices of the pixels in the patch (p,).
-        images: counts of the pixels, and their derivatives, 1/px, by displacements of the first end along
-            and across the streak, and of the second end along and across the streak (5, p).
+        images: five rows (5, p): the counts of the pixels, and the derivatives of the counts, 1/px, with
+            respect to four displacements. The displacements are those of the first end along and across the
+            streak, and of the second end along and across the streak.
         axes: unit vectors along and across the streak (2, 2).
     """
 
@@ -775,9 +783,10 @@ def _set_pixel_of_line(s: float, n: float, width: float, length: float, image: F
 
 @loop_helper
 def _solved(sums: FloatArray) -> FloatArray:
-    """Return the solution (k,) of normal equations (k, k) with the right side in the last row, regularised.
+    """Return the solution (k,) of k normal equations, which are regularised by `_RIDGE`.
 
-    Only the lower triangle of the equations is read. The method is the Cholesky decomposition.
+    The array `sums` (k + 1, k) contains the matrix of the equations and, in its last row, their right-hand
+    side. Only the lower triangle of the matrix is read. The method is the Cholesky decomposition.
     """
     size = sums.shape[1]
     scale, solution, lower = np.empty(size), np.empty(size), np.empty((size, size))
@@ -802,7 +811,7 @@ def _solved(sums: FloatArray) -> FloatArray:
 
 
 def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> FloatArray:
-    """Return the image (rows, columns) of a streak of one count along `path` (m, 2), px.
+    """Return the image (rows, columns) of a streak with one count in total along `path` (m, 2), px.
 
     The count is distributed evenly over the points of the path, and each point is blurred by a Gaussian with
     the standard deviation `sigma`, px.
@@ -814,11 +823,10 @@ def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> Floa
 def spread_with_slopes(
     path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
 ) -> list[FloatArray]:
-    """Return the image of a streak of one count, and its derivatives, 1/px, by displacements of the path.
+    """Return the image of a streak with one count in total, and the derivatives of this image, 1/px.
 
-    Each of the k displacements moves each of the m points of the path by the given fraction `shares` (k, m)
-    of a displacement. For each displacement of the path, the derivatives for a displacement along x and along
-    y are returned.
+    The derivatives are with respect to k displacements of the path, each along x and along y. A displacement
+    of 1 px moves each of the m points of the path by the fraction of a pixel given in `shares` (k, m).
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     dx, dy = (_slopes_within_pixels(each, path[:, k], sigma) for k, each in enumerate((x, y)))
@@ -861,8 +869,9 @@ def _slopes_within_pixels(profiles: _Profiles, centres: FloatArray, sigma: float
 def _added(x: _Profiles, y: _Profiles, across: FloatArray, down: FloatArray) -> FloatArray:
     """Return the image (rows, columns) of points that are each the product of two profiles.
 
-    The values `across` (m, w) and `down` (m, w) are those at the pixels of the profiles `x` and `y`. Only the
-    pixels near the points are computed, which saves time for long streaks in large images.
+    The arrays `across` (m, w) and `down` (m, w) contain the two factors of each point, on the pixels that the
+    profiles `x` and `y` cover along the two axes. Only the pixels near the points are computed, which saves
+    time for long streaks in large images.
     """
     width = across.shape[1]
     columns = x.count + 2 * width

@@ -27,7 +27,7 @@ NO_CROWD: Crowd = (
     np.zeros(0, np.float32),
     np.zeros((1, 0), np.float32),
 )
-"""The arrays of `Crowd` if stars share no pixels."""
+"""The value of type `Crowd`, with empty arrays, for stars that do not share pixels."""
 _Alone = tuple[IntArray, FloatArray, FloatArray, FloatArray]
 """The arrays `kept`, `own`, `gain` and `inner` of `normal_equations.EliminatedEquations`."""
 
@@ -87,7 +87,7 @@ def _product(
 ) -> FloatArray:
     """Return the product of the information matrix of the whole scene with a vector of parameters.
 
-    The coupling of a star is the change of the modelled counts on its shared pixels by all other stars.
+    The coupling of a star is the change of the modelled counts on its shared pixels due to all other stars.
     """
     n, shared = len(information), len(free)
     alone = parameters[shared:].reshape(n, -1)
@@ -122,8 +122,9 @@ def solution(
     """Return the vector of parameters (s + n a,) that solves the coupled normal equations.
 
     Args:
-        information: Fisher information of each star's pixels on shared and own parameters (n, s + a, s + a).
-        prior: prior information on the own parameters of a star (a,).
+        information: Fisher information (n, s + a, s + a) from the pixels of each star, on the shared
+            parameters and on the parameters of that star.
+        prior: prior information on the parameters of a single star (a,).
         crowds: derivatives of the modelled counts on the shared pixels of strips and of patches.
         common: number of pixels that several stars share.
         eliminated: solution of the equations without coupling.
@@ -222,7 +223,10 @@ def _multiply(
 
 @loop_helper
 def _add_changes(crowd: Crowd, vector: FloatArray, light: Float32Array, change: FloatArray) -> None:
-    """Set `light` (e,) to the change of each star's counts by a step `vector` (n, s + a), and sum it up."""
+    """Set `light` (e,) to the change of each star's counts due to the parameter step `vector` (n, s + a).
+
+    The changes of all stars on the same pixel are added to `change`.
+    """
     star, matrix, first, slot, _, images = crowd
     light[:] = 0.0
     for b in range(len(first)):

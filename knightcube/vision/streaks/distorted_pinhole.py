@@ -63,7 +63,7 @@ class DistortedPinhole(Pinhole):
         return np.asarray(points + np.array(self.shift) + grown * away)
 
     def undistorted(self, points: FloatArray) -> FloatArray:
-        """Return the image positions (m, 2), px, without the lens distortion of `points` (m, 2), px."""
+        """Return the ideal positions (m, 2), px, of image `points` (m, 2), px, that have lens distortion."""
         shifted = points - np.array(self.centre) - np.array(self.shift)
         away = shifted
         for _ in range(_ROUNDS):

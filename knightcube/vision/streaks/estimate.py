@@ -119,17 +119,18 @@ _CROWDED = 0.05
 _BEYOND_CROWD = 100_000.0
 # Largest excess chi-square of a well-fitted star, relative to the star's squared significance.
 _MOST_RESIDUAL = 0.01
-# Upper limit of a star's significance (standard deviations) in the sum of explained chi-squares.
+# Largest significance (standard deviations) with which one star contributes to the chi-square that a fit
+# explains.
 _ENOUGH = 200.0
 # Weight of the flux in regions longer than the guessed streak length in the comparison of guesses. The weight
 # of overlong regions is below 1, because a long region may be a blend of two streaks.
 _CONTRADICTION = 0.6
-# Median chi-square per degree of freedom above which a preliminary fit is searched for a vibration.
+# Median chi-square per degree of freedom of a preliminary fit above which a vibration is fitted.
 _SHAKEN = 2.5
 # Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
 _CALM = 2.0
-# Fraction of confirmed streak ends subtracted in the comparison, because a wrong rotation matches one end of
-# a streak.
+# Fraction of streak ends that a wrong rotation confirms by chance, because it matches one end of a streak. In
+# the comparison of guesses, it is subtracted from the fraction of confirmed streak ends.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -330,7 +331,7 @@ _MOST_TRAILING = 0.5
 
 
 class StreakVerdict(Enum):
-    """Verdict on a motion from the ends of its streaks and from gaps in the streaks."""
+    """Result of the streak check, which tests a motion by the ends of its streaks and by gaps in them."""
 
     CONFIRMED = "confirmed"
     DOUBTFUL = "doubtful"
@@ -338,7 +339,7 @@ class StreakVerdict(Enum):
 
 
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
-    """Return a verdict on a motion: whether its streaks have confirmed ends and no gaps.
+    """Return the result of the streak check: whether the streaks of a motion have confirmed ends and no gaps.
 
     In a frame with many stars, a streak may be a blend of several stars. A motion is doubtful if some streaks
     have gaps, unless enough other streaks have two confirmed ends. A motion is also doubtful if no streak has
@@ -406,7 +407,7 @@ class _Candidate:
     Attributes:
         result: estimation result with the motion.
         rotation: rotation vector over the exposure (3,), rad.
-        verdict: verdict of the streak check on the motion.
+        verdict: result of the streak check for the motion.
         middles: centres of the n bright streaks (n, 2), px. For a global shutter, `middles` is empty.
         excess: chi-square of each bright streak minus the number of its pixels (n,). For a global shutter,
             `excess` is empty.
@@ -420,7 +421,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the streak check did not reject the motion."""
+        """Whether the result of the streak check is `CONFIRMED` or `DOUBTFUL`."""
         return self.verdict is not StreakVerdict.REJECTED
 
 
@@ -537,7 +538,7 @@ def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> Motio
 def with_rate(
     result: MotionResult, camera: FitProblem, last: StreakFit, verdict: StreakVerdict
 ) -> MotionResult:
-    """Return `result` completed by the rate, or by the reason why no rate is reported."""
+    """Return `result` completed with the rate, or with the reason why no rate is reported."""
     settings = camera.settings
     if result.used_count < settings.least_stars:
         why = f"{result.used_count} streaks agree, at least {settings.least_stars} are needed"
@@ -603,7 +604,7 @@ def _rejection(
 
 # Maximum number of preliminary motions for which the joint fit is run before a frame is rejected.
 _MOST_MOTIONS = 2
-# Median region length (px) below which the stars of a frame without a common motion are at rest.
+# Median region length (px) below which the stars count as at rest, if the regions do not share one motion.
 _AT_REST = 4.0
 # Median length (px) of the brightest regions below which a frame counts as free of streaks.
 _SPOT = 2.2
@@ -756,7 +757,7 @@ def _in_direction(
 def _best_motion(
     camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None
 ) -> _Candidate | None:
-    """Return the first motion that passes all tests, or the most likely motion with its rate removed.
+    """Return the first motion that passes all tests, or the most likely motion, without a rate, as failed.
 
     Returns None if no motion is found.
     """

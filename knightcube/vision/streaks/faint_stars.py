@@ -49,7 +49,7 @@ _SHARP_FROM = 40.0
 _SHARP_SIGMAS = 6.0
 # Minimum second difference of a star's filter response, relative to the response.
 _SHARP_SHARE = 0.3
-# Minimum fraction of a peak's response that stronger peaks do not explain, if the peak is a star.
+# Minimum fraction of the response at a star's peak that must remain after stronger peaks are subtracted.
 _OWN_SHARE = 0.45
 # Maximum number of peaks in one pass of the search.
 _MOST_PEAKS = 1000
@@ -60,9 +60,9 @@ _NEIGHBOURS = sorted(
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# Number of entries per px in the table of a star's brightness profile across the circles.
+# Number of entries per px in the table `_PROFILE`.
 _PER_PX = 50.0
-# Table of a star's brightness profile against the distance across the circles.
+# Filter response to a star, relative to its maximum, as a table by the distance of a circle from the star.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 
@@ -115,10 +115,10 @@ def sharp_peaks(
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return descending peaks that stronger peaks do not explain, as fractional grid rows and columns.
+    """Return the peaks of stars, the strongest first, as fractional grid rows and columns.
 
-    Only the flat indices `place` (p,) of the filter response are searched. The range `span` (r, 2) of columns
-    on the detector is that of `RunningSums`.
+    A peak is omitted if stronger peaks cause most of its response. Only the flat indices `place` (p,) of the
+    filter response are searched. The range `span` (r, 2) of columns on the detector is that of `RunningSums`.
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
@@ -136,7 +136,7 @@ def _unshaded_numpy(
     sigmas: float,
     across: float,
 ) -> BoolArray:
-    """Return which of the peaks (k,), in descending order of strength, are not explained by stronger peaks.
+    """Return a mask (k,) of the peaks, the strongest first, that are not caused by stronger peaks.
 
     The arguments are grid indices and heights `value` of the peaks, the ranges `spans` (k, 2) of columns on
     the detector, the streak length in samples, the minimum height, and the spacing of the circles, px.
@@ -524,7 +524,8 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
         (row[one] - row[other]) * ACROSS
     )
-    # The factor on the right-hand side cancels the effect of the regularisation for isolated stars.
+    # The measured responses `seen` are multiplied by the same factor as the diagonal, so that the
+    # regularisation does not change the heights of isolated stars.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(
@@ -556,15 +557,16 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
     return np.asarray(x * scale)
 
 
-# Ratio of consecutive box lengths in the search for the rotation angle.
+# Ratio of consecutive trial lengths of a box, which is a run of samples along a circle.
 _FACTOR = 1.1
-# Shortest box, as a number of samples, in the search for the rotation angle.
+# Smallest trial length (samples) of a box, which is a run of samples along a circle.
 _SHORTEST = 5
 # Factor by which the search for the rotation angle reduces the number of circles.
 _SPARSE = 2
-# Minimum significance (standard deviations) of a box in the search for the rotation angle.
+# Minimum significance (standard deviations) of the mean of a box relative to the samples on both sides of it,
+# for the box to count in the search for the rotation angle.
 _LEAST_SIGMAS = 5.0
-# Upper limit of the significance (standard deviations) of a box in the search for the rotation angle.
+# Upper limit of the significance (standard deviations) of one box in the sum over all boxes of one length.
 _ENOUGH = 40.0
 
 
@@ -596,7 +598,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 
 
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the sum of the squared significances of the locally best boxes of `width` samples.
+    """Return the sum of the squared significances of the most significant boxes of `width` samples.
 
     The array `padded` (c, r) contains the cumulative sums along the azimuth on r circles, with a margin of
     `room` samples at both ends.
@@ -610,8 +612,8 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The circles are divided into intervals of one box length. The best box of an interval is counted if no
-    # adjacent interval, on the same or a neighbouring circle, has a better box.
+    # The circles are divided into intervals of one box length. The most significant box of an interval is
+    # counted if no adjacent interval, on the same or a neighbouring circle, has a more significant box.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)

@@ -6,16 +6,16 @@ therefore gives the linear equation n.B(p) u = 0, which holds for either directi
 Pairs of bright regions propose rotation axes, the other regions vote for the proposed axes, and least squares
 refines the axis with most votes. All streaks subtend the same rotation angle, so that the length of each
 bright region is a vote for an angle. A bright region that the border of the frame truncates gives only a
-lower limit of the rotation angle. Fragments of one streak lie on one circle about the rotation axis, and
-their total length is a vote as well.
+lower limit of the rotation angle. Fragments of one streak lie on one circle about the rotation axis. The
+angle from the start of one fragment to the end of the next is therefore also a vote.
 
 If few streaks lie completely in the frame, a scan finds the rotation angle. Along a circle about the rotation
 axis, the intensity of a star's streak is a box function whose length is the rotation angle. For each trial
 length, the pixel samples around the brightest regions are summed in boxes, and each box is moved along its
-circle to the position of its largest sum. A box of the correct length contains the whole flux of a star and
-no other pixels. Boxes that are too long or too short by a factor of two explain only half of the chi-square.
-The scan therefore finds the rotation angle without a good initial guess, whereas a fit of the pixels
-converges only from within a few point-spread widths.
+circle to the position of its largest sum. A box of the correct length contains all samples of a star's streak
+and no samples beyond the ends of the streak. Boxes that are too long or too short by a factor of two explain
+only half of the chi-square. The scan therefore finds the rotation angle without a good initial guess, whereas
+a fit of the pixels converges only from within a few point-spread widths.
 """
 
 from __future__ import annotations
@@ -37,14 +37,13 @@ SCANNED_STARS = 14
 
 # Spacing (px) of the samples along the circle on which stars move fastest.
 _STEP = 2.0
-# Ratio of consecutive box lengths in the scan for the rotation angle.
+# Ratio of consecutive trial lengths of a box, which is a run of pixel samples along a circle.
 _FACTOR = 1.04
-# Shortest box, as a number of samples, in the scan for the rotation angle.
+# Smallest trial length (samples) of a box, which is a run of pixel samples along a circle.
 _SHORTEST = 6
-# Number of the most likely rotation angles among which the prior rate chooses.
+# Number of the most likely rotation angles that are sorted by their difference from the prior angle.
 _WEIGHED = 3
-# Upper limit of a sample relative to the median of its region, by which the effect of crossing stars is
-# limited.
+# Upper limit of a sample relative to the median of its region, which limits the effect of crossing stars.
 _CAP = 2.0
 # Upper limit of the significance (standard deviations) of a star in the scan for the rotation angle.
 _ENOUGH = 60.0
@@ -487,8 +486,8 @@ def _arcs_numpy(
 
     The moments are the mean and the variance of the azimuth about the axis, relative to the azimuths
     `reference` (n,), and the mean cosine of the angle from the axis. The pixels of the regions are those of
-    `BrightRegions`, the matrix `frame` (3, 3) is that of `Circles`, and the camera has the focal length and
-    centre `view`.
+    `BrightRegions`, and the matrix `frame` (3, 3) is that of `Circles`. The tuple `view` contains the focal
+    length and the image centre (x, y) of the camera, px.
     """
     n, (focal, centre_x, centre_y) = len(reference), view
     v = np.stack([(column - centre_x) / focal, (row - centre_y) / focal, np.ones(len(row))])
@@ -562,7 +561,7 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
 
 
 def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
-    """Return the most likely rotation angles (rad), each with the fraction of the flux in longer regions."""
+    """Return likely rotation angles (rad), each with the fraction of flux in regions longer than it."""
     whole = guess.agree & ~regions.cut & (guess.width > 0.0)
     candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
     spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates
@@ -598,7 +597,8 @@ def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
     """Return rotation angle, standard error and weight (k, 3) from k pairs of fragments on one circle."""
     part = np.flatnonzero(guess.agree & ~regions.cut)
     sine = np.sqrt(np.maximum(1.0 - guess.height[part] ** 2, 1e-12))
-    # The factor `scale` converts a difference of the cosines `height` into px across the circles.
+    # The factor `scale` converts a difference of `height`, which is the cosine of the angle from the rotation
+    # axis, into the distance (px) between two circles.
     scale = guess.speed[part] / sine**2
     near = np.abs(guess.height[part, None] - guess.height[part]) * scale < _SAME_CIRCLE
     gap = guess.first[part][None, :] - guess.last[part][:, None]

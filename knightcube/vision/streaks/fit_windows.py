@@ -59,7 +59,7 @@ class BlockPixels:
         inside: mask of the fitted pixels of each block.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
-        ceiling: counts above the background from which each pixel is saturated.
+        ceiling: smallest counts above the background at which each pixel is saturated.
         gain: gain of the camera, electrons per count.
         crowded: flat indices (e,), in the arrays of this class, of the e pixels that several stars share.
         common: index of each fitted pixel in the list of the pixels that several stars share.
@@ -157,7 +157,10 @@ class FitWindows:
 
 
 def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
-    """Return the sums (count,) of the counts `first` and `second` on pixels that have the same `slot`."""
+    """Return the sum (count,), over the values of `first` and `second`, of all counts on each fitted pixel.
+
+    The array `slot` contains the index of the pixel for each value of `first`, and then of `second`.
+    """
     light = np.concatenate([first, second.astype(np.float32)])
     return np.bincount(slot, light, count).astype(np.float32)
 

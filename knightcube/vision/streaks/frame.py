@@ -41,7 +41,7 @@ class ReducedFrame:
         sums: sum of `signal` over the 3 x 3 pixels around each pixel.
         floor: noise variance of each pixel without a star, counts^2.
         counts: raw counts.
-        top: saturation level, the raw counts from which a pixel is saturated.
+        top: saturation level, the smallest raw counts at which a pixel is saturated.
         bad: mask of the saturated and hot pixels, which the fit excludes.
         gain: gain of the camera, electrons per count.
         hot_pixels: number of hot pixels in the frame.
@@ -156,7 +156,9 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
 
 
 def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
-    """Return the ascending indices of `sums` that exceed `threshold` times the root of their `floor`.
+    """Return the ascending indices of the pixels whose `sums` exceed `threshold` times their noise.
+
+    The noise of a pixel is the square root of its noise variance `floor`, counts^2.
 
     The argument `least` is the minimum of `floor`.
     """
@@ -178,7 +180,7 @@ def _significant(sums: Float32Array, floor: Float32Array, least: float, threshol
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest star images.
 _BROAD = 25.0
-# Lower limit (px) of the length by which the area of a region is divided to compute its mean width.
+# Smallest length (px) of a region that is assumed when its mean width is computed from its area.
 _LEAST_LENGTH = 40.0
 # Side length (px) of a square that fits into the image of a limb or a reflection, but not into that of a
 # star.
@@ -233,9 +235,10 @@ MEDIAN_ERROR = 1.25
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
     """Return `frame` with the filter responses of a colour mosaic equalised, or None if they are equal.
 
-    The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. Each bright region has
-    about the same flux on the four kinds of pixels of the pattern. The ratios of the summed counts of the
-    four kinds of pixels are therefore the responses to starlight.
+    The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. In each bright region,
+    about the same flux of starlight reaches the pixels behind each of the four filters. The ratios of the
+    counts, summed over the pixels behind each filter, are therefore the relative responses of the filters to
+    starlight.
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:
@@ -304,7 +307,7 @@ _NARROWEST = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Binning:
-    """Binning of `size` x `size` pixels, from pixel `first` (x, y), and the binned camera `pinhole`."""
+    """Binning of `size` x `size` pixels from pixel `first` (x, y), with `pinhole` for the binned image."""
 
     size: int
     first: tuple[int, int]
@@ -312,7 +315,7 @@ class Binning:
 
     @classmethod
     def suited(cls, pinhole: Pinhole, psf_sigma: float) -> Binning:
-        """Return the binning for a point spread of `psf_sigma` px, with one pixel per bin if that is narrow.
+        """Return the binning for a point spread of `psf_sigma` px; a narrow one needs one pixel per bin.
 
         The same number of pixels is omitted at opposite sides of the frame, so that the optical axis stays in
         the centre.
@@ -326,7 +329,10 @@ class Binning:
         return cls(1, (0, 0), pinhole)
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
-        """Return the binned `pixels`, and the value of each bin with a pixel of at least `top` counts."""
+        """Return the binned image of `pixels`, and the counts assigned to a saturated bin.
+
+        A bin is saturated if one of its pixels has at least `top` counts.
+        """
         if self.size == 1:
             return pixels, top
         x, y = self.first
@@ -404,9 +410,9 @@ class PreparedFrame:
 def prepare_frame(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
 ) -> PreparedFrame:
-    """Return the frame `pixels` prepared for the configured point spread, or for a much larger measured one.
+    """Return the frame, binned for the configured point-spread width or for a much larger measured width.
 
-    `saturation` is the count from which a pixel is saturated.
+    `saturation` is the smallest count at which a pixel is saturated.
     """
     prepared = _prepared(pixels, pinhole, saturation, settings, settings.psf_sigma)
     if prepared.binning.size > 1:
@@ -420,7 +426,7 @@ def prepare_frame(
 def _prepared(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
 ) -> PreparedFrame:
-    """Return the frame `pixels` prepared for a point spread with standard deviation `sigma` px."""
+    """Return the frame, binned for a point spread with the standard deviation `sigma`, px."""
     binning = Binning.suited(pinhole, sigma)
     frame = reduce_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
     regions = find_bright_regions(frame, settings.threshold_sigmas, _MOST_REGIONS)

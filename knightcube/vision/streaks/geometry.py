@@ -1,11 +1,11 @@
 """Paths of stars over the detector of a rotating camera, and the derivatives of these paths.
 
-Times are measured in exposures and are zero at mid-exposure. With the rate u at mid-exposure and the angular
-acceleration g in camera axes, the rate at time t is u + g t, and the direction v of a star obeys v' = -(u + g
-t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion). The
-Magnus expansion is exact if the acceleration g is zero, and otherwise has an error of fourth order in t. If
-the navigation filter provides terms of third and higher order in t, they are added to the rotation vector. A
-star is identified by its pixel coordinates at mid-exposure.
+Times are in units of the exposure time, and are zero at mid-exposure. With the rate u at mid-exposure and the
+angular acceleration g in camera axes, the rate at time t is u + g t, and the direction v of a star obeys v' =
+-(u + g t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion).
+The Magnus expansion is exact if the acceleration g is zero, and otherwise has an error of fourth order in t.
+If the navigation filter provides terms of third and higher order in t, they are added to the rotation vector.
+A star is identified by its pixel coordinates at mid-exposure.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class CameraMotion:
     """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
     Attributes:
-        rate: angular rate at mid-exposure (3,), rad per exposure, without the rate of a vibration.
-        acceleration: angular acceleration at mid-exposure (3,), rad per exposure^2, without a vibration.
+        rate: angular rate at mid-exposure (3,), rad per exposure, excluding the vibration.
+        acceleration: angular acceleration at mid-exposure (3,), rad per exposure^2, excluding the vibration.
         higher_terms: known coefficients of t^3, t^4, ... in the rotation vector (k, 3), rad.
         vibration: vibration of the camera, whose rotation vector adds to the other terms.
     """
@@ -192,14 +192,14 @@ class StarPaths:
     acceleration: FloatArray
 
     def at_lines(self, shape: tuple[int, ...]) -> PointsAtLines:
-        """Return position, velocity and acceleration, each (2, *shape), of m points on lines of pixels."""
+        """Return position, velocity and acceleration of the m points, reshaped to arrays (2, *shape)."""
         x = np.ascontiguousarray(self.position.T).reshape(2, *shape)
         v = np.ascontiguousarray(self.velocity.T).reshape(2, *shape)
         return x, v, np.ascontiguousarray(self.acceleration.T).reshape(2, *shape)
 
 
 PointsAtLines = tuple[FloatArray, FloatArray, FloatArray]
-"""Position, velocity and acceleration of stars at b blocks of lines of pixels, each (2, b, LINES)."""
+"""Position, velocity and acceleration, each (2, b, LINES), of a star at each pixel line of b blocks."""
 
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
@@ -684,7 +684,8 @@ class Shutter:
     """Exposure delays of the rows of a detector with a rolling or global shutter.
 
     Attributes:
-        delay_per_row: delay from one row to the next, in exposures. For a global shutter, the delay is 0.
+        delay_per_row: delay from one row to the next, in units of the exposure time. For a global shutter,
+            the delay is 0.
         middle: index of the row whose mid-exposure is at time zero.
     """
 
@@ -692,7 +693,7 @@ class Shutter:
     middle: float = 0.0
 
     def delay(self, rows: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
-        """Return the exposure delay of `rows` relative to the middle row, in exposures."""
+        """Return the exposure delay of `rows` relative to the middle row, in units of the exposure time."""
         # The two scalars get the type of `rows`, so that float32 arrays are not converted to float64.
         return np.asarray((rows - rows.dtype.type(self.middle)) * rows.dtype.type(self.delay_per_row))
 
@@ -855,7 +856,9 @@ def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return which of the first `judged` of n stars at `stars` (n, 2), px, seem to be parts of one streak.
+    """Return whether each of the first `judged` stars seems to be only a segment of a streak, (judged,).
+
+    The n stars have the positions `stars` (n, 2), px, and the fluxes `light` (n,), counts.
 
     If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
     on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.

@@ -1,7 +1,7 @@
 """Joint fit of the motion and the brightest stars, together with the fainter stars on the same pixels.
 
 The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
-the ends of the streaks, so that it can converge to a wrong rotation angle. If the fitted rotation is too
+the ends of the streaks. It can therefore converge to a wrong rotation angle. If the fitted rotation is too
 small, the model may match only one end of every streak. The function `true_ends` detects flux beyond the
 modelled streak ends. If the fitted rotation is too large, the modelled streaks extend over dark pixels. The
 function `unbroken` detects gaps, which are dark segments within a streak. If a modelled streak end lies more
@@ -52,8 +52,8 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
-# Number of processed pixels per frame after which no further motion is fitted.
-# A fit in progress is always completed, so that the work on a frame may be twice the limit.
+# Number of processed pixels per frame after which no further motion is fitted. A fit in progress is always
+# completed. The work on one frame can therefore reach twice the limit.
 _MOST_WORK = 1_600_000
 # Fixed work of one evaluation of the model, expressed as a number of processed pixels.
 _EVALUATION = 15_000
@@ -68,11 +68,11 @@ class WorkBudget:
         self._spent = 0.0
 
     def evaluated(self, pixels: int) -> None:
-        """Add the work of one model evaluation of `pixels` pixels."""
+        """Add the work of one model evaluation on `pixels` pixels to the work spent on the frame."""
         self._spent += pixels + _EVALUATION
 
     def passed(self, pixels: int) -> None:
-        """Add the work of one pass over a frame of `pixels` pixels."""
+        """Add the work of one pass over a frame with `pixels` pixels to the work spent on the frame."""
         self._spent += _PASS * pixels
 
     @property
@@ -121,8 +121,8 @@ class IterationLimits:
         clipped: whether pixels with residuals far beyond the noise are excluded from the fit.
         tolerance: largest step (px) of a streak end or of the width at which the fit is converged.
         settled: largest step (standard deviations) of the shared parameters at which the fit is converged.
-        conjugate: maximum number of conjugate-gradient iterations by which the coupling of stars on shared
-            pixels is included.
+        conjugate: maximum number of conjugate-gradient iterations, which account for the coupling of stars on
+            shared pixels.
         patience: number of iterations before the first check of the fit's progress.
     """
 
@@ -213,7 +213,8 @@ class StreakFit:
     def grows(self) -> bool:
         """Return whether the rate changes significantly, by a score test of the constant rate.
 
-        The test accounts for the scatter of the accelerations of single stars (Hotelling's T-squared test).
+        The test accounts for the scatter of the accelerations of individual stars (Hotelling's T-squared
+        test).
         """
         # In most cases, an approximation without the coupling of stars on shared pixels is sufficient.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
@@ -282,8 +283,8 @@ def iterate(
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
     """Return whether new fit windows are needed, because streak ends moved or the acceleration changed.
 
-    The argument `faint` is the displacement (px) above which the streak ends of a star without effect on the
-    motion require new fit windows.
+    New windows are needed if a streak end moved by more than `_DRIFT` px. For stars that have no effect on
+    the motion, the limit is `faint` px.
     """
     grown = float(np.linalg.norm(after.motion.acceleration - before.motion.acceleration))
     if grown > _GROWN * float(np.linalg.norm(after.motion.rotation)):
@@ -327,7 +328,8 @@ _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
 # Lower limit of a star's speed, relative to the mean speed, in the computation of the expected intensity. The
-# point spread limits the intensity of streak segments in which the star is slow.
+# intensity is inversely proportional to the speed, but the point spread keeps it finite where the star is
+# nearly at rest.
 _SLOW = 0.5
 # Minimum intensity beyond a streak end that counts as a trail, relative to the streak's mean intensity.
 _TRAIL = 0.08
@@ -389,7 +391,10 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
 def _end_motions(
     camera: FitProblem, scene: StreakScene
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
-    """Yield, for the first and the second ends: column, outward sign, uniform motion, positions, speeds.
+    """Yield five values for the first ends of all streaks, and then for the second ends.
+
+    The values are the index of the end (0 or 1), the sign of the time beyond the end (-1 or 1), the uniform
+    motion, the positions of the ends (n, 2), px, and the speeds (n,), px per exposure.
 
     The paths are extrapolated with a uniform motion, because the star may have no speed at a streak end.
     """
@@ -517,14 +522,13 @@ _LEAST_REACH, _MOST_REACH = 10.0, 40.0
 _STEPS = 41
 # Minimum significance (standard deviations) of the flux near a streak end for the end to be measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Upper limit of a sample's intensity relative to the expected value, by which the effect of other stars is
-# limited.
+# Upper limit of a sample's intensity relative to the expected value, which limits the effect of other stars.
 _CAP = 2.0
 # Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3
-# Minimum error (px) of a streak length that counts as wrong.
+# Error (px) of the length of a streak above which this length counts as wrong.
 _LEAST_OFF = 4.0
-# Largest difference (px) between the length errors of two streaks that are considered equal.
+# Difference (px) between the length errors of two streaks below which these errors count as equal.
 _ALIKE = 3.0
 # Minimum ratio of the number of streaks with a wrong length to the number with the correct length, for a
 # correction.
@@ -611,7 +615,7 @@ _WIDTH_FLOOR = 0.002
 # Distance between two streaks below which they are fitted together, as a multiple of half the width of a
 # strip.
 _NEAR = 1.4
-# Displacement (px) of the streak ends during the fit above which faint stars are searched again.
+# Displacement (px) of the streak ends during the fit above which the search for faint stars is repeated.
 _FAR = 6.0
 # Maximum number of searches for faint stars.
 _MOST_REPEATS = 2
@@ -634,7 +638,7 @@ _AT_ONCE = 16
 def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
     """Return the joint fit of the brightest stars, and the faint stars that were not fitted.
 
-    Faint stars are searched a second time if the fit differs much from the motion of the fit `first`, or if
+    The search for faint stars is repeated if the fit differs much from the motion of the fit `first`, or if
     modelled and measured streak ends disagree. A fit is rejected if its streaks have wrong ends after the
     second search.
     """
@@ -659,7 +663,7 @@ def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
-    """Return whether streak ends moved so far during the fit that faint stars must be searched again."""
+    """Return whether streak ends moved so far that the search for faint stars must be repeated."""
     changed = float(np.linalg.norm(after.motion.rotation - before.motion.rotation))
     turn = float(np.linalg.norm(after.motion.rotation))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
@@ -667,9 +671,10 @@ def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
 
 
 def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
-    """Return the joint fit of stars found along the motion of the fit `first`, and the other faint stars.
+    """Return the joint fit of the bright stars, and the detected faint stars that it does not include.
 
-    A constant rate is fitted unless the settings or the pixels require a changing rate.
+    Faint stars are detected as streaks along the motion of the fit `first`. A constant rate is fitted unless
+    the settings or the pixels require a changing rate.
     """
     settings, before = camera.settings, first.scene
     if before.motion.accelerates:
@@ -717,8 +722,8 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     """Return the fit of `scene` with the motion of the majority of stars; None if the fit fails.
 
     A score test on the pixels decides between a constant and a changing rate. Stars without effect on the
-    motion are fitted as well, in descending order of brightness, until the number of pixels reaches `room`
-    times its usual limit. Stars that are not fitted are subtracted from the frame.
+    motion are fitted as well, in descending order of brightness, until all fit windows together contain
+    `room` times `_MOST_PIXELS` pixels. Stars that are not fitted are subtracted from the frame.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
@@ -752,9 +757,10 @@ def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     """Fit the brightest streaks of `last` again, together with all stars on the pixels of these streaks.
 
-    Faint stars hidden in a bright streak shift the fitted streak ends. If the limit on fitted pixels excluded
-    hidden stars from the joint fit, a fit of fewer streaks with all their hidden stars is more accurate.
-    Returns None if the joint fit included all stars, or if the new fit does not succeed or diverges.
+    Faint stars hidden in a bright streak shift the fitted streak ends. The joint fit omits such faint stars
+    if they would exceed the limit on the number of fitted pixels. A fit of fewer bright streaks, but with all
+    faint stars on their pixels, is then more accurate. Returns None if the joint fit included all stars, or
+    if the new fit does not succeed or diverges.
     """
     others, scene = last.hidden, last.scene
     if others is None or not len(others.light):

@@ -50,10 +50,10 @@ class Evaluation:
     """The normal equations for the shared parameters and the stars of a scene.
 
     Attributes:
-        information: Fisher information on shared and own parameters from the pixels of each star, (n, SHARED
-            + ALONE, SHARED + ALONE).
-        gradient: gradient of the log-likelihood of each star's pixels by shared and own parameters, (n,
-            SHARED + ALONE).
+        information: Fisher information (n, SHARED + ALONE, SHARED + ALONE) from the pixels of each star, on
+            the shared parameters and on the parameters of that star.
+        gradient: gradient (n, SHARED + ALONE) of the log-likelihood of each star's pixels, with respect to
+            the shared parameters and the parameters of that star.
         chi2: chi-square of the residuals on the pixels of each star (n,).
         pixels: number of fitted pixels of each star (n,).
         crowds: derivatives of the modelled counts on the pixels that several stars share.
@@ -76,8 +76,8 @@ class SharedPixels:
 
     Attributes:
         star: index of the star of each block of pixels (b,).
-        matrix: coefficients that combine i images into the derivatives by each parameter, (b, i, SHARED +
-            ALONE) for b blocks.
+        matrix: coefficients (b, i, SHARED + ALONE) that combine the i images of each of b blocks into the
+            derivatives with respect to each parameter.
         first: index of the first shared pixel of each block (b,).
         slot: index of each pixel in the list of all pixels that several stars share (e,).
         weight: inverse variance of the counts of each of the e shared pixels (e,).
@@ -131,9 +131,9 @@ def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: Fi
 def model_images(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return the images whose combinations model long streaks, and the images of spots with derivatives.
+    """Return the images that are combined to model long streaks, and the images and derivatives of spots.
 
-    The last image of each long streak is not initialised, because it is the memory for the residual.
+    The last image of each long streak is not initialised. It is a buffer for the residuals.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -146,7 +146,10 @@ def model_images(
 def _block_coefficients(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
 ) -> FloatArray:
-    """Return coefficients (b, IMAGES, SHARED + ALONE) that combine images into derivatives by parameter."""
+    """Return coefficients (b, IMAGES, SHARED + ALONE) that combine images into derivatives of the counts.
+
+    The derivatives are with respect to the shared parameters and the parameters of the star of each block.
+    """
     strips = windows.strips
     light = scene.light[windows.long[strips.star]]
     geometry = streak_model.coefficients(
@@ -212,8 +215,8 @@ def _sum_products_numpy(
     The weights (b, p), and the residuals in the last of the `images` (b, i + 1, p), are computed from the
     modelled counts `total` of all fitted pixels. Products of the residual with the other images give the
     gradient, and the squared residual gives chi-square. Coefficients `matrix` (b, i, SHARED + ALONE) combine
-    the images into derivatives. The `levels` are signal, floor and ceiling of `BlockPixels`, and the `limits`
-    gain and clip of `fit_windows.residuals`.
+    the images into derivatives. The tuple `levels` contains signal, floor and ceiling of `BlockPixels`. The
+    tuple `limits` contains the arguments gain and clip of `fit_windows.residuals`.
     """
     weight[:], images[:, -1] = residuals(total, slot, inside, *levels, *limits)
     blocks, count = images.shape[:2]
@@ -326,10 +329,11 @@ def _shared_pixels(
 
 
 def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
-    """Return the block (e,) of each of e pixels, and the values of the images, without the last, (i, e).
+    """Return the indices (e,) of the blocks that contain e pixels, and the values (i, e) of i images there.
 
-    The flat indices `crowded` (e,) of the pixels are those in b blocks of p pixels with i + 1 `images` each
-    (b, i + 1, p).
+    The array `images` (b, i + 1, p) contains i + 1 images on the p pixels of each of b blocks. The last image
+    contains the residuals and is omitted. The array `crowded` (e,) contains the flat indices of the given
+    pixels in an array (b, p).
     """
     _, count, size = images.shape
     block, place = np.divmod(crowded, size)
@@ -357,9 +361,9 @@ def _at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float
 def _spot_images(
     scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
 ) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spot images of p x p pixels by parameter.
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spots of p x p pixels for each parameter.
 
-    The last element along the second axis is not initialised, because it is the memory for the residual.
+    The last element along the second axis is not initialised. It is a buffer for the residuals.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
@@ -378,7 +382,7 @@ class Solution:
 
     Attributes:
         shared: step of the parameters that all stars share (SHARED,).
-        alone: step of the own parameters of each star (n, ALONE).
+        alone: step of the parameters of each single star (n, ALONE).
         eliminated: normal equations for the shared parameters alone, in which the coupling of stars by shared
             pixels is neglected.
     """
@@ -618,7 +622,7 @@ class StarEquations:
     Attributes:
         kept: indices of the k fitted parameters among the shared parameters (k,).
         information: information matrix of each star for the k fitted parameters (n, k, k).
-        score: gradient of each star's log-likelihood by the k fitted parameters (n, k).
+        score: gradient (n, k) of each star's log-likelihood with respect to the k fitted parameters.
     """
 
     kept: IntArray
@@ -627,7 +631,7 @@ class StarEquations:
 
 
 def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) -> StarEstimates | None:
-    """Return the estimates of the single stars, or None if the equations are singular."""
+    """Return the estimate from each individual star, or None if the equations are singular."""
     alone = star_equations(evaluation, free)
     return None if alone is None else estimates_of(alone, scene)
 
@@ -635,8 +639,8 @@ def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) 
 def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
     """Return, for each star, its estimate of three rate components and of the point-spread width.
 
-    The rate components are along the rotation axis and along two vectors normal to it. All estimates are
-    changes relative to the scene, in rad per exposure for the rate and in px for the width.
+    The rate components are along the rotation axis and along two vectors normal to it. Each estimate is the
+    difference from the value in `scene`, in rad per exposure for the rate and in px for the width.
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]

@@ -19,13 +19,13 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import CameraMotion, PointsAtLines, StarPaths, paths, positions
 
 LINES = 10
-"""Number of lines of pixels across a path that form a block."""
+"""Number of lines of pixels in one block. Each line crosses the path of the star."""
 
 STEEPEST = 0.68
 """Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
 
-# Largest camera rotation (rad) within a part of a path for which the column or row of the star changes
-# monotonically.
+# Largest camera rotation (rad) during one part of a path. Within a part, the column or the row of the star
+# must change monotonically.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
 _SAMPLES = 17
@@ -85,9 +85,9 @@ def cut_strips(
 ) -> Strips:
     """Return the pixels within `width` px of the paths of `stars` (n, 2), px, between start and end `times`.
 
-    The start and end times (n, 2) are in exposures from mid-exposure. The mask `ending` (n, 2) states which
-    start and end times are ends of a streak. At an end of a streak, pixels beyond the end are included. If
-    `ending` is None, all start and end times are ends of a streak.
+    The start and end times (n, 2) are relative to mid-exposure, in units of the exposure time. The mask
+    `ending` (n, 2) states which start and end times are ends of a streak. At an end of a streak, pixels
+    beyond the end are included. If `ending` is None, all start and end times are ends of a streak.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
@@ -124,7 +124,7 @@ def cut_strips(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Lines of pixels across star paths (b, LINES), with star and path part of each block of such lines."""
+    """Lines of pixels across star paths, in b blocks that each belong to one part of the path of one star."""
 
     star: IntArray
     part: IntArray
@@ -185,7 +185,8 @@ def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: In
     major = np.where(falling[:, None], major[:, ::-1], major)
     sampled = np.where(falling[:, None], sampled[:, ::-1], sampled)
     within = np.clip(line, major[owner, :1], major[owner, -1:])
-    # All parts are interpolated in one call, because each part has its own interval.
+    # The coordinates of successive parts are shifted to separate intervals, so that one call interpolates all
+    # parts.
     begin = np.arange(len(major)) * (float(np.ptp(major)) + 1.0 if major.size else 1.0)
     at = (within + begin[owner, None]).reshape(-1)
     times = np.interp(at, (major + begin[:, None]).reshape(-1), sampled.reshape(-1)) if len(at) else at

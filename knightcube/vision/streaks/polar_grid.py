@@ -258,10 +258,11 @@ def _sum_along_numpy(
 ) -> None:
     """Compute the running sums `response` and their numbers of samples `count` (r, c), and `span` (r, 2).
 
-    The direction of a sample is the sum of a term `turning` (3, c) of its azimuth and a term `rising` (3, r)
-    of its circle. Each row of the array `parts` (g, 4) describes a group of samples by the indices of the
-    first circle, the circle after the last, the first azimuth and the azimuth after the last. The camera has
-    the focal length and centre `view`, and the `shape` columns and rows.
+    The direction of a sample is the sum of two vectors: one from `turning` (3, c), which depends on the
+    azimuth of the sample, and one from `rising` (3, r), which depends on its circle. Each row of the array
+    `parts` (g, 4) describes a group of samples by the indices of the first circle, the circle after the last,
+    the first azimuth and the azimuth after the last. The tuple `view` contains the focal length and the image
+    centre (x, y) of the camera, px, and `shape` contains the numbers of columns and rows.
     """
     width, full, per_count, unit = limits
     before, after, columns = width // 2, width - width // 2, response.shape[1]

@@ -19,9 +19,9 @@ class LikelihoodSettings:
 
     Attributes:
         gain: gain of the camera, electrons per count.
-        saturation: count from which a pixel is saturated. If `saturation` is None, the highest count of the
-            frame is used if several pixels have that count, otherwise the maximum of the integer type.
-        saturated_fraction: fraction of saturated pixels from which a frame is rejected.
+        saturation: smallest count at which a pixel is saturated. If `saturation` is None, the highest count
+            of the frame is used if several pixels have that count, otherwise the maximum of the integer type.
+        saturated_fraction: smallest fraction of saturated pixels for which a frame is rejected.
         psf_sigma: initial standard deviation of the point spread, px. If `psf_sigma` is 2 px or more, the
             frame is binned.
         rate_model: `constant` for a constant rate, `accelerating` for a linearly changing rate, or `auto` to
@@ -36,9 +36,9 @@ class LikelihoodSettings:
         faint_sigmas: minimum significance of a detected streak, in standard deviations.
         reach: half width of the strip of pixels that is fitted along a star's path, in point-spread widths.
         clip: residual above which a pixel is excluded from the fit, in standard deviations.
-        least_stars: minimum number of stars from which a rate is reported. Two stars determine a rate, but do
+        least_stars: minimum number of stars for which a rate is reported. Two stars determine a rate, but do
             not allow a check of their agreement.
-        least_length: minimum median length of streaks from which a rate is reported, px.
+        least_length: minimum median length of the streaks for which a rate is reported, px.
         least_significance: minimum ratio of a rate to its standard deviation for the rate to be reported.
         worst_misfit: chi-square per degree of freedom above which a motion is rejected, provided that the
             residuals also exceed `worst_displacement`.

@@ -22,8 +22,9 @@ following equation gives the change dm of the counts if a parameter displaces th
 
 In this equation, c_n and c_s are the components of c across and along the path, and e0 and e1 are the counts
 per px at the two streak ends. All derivatives of the counts are combinations of seven basis images, with
-coefficients for each block of pixels. One basis image, the first moment of m along the path, describes
-derivatives that vary along a block of pixels.
+coefficients for each block of pixels. One basis image is n/w^2 m multiplied by the distance along the path
+from the centre of the block, with a correction at the streak ends. It describes a linear change of c_n within
+a block of pixels.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
 instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
@@ -166,10 +167,10 @@ IMAGES = 7
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths), along a path, of a pixel from the point where the path crosses its
-# line.
+# Largest distance (point-spread widths), measured along a path, between a pixel and the point where the path
+# crosses the line of this pixel.
 _OBLIQUE = 7.0
-# Time step of numerical derivatives, in exposures.
+# Time step of numerical derivatives, in units of the exposure time.
 _STEP = 1e-4
 # Fourth cumulant (px^4) of a uniform distribution over a pixel.
 _KURTOSIS = -1.0 / 120.0
@@ -309,10 +310,11 @@ def _endless(lines: _Crossings, count: int, width: float) -> tuple[Float32Array,
 
 
 def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Shutter, width: float) -> None:
-    """Limit the counts `out[:, 0]` of an infinitely long streak to the exposure, and compute its end images.
+    """Remove the counts before and after the exposure from those of an infinitely long streak, `out[:, 0]`.
 
-    The array `along` (b, LINES, k) is the distance (px) of each pixel along the path from the centre of its
-    block of pixels.
+    The images of the streak ends, `out[:, 3:5]`, and the effect of the ends on the derivative `out[:, 5]`
+    with respect to the width are computed as well. The array `along` (b, LINES, k) is the distance (px) of
+    each pixel along the path from the centre of its block of pixels.
     """
     out[:, 3:6] = 0.0
     crossing, centre, speed, gained = lines.time, lines.centre, lines.speed, lines.gained
@@ -433,11 +435,11 @@ def _endless_line(
     """Compute four values for each of `count` pixels on a line across an infinite streak, from `begin`.
 
     The values are distance across the path, distance along the path from the centre of the block, exponent of
-    the profile, and factor of the profile. Distances (px) across and along the path from the point at which
-    the path crosses the line are `first` at the first pixel, and change by `each`. The values `path` are the
-    curvature, the acceleration along the path divided by the squared speed, and the distance of the line from
-    the centre. The values `profile` are the inverse squared width, the maximum, and the relative correction
-    for the fourth cumulant.
+    the profile, and factor of the profile. The values `first` are the distances (px) of the first pixel,
+    across and along the path, from the point at which the path crosses the line. The values `each` are the
+    changes of the two distances from pixel to pixel. The values `path` are the curvature, the acceleration
+    along the path divided by the squared speed, and the distance of the line from the centre. The values
+    `profile` are the inverse squared width, the maximum, and the relative correction for the fourth cumulant.
     """
     across, ahead, by_across, by_ahead = first[0], first[1], each[0], each[1]
     bend, thinning, shift = path
@@ -456,7 +458,7 @@ def _endless_line(
 
 @loop_helper
 def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> None:
-    """Set the images of a block of pixels to the images of an infinitely long streak."""
+    """Set the counts `out[0]` to those of an infinitely long streak, and initialise the images `out[3:7]`."""
     for k in range(len(exponential)):
         out[0, k] = exponential[k] * pixels[3, k]
         out[3, k], out[4, k], out[5, k], out[6, k] = 0.0, 0.0, 0.0, 1.0
@@ -467,8 +469,9 @@ def _from_end(pixels: FloatArray, pace: FloatArray, width: float, sign: float, l
     """Compute the distances `pixels[3]` (point-spread widths) of a line of pixels from one streak end.
 
     The variable `sign` is 1 for the start and -1 for the stop of the exposure. The argument `pace` contains
-    the speed, the acceleration along the path, the time, the time from the centre of the block, and the delay
-    of the first pixel. The delay increases by `later` from pixel to pixel.
+    five values: the speed of the star, its acceleration along the path, the time at which it crosses the
+    line, the difference of this time from that of the centre of the block, and the exposure delay of the
+    first pixel. The delay increases by `later` from pixel to pixel.
     """
     speed, gained, time, end = pace[0], pace[1], pace[2], -0.5 * sign
     shift = (time - pace[3] - end - pace[4]) * speed - 0.5 * gained * (time - end) ** 2
@@ -487,7 +490,7 @@ def _draw_end(
     sign: float,
     pace: FloatArray,
 ) -> None:
-    """Limit the counts on a line of pixels to one end of the exposure, see `_ends`."""
+    """Remove the counts beyond one streak end from a line of pixels, see `_ends`."""
     image, scale, thinned = 3 if sign > 0.0 else 4, _BELL / width, sign * width**2 * pace[1] / pace[0] ** 2
     for k in range(len(distance)):
         u = distance[k]
@@ -500,7 +503,7 @@ def _draw_end(
 
 @loop_helper
 def _draw_moments(out: Float32Array, pixels: FloatArray, width: float) -> None:
-    """Compute the images of a block of pixels that depend on the limited counts."""
+    """Compute the images of a block of pixels that depend on the counts within the exposure."""
     narrow, cubed, inverse = 1.0 / width**2, 1.0 / width**3, 1.0 / width
     for k in range(out.shape[1]):
         light, across = out[0, k], pixels[0, k]
@@ -544,11 +547,12 @@ def coefficients(
 
 
 def _mixtures_numpy(change: FloatArray, velocity: FloatArray, spread: IntArray) -> FloatArray:
-    """Return the coefficients (b, IMAGES, 8) of `coefficients` from derivatives of star positions.
+    """Return the result (b, IMAGES, 8) of `coefficients`, computed from the derivatives of star positions.
 
-    The derivatives `change` (m, 2, 8) and velocities (m, 2) are those shortly before and after the centre of
-    each block, and then at the starts and stops of the exposure. The index of the start and stop of each
-    block is `spread` (b,).
+    The derivatives `change` (m, 2, 8) and the velocities (m, 2) are given at four groups of instants: shortly
+    before the star crosses the centre of each block, shortly after this, at the starts of exposures, and at
+    the stops of exposures. The array `spread` (b,) contains the index of each block among the starts, which
+    is also its index among the stops.
     """
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]

@@ -92,8 +92,8 @@ def _displacement(
 ) -> Displacement | None:
     """Return the displacement that explains the squared residuals `squares` on the pixels of the mask `on`.
 
-    The array `change` is the change of the counts per px of displacement, and `usual` is the expected
-    weighted square of a residual without displacement.
+    The array `change` contains the derivatives of the counts with respect to the displacement, 1/px. The
+    value `usual` is the expected weighted square of a residual if the displacement is zero.
     """
     count = int(np.count_nonzero(on))
     information = float(np.sum((left.weight * change * change)[on], dtype=np.float64))
@@ -107,7 +107,8 @@ def _displacement(
     )
 
 
-# Instants (in exposures from mid-exposure) at which paths with and without lens error are compared.
+# Instants (relative to mid-exposure, in units of the exposure time) at which paths with and without lens
+# error are compared.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
 # Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
@@ -124,7 +125,8 @@ class CalibrationCorrection:
     Attributes:
         step: correction of the k fitted shared parameters (k,). The correction is 0 if the calibration errors
             are not significant.
-        added: covariance (k, k) that calibration errors add to the covariance for an exactly known camera.
+        added: increase of the covariance (k, k) due to calibration errors, compared with an exactly known
+            camera.
         described: part of `added` (k, k) that is due to calibration errors with a specified standard
             deviation.
         score: gradient of the log-likelihood of each star after the correction (n, k).
@@ -151,10 +153,10 @@ def correct(
     Args:
         information: Fisher information of each star on k shared parameters (n, k, k), after elimination of
             the star's own parameters.
-        score: gradient of each star's log-likelihood by the k shared parameters (n, k).
-        apparent: change (n, k, m) of each star's estimate of k shared parameters by each of m calibration
-            errors of one standard deviation. The calibration errors of specified standard deviation are the
-            first of the m errors.
+        score: gradient (n, k) of each star's log-likelihood with respect to the k shared parameters.
+        apparent: change (n, k, m) of each star's estimate of k shared parameters due to each of m calibration
+            errors of one standard deviation. Calibration errors whose standard deviation is specified precede
+            the other calibration errors.
         spread: variance of the scatter of the stars, relative to their noise.
         described: number of calibration errors whose standard deviation is specified.
         counted: calibration errors that the fit has already corrected, in standard deviations (m,). The
@@ -196,11 +198,12 @@ def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArr
 
 
 def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> FloatArray:
-    """Return apparent rate changes (n, 3, m) of each star by calibration errors of one standard deviation.
+    """Return the apparent rate changes (n, 3, m) of n stars due to m calibration errors.
 
-    The apparent rate changes are in rad per exposure. Exactly known calibration parameters are omitted. The
-    last of the m errors is that of the line time. A streak determines the position of its path perpendicular
-    to the path, and its ends determine the length.
+    The apparent rate changes are in rad per exposure. Each calibration error has the size of its standard
+    deviation. Exactly known calibration parameters are omitted. The last of the m errors is that of the line
+    time. A streak determines the position of its path perpendicular to the path, and its ends determine the
+    length.
     """
     errors = _error_root(camera)
     n = len(scene.stars)
@@ -246,7 +249,7 @@ def _error_root(camera: FitProblem) -> FloatArray:
 def _error_displacements(
     pinhole: Pinhole, errors: FloatArray, place: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return the displacements (p, 2, m), px, of stars by each of m calibration errors (5, m)."""
+    """Return the displacements (p, 2, m), px, of stars due to each of m calibration errors (5, m)."""
     away = place - np.array(pinhole.centre)
     corner = np.hypot(*pinhole.centre)
     moves = [
@@ -261,7 +264,8 @@ def _error_displacements(
 
 def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     """Return `camera` with a lens that has calibration errors `error` (m,), given in standard deviations."""
-    # The line time, which is the last row of the calibration errors, is not a property of the lens.
+    # The last row of the calibration errors is omitted. It contains the errors of the line time, which is not
+    # a property of the lens.
     change = _error_root(camera)[:4] @ error
     pinhole = camera.pinhole
     if isinstance(pinhole, DistortedPinhole):
@@ -277,7 +281,7 @@ _NEAR_REST = 1.5
 _MOST_STARS = 10
 # Sampling step (px) of the intensity along a star's path in the test for a reversal.
 _STEP = 0.5
-# Margin (px) by which the examined path extends beyond the point at which the star is at rest.
+# Margin (px) by which the examined path extends beyond the point at which the star's image is at rest.
 _BEFORE = 5.0
 # Ratio of the length of the path that is examined for a reversal to the length of the fitted path.
 _BEYOND = 1.9
@@ -301,7 +305,7 @@ class _PathLight:
     point-spread profile across the path.
 
     Attributes:
-        places: distances along the path (k,) from the point at which the star rests, px.
+        places: distances along the path (k,), px, from the point at which the image of the star is at rest.
         square: sums of w g^2 over the pixels nearest to each of the k `places` (k,).
         cross: sums of w g d over the pixels nearest to each of the k `places` (k,).
         plain: (k,) sums of w g.
@@ -412,14 +416,15 @@ _END_SHARE = 1.0
 _END_FLOOR = 0.12
 # Ratio of the uncertainty of the streak ends to the significant displacement that explains their residuals.
 _END_SHOWN = 1.5
-# Ratio of the uncertainty of the streak ends to the upper limit of the displacement from their residuals.
+# Ratio of the uncertainty of the streak ends to the upper limit of their displacement, which is computed from
+# the residuals.
 _END_CHANCE = 0.5
 # Ratio of the error of the streak ends (px) to the vibration common to all streaks, given in px across the
 # streaks or as relative change of brightness.
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
-# Largest remaining calibration error (standard deviations) for which the lens correction has converged.
+# Remaining calibration error (standard deviations) below which the lens correction counts as converged.
 _SMALL_ERROR = 0.2
 # Relative uncertainty of the rotation due to lens errors above which the lens is always corrected.
 _WORTHWHILE = 0.002
@@ -449,10 +454,10 @@ class RotationUncertainty:
 
 
 def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: StreakFit) -> RotationUncertainty:
-    """Return the rotation over the exposure of the fit `whole`, with its uncertainty.
+    """Return the rotation of the camera over the exposure from the fit `whole`, with its uncertainty.
 
-    The argument `result` contains the stars of the fit. If faint stars are hidden in the streaks, the
-    rotation is taken from a fit of the brightest streaks with all their hidden stars.
+    The argument `result` contains the stars of the fit. If the fit omits faint stars on the pixels of the
+    streaks, the rotation is taken from a fit of the brightest streaks with all faint stars on their pixels.
     """
     camera, whole, lens = _corrected_lens(camera, whole, result.exposure)
     brightest = brightest_fit(camera, whole)
@@ -509,7 +514,7 @@ class _LensEffect:
             deviations (m,).
         counted: calibration errors that the fit has already corrected, in standard deviations (m,); None
             without any.
-        seen: whether the stars show the calibration errors significantly.
+        seen: whether the calibration errors estimated from the stars are significant.
     """
 
     step: FloatArray
@@ -570,7 +575,7 @@ def _lens_effect(
     shared = np.zeros((len(trusted), len(equations.kept), apparent.shape[2]))
     shared[:, :3] = apparent
     corrected, before = None, 1.0
-    # The scatter of the stars that calibration errors explain is not counted as noise.
+    # Differences between the estimates of the stars that are due to calibration errors do not count as noise.
     for _ in range(2):
         corrected = correct(equations.information, equations.score, shared, before, described, counted)
         if corrected is None:

@@ -1,4 +1,4 @@
-"""Fit of a vibration of the camera, which displaces all streaks of a frame in common.
+"""Fit of a vibration of the camera, which displaces all streaks of a frame at the same instants.
 
 A vibration displaces the stars across their paths and changes their speed, and thereby the intensity, along
 their paths. The residuals of a fit without vibration show the displacements and the changes of intensity as
@@ -164,7 +164,7 @@ _LARGEST = 2.5
 # Ratio of the error of the rotation over the exposure to the amplitude that is lost by averaging over the
 # point spread.
 _LOST_SHARE = 2.0
-# Start and end of the exposure, in exposures from mid-exposure.
+# Start and end of the exposure, relative to mid-exposure and in units of the exposure time.
 _ENDS = np.array([-0.5, 0.5])
 
 
@@ -233,7 +233,7 @@ class _RotationSums:
     """Normal equations of four rotation vectors in each of b time bins.
 
     Attributes:
-        time: middle of each bin (b,), in exposures from mid-exposure.
+        time: middle of each bin (b,), relative to mid-exposure, in units of the exposure time.
         information: Fisher information (b, 4, 3, 4, 3) of rotation, rate and rotations at start and end.
         score: gradient (b, 4, 3) of the log-likelihood.
         focal_length: focal length, px.
@@ -300,13 +300,20 @@ def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
 
 
 def _functions(values: FloatArray, slopes: FloatArray, at_ends: FloatArray) -> FloatArray:
-    """Return values and derivatives (n, b) of n functions in b time bins, and their values at both ends."""
+    """Return n functions of time as one array (n, b, 4), where b is the number of time bins.
+
+    The four elements are the value of the function in a bin, its derivative in the bin, and its values at the
+    start and at the end of the exposure. The last two are the same for all bins.
+    """
     ends = np.broadcast_to(at_ends[:, None], (*values.shape, 2))
     return np.concatenate([values[..., None], slopes[..., None], ends], axis=2)
 
 
 def _powers(time: FloatArray) -> FloatArray:
-    """Return the functions (3, b, 4) of errors of position, rate and acceleration."""
+    """Return the functions 1, t and t^2 of the time t as an array (3, b, 4), see `_functions`.
+
+    The functions describe errors of position, rate and acceleration that are common to all stars.
+    """
     one = np.ones_like(time)
     values, slopes = np.stack([one, time, time**2]), np.stack([0.0 * one, one, 2.0 * time])
     return _functions(values, slopes, np.stack([_ENDS**0, _ENDS, _ENDS**2]))
