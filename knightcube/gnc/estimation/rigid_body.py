@@ -158,7 +158,7 @@ class RigidBody:
     def linearise(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, ahead: float
     ) -> Linearised:
-        """Return the angular acceleration under `torquing` at attitude q, with its derivatives.
+        """Return the angular acceleration at attitude `q` for the coil state `torquing`, with derivatives.
 
         The gyroscopic torque is computed for the predicted rate `ahead` seconds later. With this prediction,
         the error of the midpoint rule for a tumbling body is of third order per step.
