@@ -757,9 +757,9 @@ def _in_direction(
 def _best_motion(
     camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None
 ) -> _Candidate | None:
-    """Return the first motion that passes all tests, or the most likely motion, without a rate, as failed.
+    """Return the first motion that passes all tests, or the most likely motion with the status FAILED.
 
-    Returns None if no motion is found.
+    A motion with the status FAILED does not contain a rate. Returns None if no motion is found.
     """
     rivals = islice(first_fits(camera, regions, near), _MOST_MOTIONS)
     first = next(rivals, None)

@@ -60,7 +60,7 @@ _NEIGHBOURS = sorted(
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# Number of entries per px in the table `_PROFILE`.
+# Number of entries of the table `_PROFILE` per px of distance from the star.
 _PER_PX = 50.0
 # Filter response to a star, relative to its maximum, as a table by the distance of a circle from the star.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)

@@ -315,7 +315,7 @@ class Binning:
 
     @classmethod
     def suited(cls, pinhole: Pinhole, psf_sigma: float) -> Binning:
-        """Return the binning for a point spread of `psf_sigma` px; a narrow one needs one pixel per bin.
+        """Return the binning for the point-spread width `psf_sigma`, px; a small width needs no binning.
 
         The same number of pixels is omitted at opposite sides of the frame, so that the optical axis stays in
         the centre.

@@ -361,7 +361,7 @@ def _at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float
 def _spot_images(
     scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
 ) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of n spots of p x p pixels for each parameter.
+    """Return derivatives (n, SHARED + ALONE + 1, p, p) of n spots of p x p pixels with respect to parameters.
 
     The last element along the second axis is not initialised. It is a buffer for the residuals.
     """
@@ -418,7 +418,7 @@ class EliminatedEquations:
 
     Attributes:
         kept: indices of the k fitted parameters among the shared parameters (k,).
-        own: inverse of the block of the information matrix for each star's own parameters (n, ALONE, ALONE).
+        own: inverse (n, ALONE, ALONE) of the block of the information matrix for the parameters of each star.
         gain: product of `own` and the block of the information matrix that couples k shared and each star's
             own parameters (n, k, ALONE).
         inner: covariance of the k fitted shared parameters (k, k).

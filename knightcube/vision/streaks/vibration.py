@@ -302,8 +302,9 @@ def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
 def _functions(values: FloatArray, slopes: FloatArray, at_ends: FloatArray) -> FloatArray:
     """Return n functions of time as one array (n, b, 4), where b is the number of time bins.
 
-    The four elements are the value of the function in a bin, its derivative in the bin, and its values at the
-    start and at the end of the exposure. The last two are the same for all bins.
+    The four elements of the last axis are the value of the function in a bin, its derivative in the bin, and
+    its values at the start and at the end of the exposure. The values at the start and the end are repeated
+    for all bins.
     """
     ends = np.broadcast_to(at_ends[:, None], (*values.shape, 2))
     return np.concatenate([values[..., None], slopes[..., None], ends], axis=2)
