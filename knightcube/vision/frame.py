@@ -367,7 +367,8 @@ def among_blocks(
 ) -> FloatArray:
     """Return block values (down, across) interpolated bilinearly at n pixels, (n,).
 
-    The blocks divide a frame of `shape`, and the pixels are at `column` (n,) and `row` (n,), of any shape.
+    The blocks divide a frame with the rows and columns `shape`. The pixel coordinates are `column` (n,) and
+    `row` (n,). If `column` has several dimensions, the result has the same dimensions.
     """
     x, y = (np.ascontiguousarray(place, dtype=float) for place in (column, row))
     return _among_blocks(np.ascontiguousarray(values), *shape, x.ravel(), y.ravel()).reshape(np.shape(column))
@@ -556,7 +557,11 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
 
 @loop_helper
 def _root_of(root: IntArray, run: int) -> int:
-    """Return the first run in a chain of links, and shorten the chain."""
+    """Return the first run of the region that contains `run`, and shorten the links to the first run.
+
+    A run consists of adjacent pixels in a row. The array `root` links each run to an earlier run of its
+    region.
+    """
     while root[run] != run:
         root[run] = root[root[run]]
         run = root[run]
@@ -640,16 +645,15 @@ def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> 
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
 """Limits for the neighbours of a hot pixel.
 
-Each neighbour of a hot pixel must be below two limits. The first limit is the first value times the
-brightness of the hot pixel plus the second value times the noise. The second limit is the third value times
-the brightness of the hot pixel.
+Each neighbour of a hot pixel must be darker than `_SHARPNESS` times the brightness of the hot pixel plus
+`_NOISE` standard deviations of the noise, and darker than `_MOST` times the brightness of the hot pixel.
 """
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 """Thresholds (noise standard deviations) for the recognition of two adjacent hot pixels.
 
-For two adjacent hot pixels, the first value is the minimum brightness of the brightest pixel. The second
-value is the number of standard deviations by which noise may raise the third brightest pixel beside two hot
-pixels.
+The brighter of the two hot pixels must be brighter than `_PAIR` standard deviations of the noise. The other
+seven pixels of the window must be darker than `_SHARPNESS` times the brighter hot pixel plus `_PAIR_NOISE`
+standard deviations of the noise.
 """
 _REPAIR_SIGMAS, HOT_SIGMAS = 10.0, 8.0
 """Minimum brightness (noise standard deviations) of replaced hot pixels, and of excluded hot pixels."""
@@ -768,12 +772,12 @@ _DEAD_FRACTION = 1e-4
 _PLATEAU = 6
 """Minimum number of pixels with the highest count in a saturated frame of streaks."""
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
-"""Limits by which saturation is recognised in a frame of point stars.
+"""Limits for the recognition of saturation in a frame of point stars.
 
-The first limit is the minimum number of pixels with the highest count. The second limit is the minimum ratio
-of the number of pixels with the highest count to the number of pixels with slightly smaller counts. The third
-limit is the width of the range of slightly smaller counts, as a fraction of the difference between the
-highest count and the median.
+In a saturated frame, at least `_LEAST_PLATEAU` pixels have the highest count, and more than `_PILED_UP` times
+as many pixels have the highest count as have slightly smaller counts. A count is slightly smaller if it
+differs from the highest count by at most `_PLATEAU_REACH` times the difference between the highest count and
+the median.
 """
 
 

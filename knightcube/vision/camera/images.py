@@ -140,7 +140,10 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
 
 
 def _grey_of_planes(planes: Image) -> Image:
-    """Return the luminance (rows, columns) of three colour planes (3, rows, columns), in their type."""
+    """Return the luminance (rows, columns) of three colour planes (3, rows, columns).
+
+    The luminance has the data type of the planes.
+    """
     grey = np.zeros(planes.shape[1:])
     for weight, plane in zip(_LUMINANCE, planes, strict=True):
         grey += weight * plane

@@ -69,7 +69,7 @@ class Pinhole:
         return np.asarray(self.focal_length * v[..., :2] / z + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
-        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2) (Sease, eq. (3.20), (3.21))."""
+        """Return unit vectors (n, 3) to pixels (n, 2), in the camera frame (Sease, eq. (3.20), (3.21))."""
         offset = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
         v = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1)
         return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
@@ -90,7 +90,7 @@ class Pinhole:
 _MOST_STEPS, _LAST_STEP = 60, 1e-8
 """Maximum number of Newton steps that invert the distortion, and step (tangent) that ends the iteration."""
 _NO_FOLD = 1e-12
-"""Minimum denominator in the formula for the fold of the distortion.
+"""Minimum denominator in the formula for the tangent at which the distortion folds the image back.
 
 Folds at tangents above 1e6 are ignored.
 """
@@ -101,7 +101,7 @@ SHAPE_TERMS = ("aspect", "shear", "p1", "p2")
 _MOST_SHAPE = 0.3
 """Largest magnitude of aspect and shear."""
 _MOST_TANGENTIAL, _TANGENTIAL_STEPS = 0.5, 40
-"""Largest derivative of the tangential distortion at a corner, and maximum number of steps that invert it."""
+"""Largest derivative of the tangential distortion at a corner, and maximum number of inversion iterations."""
 
 
 class LensError(FlightError):
@@ -142,7 +142,7 @@ class CameraModel(Protocol):
         """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions not imaged give NaN."""
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
-        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2)."""
+        """Return the unit vectors (n, 3) from the camera to pixels (n, 2), in the camera frame."""
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
         """Return which pixel positions (n, 2) lie on the detector, widened by `margin` px."""
@@ -244,7 +244,7 @@ class Lens:
         return np.asarray(self.focal_length * stretched + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
-        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2).
+        """Return the unit vectors (n, 3) of the rays through pixels (n, 2), in the camera frame.
 
         A pixel beyond the fold of the distortion gives NaN.
         """

@@ -44,7 +44,10 @@ _REACH = 3.0
 _TAIL = 3.5
 """Distance from the centre at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
-"""Minimum ratio of an edge's step heights with a wider and with a narrower Gaussian for the wider to be used.
+"""Minimum ratio of the step heights of an edge at which the wider of two Gaussians is used.
+
+The ratio is the step height after smoothing by the wider Gaussian, divided by the step height after smoothing
+by the narrower Gaussian.
 """
 _MARGIN = 4.0
 """Distance from the image border (px) within which edges are ignored. Some detectors have a black border."""
@@ -323,7 +326,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
         left, peak, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
         bend = np.minimum(left - 2.0 * peak + right, -1e-300)
         place = best - reach + np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
-        # A step lower than the threshold `weak` is noise, so that the search continues with wider Gaussians.
+        # A step lower than the threshold `weak` is noise, so the search continues with wider Gaussians.
         before = height[open_]
         gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
         open_ = open_[gains]
@@ -364,8 +367,8 @@ class EdgeRays:
 
     Attributes:
         rays: unit vectors to the edges (n, 3), camera axes.
-        brighter: derivative of the unit vector to each edge (n, 3) by the position along the scan line, per
-            pixel towards the bright side.
+        brighter: derivative of the unit vector to each edge (n, 3) with respect to the position along the
+            scan line, per pixel towards the bright side.
         pixel: angular size of a pixel at each edge (n,), rad.
     """
 
@@ -386,8 +389,9 @@ class Samples:
         bright: whether each sampled pixel is bright (m,).
         level: mean brightness around each sampled pixel (m,), 0 at the dark level of the image and 1 at the
             bright level.
-        mottle: curvature of the brightness along the scan line at each sampled pixel (m,), scaled to the
-            standard deviation of `level` for white noise.
+        mottle: texture of the image at each sampled pixel (m,), measured by the second difference of `level`
+            along the scan line. The second difference is divided by 6^0.5, so that white noise has the same
+            standard deviation in `mottle` and in `level`.
         noise: standard deviation of `level` from the noise of the dark pixels.
         floor: dark level of the image divided by the bright level.
     """
@@ -406,8 +410,8 @@ class Observation:
 
     Attributes:
         space: distance between the scan lines, px.
-        edges: edges of the image as pixel positions.
-        rays: edges of the image as directions.
+        edges: detected edges as pixel positions.
+        rays: detected edges as directions.
         across, down: derivatives of the unit vector to each edge (n, 3), per pixel to the right and per pixel
             downwards.
         samples: directions and brightness of sampled pixels on the scan lines.
@@ -478,7 +482,7 @@ def _span(levels: Levels) -> float:
 
 
 def _sample_levels(light: FloatArray, levels: Levels) -> FloatArray:
-    """Return level and mottle (2, k) of the sampled pixels of scan lines (n, m), as defined by `Samples`."""
+    """Return `Samples.level` and `Samples.mottle`, as (2, k), of the sampled pixels of scan lines (n, m)."""
     size, half = light.shape[1], _AVERAGED // 2
     index = _sample_places(size)[:, None] + np.arange(-half, half + 1)
     before, here, after = (
@@ -500,7 +504,7 @@ def _hidden_samples(masked: BoolArray) -> BoolArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the directions (m, 3) of the sampled pixels on scan lines, and which of them the lens images.
+    """Return unit vectors (m, 3) to the m of k sampled pixels that the lens images, and their mask (k,).
 
     The directions are cached, because successive frames have the same directions.
     """

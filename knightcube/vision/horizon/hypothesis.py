@@ -1,7 +1,7 @@
 """A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
-The significance of a horizon is an upper bound of the expected number of equally good horizons that chance
-edges form. Chance edges are edges such as coasts and the borders of clouds. The density of chance edges is
+The significance of a horizon is an upper bound on the expected number of equally good horizons that other
+edges, such as coasts and the borders of clouds, form by chance. The density of these chance edges is
 estimated from the number of edges beside the limb. A coast or the border of a cloud with the radius of
 curvature R, tangent to the limb, stays within a distance g of the limb over a length of 2 sqrt(2 g R). Scan
 lines that cross the same segment of a coast or cloud are not independent. The test therefore counts limb
@@ -53,7 +53,7 @@ _GRAZING = 0.3
 _LOWEST_SUN = np.radians(1.0)
 """Minimum elevation of the Sun (rad) at a limb point; with a lower Sun the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size at the limb (m) below which the profile samples do not cover the air's brightness profile."""
+"""Pixel size at the limb (m) below which the samples do not cover the atmosphere's brightness profile."""
 _CORRELATED = 10.0
 """Correlation length (px), along the limb, of the brightness of the ground behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
@@ -61,7 +61,7 @@ _PIXEL_SIGMA = 12.0**-0.5
 _LEAST_SPREAD = 0.03
 """Minimum assumed standard deviation (px) of a limb position that is fitted to a brightness profile."""
 _OTHER_AIR = 500.0
-"""Error of the limb height (m) due to the unknown brightness of the ground and density of the air."""
+"""Error of the limb height (m) due to the unknown brightness of the ground and density of the atmosphere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,9 +139,13 @@ _GATES = (0.25, 0.5, 1.0, 2.0)
 The trial distance with the most significant result is used.
 """
 _ROUND = 0.1
-"""Assumed radius of curvature of coasts and other lines of chance edges, as a fraction of the image size."""
+"""Assumed radius of curvature of coasts and other lines that are not a limb, as a fraction of the image size.
+"""
 _BESIDE = 0.05
-"""Largest distance of counted chance edges from the limb, as a fraction of the image size."""
+"""Distance from the limb within which other edges are counted, as a fraction of the image size.
+
+The number of edges gives the density of chance edges.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +189,7 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of the upper bound of the expected number of chance limbs that fit equally well.
+    """Return log10 of an upper bound on the expected number of limbs that fit equally well by chance.
 
     Args:
         limb: length of the limb in the image, and its crossings with scan lines.
@@ -207,7 +211,7 @@ def log10_chance(
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        # The variable `tail` is Chernoff's bound (log10) of the probability that chance edges lie on at least
+        # The variable `tail` is Chernoff's bound (log10) on the probability that chance edges lie on at least
         # the fraction `share` of the limb segments.
         tail = 0.0
         if share > chance:
@@ -225,7 +229,11 @@ For a spherical Earth, the rotation about nadir has no effect.
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun at a limb point (rad) below which the limb is too dark to show an edge."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
-"""Number of limb points for the coverage by edges, and number for the length of the limb in the image."""
+"""Numbers of points that represent the limb.
+
+`_LIMB_RAYS` points are used to compute the coverage of the limb by edges, and `_FINE_RAYS` points to compute
+the length of the limb in the image.
+"""
 _BORDER = 8.0
 """Width of the zone along the image border (px) in which no edges of the limb are expected."""
 _NEAR = 0.0375
@@ -249,12 +257,12 @@ class Hypothesis:
             implies.
         coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 if the image shows no
             sunlit limb.
-        night: fraction of the edges on the horizon at which the Sun is well below the horizon.
+        night: fraction of the edges on the fitted limb at which the Sun's elevation is below `_NIGHT`.
         allowance: standard deviation per axis, rad, by which the uncertainty of the nadir is increased for
             unmodelled effects.
-        chance: log10 of the expected number of equally good chance horizons, from `log10_chance`.
-        breadth: ratio of the median width of the edges on the horizon to the width expected from the air's
-            brightness profile.
+        chance: log10 of the expected number of horizons that fit equally well by chance, from `log10_chance`.
+        breadth: ratio of the median width of the edges on the horizon to the width expected from the
+            brightness profile of the atmosphere.
         not_space: why the image beyond the horizon is not space, or an empty string if it may be space.
         altitude_off: distance of a fitted altitude from the range `HorizonSettings.altitudes`, in standard
             deviations of the altitude; 0 if the altitude is known.
@@ -335,7 +343,7 @@ def examine(
 
 
 def _night_share(view: LimbView, rays: FloatArray, sun: FloatArray | None) -> float:
-    """Return the fraction of limb points at `rays` (n, 3) at which the Sun is well below the horizon."""
+    """Return the fraction of limb points at `rays` (n, 3) at which the Sun's elevation is below `_NIGHT`."""
     if sun is None or not len(rays):
         return 0.0
     return float(np.mean(sun_elevation(view, rays, sun) < _NIGHT))

@@ -35,13 +35,13 @@ from knightcube.vision.horizon.edges import Samples
 from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals
 
 _TWILIGHT = np.radians(12.0)
-"""Depression angle of the Sun below the horizon (rad) above which ground and air count as dark."""
+"""Depression angle of the Sun below the horizon (rad) above which ground and atmosphere count as dark."""
 DAYLIGHT = np.radians(8.0)
 """Elevation of the Sun (rad) above which ground and limb count as sunlit."""
 GLARE = np.radians(12.0)
 """Angle from the Sun (rad) within which stray light may be as bright as the Earth."""
 _ATMOSPHERE = 60e3
-"""Tangent height (m) above which the air counts as dark sky."""
+"""Tangent height (m) above which a line of sight counts as dark sky."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ _ROUND_GLARE = 0.85
 
 
 def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> BoolArray:
-    """Return which rays (n, 3) are outside the glare of a Sun whose direction is unknown.
+    """Return which rays (n, 3) are outside the Sun's glare, located by the bright samples in the sky.
 
     The assumed direction of the Sun is the mean direction of the bright samples in the sky, if most of these
     samples are within the glare of this direction and form a round patch. The masks `sky` (n,) and `bright`
@@ -131,9 +131,12 @@ def _away_from_glare(rays: FloatArray, sky: BoolArray, bright: BoolArray) -> Boo
 
 
 _LEAST_SKY = 8
-"""Minimum number of samples in the assumed sky for the test whether the sky looks like space."""
+"""Minimum number of samples in the assumed sky for a test of whether the sky looks like space."""
 _DIM_AIR = 30e3
-"""Height (m) above the limb at which the air has 3 % of its brightness, for images that show no sky above."""
+"""Height (m) above the limb at which the atmosphere has 3 % of its brightness.
+
+The height is used for images that do not show enough sky above `_ATMOSPHERE`.
+"""
 _CLEAR = 24.0
 """Distance from the limb (px) beyond which the pixels averaged in a sample do not image the Earth."""
 _DARKEST = 0.15
@@ -141,7 +144,10 @@ _DARKEST = 0.15
 _BLACKEST = 0.35
 """Largest dark level of an image of space, as a fraction of the bright level."""
 _SMOOTHEST, _NOISES = 0.01, 2.0
-"""Largest mottle (texture) of space: an absolute value, and a multiple of the noise of a sample."""
+"""Largest texture (`Samples.mottle`) of space.
+
+The limit is the larger of `_SMOOTHEST` and `_NOISES` times the noise of a sample.
+"""
 
 
 def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixel: float) -> str:
@@ -161,7 +167,7 @@ def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixe
     away = np.ones(len(outside), dtype=bool)
     if sun is not None:
         away = samples.rays @ (view.rotation @ sun) < np.cos(GLARE)
-    # In a narrow field, the air may fill the image up to a large height.
+    # In a narrow field, the atmosphere may fill the image up to a large height.
     for height in (_ATMOSPHERE, _DIM_AIR):
         sky = away & (outside > np.arctan(height / view.limb_distance) + _CLEAR * pixel)
         if np.count_nonzero(sky) >= _LEAST_SKY:
@@ -267,7 +273,7 @@ def coarse_nadir(
     """Return the nadir that explains the brightness of all images, or None if the nadir is too uncertain.
 
     Args:
-        looks: directions and brightness of the samples of each image.
+        looks: samples of each image, with their directions and brightness.
         altitude: height of the cameras above the Earth's mean radius, m.
         sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees, or None if unknown.
     """
@@ -352,13 +358,14 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle (rad) from the limb within which the air or an attitude error of 1 deg may change a sample."""
+"""Angle (rad) from the limb within which the atmosphere or an attitude error of 1 deg may change a sample."""
 _DAY = DAYLIGHT + math.radians(12.0)
 """Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
 """Angle between the Sun and the nearest sample (rad) below which stray light may cover the whole image."""
 _LEAST = 8
-"""Minimum number of comparable samples, out of 64, for the test whether an image contradicts the attitude."""
+"""Minimum number of samples (of 64) that must be predicted to be bright, or dark, for a test of the attitude.
+"""
 _MOST = 0.6
 """Fraction of contradicting samples above which an image contradicts the attitude.
 
@@ -370,7 +377,7 @@ def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: Fl
     """Return why an image contradicts a known attitude, or an empty string if it agrees.
 
     Args:
-        look: directions and brightness of the samples of the image.
+        look: samples of the image, with their directions and brightness.
         nadir: unit vector (3,) to nadir in body axes, accurate to a degree.
         altitude: height of the camera above the Earth's mean radius, m.
         sun: unit vector (3,) to the Sun in body axes, accurate to a degree.

@@ -49,8 +49,8 @@ _PARALLEL = 1e-12
 def nadirs_of_pairs(first: FloatArray, second: FloatArray, cosine: float) -> FloatArray:
     """Return the two directions (2, n, 3) that make a given angle with both rays of each pair (n, 3).
 
-    `cosine` is the cosine of the angle. The directions are NaN if the rays of a pair are parallel, or too far
-    apart for the angle.
+    `cosine` is the cosine of the angle. The directions are NaN if the rays of a pair are parallel, or if the
+    angle between the two rays is more than twice the given angle.
     """
     dot = np.einsum("ij,ij->i", first, second)
     normal = np.cross(first, second)
@@ -101,7 +101,7 @@ def best_cone(
     """Return the cone with which most edges in the mask `free` agree, or None if no cone can be formed.
 
     Args:
-        edges: edges of the image as directions.
+        edges: directions of the edges that were detected in the image.
         free: mask of the edges that may be used (n,).
         cosines: lower and upper limit of the cosine of the cone's half-angle; equal if the angle is known.
         tolerance: largest distance of an agreeing edge from the cone, px.

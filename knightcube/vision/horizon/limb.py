@@ -14,13 +14,13 @@ estimated from the median of the residuals if this estimate exceeds the stated s
 height, the rotation about nadir and the altitude have a prior, because the limb does not determine them. The
 covariance therefore includes the uncertainty of limb height, rotation and altitude.
 
-Along a line of sight with the tangent height h, the optical depth of the air is t(h) = t0 exp(-h/H) with t0 =
-t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius and H
-the scale height of the air. A line of sight with a tangent height h < 0 ends on the ground at an elevation
-whose sine is sqrt(-2h/R). The brightness of sunlit air at the optical depth t is 1 - exp(-t), and the air
-attenuates the light from the ground by the factor exp(-t). Without blur, the brightness falls fastest at the
-optical depth t = 1, at a tangent height of 15.4 km. Refraction is neglected. Refraction lowers the apparent
-limb by 1 to 2 km, which is within `HorizonSettings.limb_height_sigma`.
+Along a line of sight with the tangent height h, the optical depth of the atmosphere is t(h) = t0 exp(-h/H)
+with t0 = t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's
+radius and H the scale height of the atmosphere. A line of sight with a tangent height h < 0 ends on the
+ground at an elevation whose sine is sqrt(-2h/R). The brightness of sunlit air at the optical depth t is 1 -
+exp(-t), and the air attenuates the light from the ground by the factor exp(-t). Without blur, the brightness
+falls fastest at the optical depth t = 1, at a tangent height of 15.4 km. Refraction is neglected. Refraction
+lowers the apparent limb by 1 to 2 km, which is within `HorizonSettings.limb_height_sigma`.
 
 The brightness profile across an edge is fitted by background + a air(h) + b ground(h), where a and b are
 free, and the tangent height h falls by a known number of metres per pixel. The position of unit optical depth
@@ -165,7 +165,7 @@ _AFTER, _BEFORE = [1, 2, 0], [2, 0, 1]
 
 
 def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (n,), rad, of rays (n, 3), and their gradients (n, 5) by the fitted parameters."""
+    """Return residuals (n,), rad, of rays (n, 3), and gradients (n, 5) with respect to the fitted parameters."""
     stretching = view.surface.stretching(view.limb_height)
     by_height = view.surface.stretching_by_height(view.limb_height)
     centre = -(stretching @ view.position)
@@ -204,7 +204,10 @@ _MOST_STEPS = 10
 _LAST_STEP = 3e-5
 """Rotation step (rad) below which the fit of the limb ends, about an eightieth of a pixel."""
 _SAME_GRADIENTS = 3e-3
-"""Rotation step (rad) below which the gradients change by less than 1 % and are not computed again."""
+"""Rotation step (rad) below which the gradients of the residuals are not computed again.
+
+Such a step changes the gradients by less than 1 %.
+"""
 _HUBER, _BEYOND = 1.5, 5.0
 """Residuals (standard deviations) above which Huber's weights decrease, and above which they are zero."""
 _MOST_CORRELATED = 0.8
@@ -390,7 +393,11 @@ def _is_outside(view: LimbView) -> bool:
 
 
 SCALE_HEIGHT = 8000.0
-"""Scale height of the lower air, m (US Standard Atmosphere 1976: 8.4 km at the ground, 6.4 km at 15 km)."""
+"""Scale height (m) of the lower atmosphere.
+
+The scale height of the US Standard Atmosphere 1976 is 8.4 km at the ground and 6.4 km at an altitude of 15
+km.
+"""
 _VERTICAL_DEPTH = 0.097
 """Vertical optical depth of the atmosphere at 550 nm (Bucholtz 1995, Applied Optics 34, 2765, Table 3)."""
 UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
@@ -466,7 +473,7 @@ _OUTSIDE, _INSIDE = -8.0, 4.0
 _FLOOR, _SHARE = 0.02, 0.08
 """Noise of a profile sample: a fraction of the profile's maximum plus a fraction of the sample's value."""
 _FARTHEST = 2.0
-"""Largest distance (px) of the fitted limb from the steepest point."""
+"""Largest distance (px) of the fitted limb from the steepest point of the brightness profile."""
 _LEAST_SAMPLES = 7
 
 

@@ -5,16 +5,18 @@
         filter.update(solution.nadir.direction, solution.nadir.covariance, -position)
 
 `find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
-the edges of each cone. Each fitted limb is tested against chance edges, the width of the atmosphere's
-brightness profile, the darkness of space, the brightness of the whole image, the coarse sensors and the rough
-attitude. If exactly one limb passes all tests, this limb gives the nadir. If several limbs pass all tests,
-the image is ambiguous. If no limb passes all tests, the image is refused, and the result contains the reason.
+the edges of each cone. Each fitted limb is tested against the number of edges expected by chance, the width
+of the atmosphere's brightness profile, the darkness of space, the brightness of the whole image, the coarse
+sensors and the rough attitude. If exactly one limb passes all tests, this limb gives the nadir. If several
+limbs pass all tests, the image is ambiguous. If no limb passes all tests, the image is refused, and the
+result contains the reason.
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
 searched again with the nadir of the other cameras as prior knowledge. One common limb is fitted to the limb
-points of all images. The unknown height of the air displaces every limb outwards. An unknown height of the
-air displaces the nadir only if the images show one side of the limb but not the opposite side.
+points of all images. The apparent limb is at an unknown height above the ground, so every limb is displaced
+outwards. An unknown limb height displaces the nadir only if the images show one side of the limb but not the
+opposite side.
 """
 
 from __future__ import annotations
@@ -168,9 +170,10 @@ _RIVAL = 0.3
 _SAME = np.radians(1.0)
 """Angle (rad) between two nadirs from one image below which they count as the same nadir."""
 _MOST_CHANCE = -6.0
-"""Largest accepted log10 of the expected number of equally good horizons formed by chance edges."""
+"""Largest accepted log10 of the expected number of equally good horizons that edges form by chance."""
 _BREADTH = 0.125, 2.0
-"""Minimum and maximum ratio of the width of the limb's edges to that of the air's brightness profile."""
+"""Minimum and maximum ratio of the width of the limb's edges to that of the atmosphere's brightness profile.
+"""
 _OFF = 9.0
 """Upper limit of an edge's chi-square in the comparison of the horizons of different trial focal lengths."""
 _GAIN = 1.5
@@ -232,7 +235,7 @@ _FIELD_STEPS: FloatArray = np.linspace(-2.5, 2.5, 11)
 _FIELD_ROUNDS, _RESOLVED = 4, 0.3
 """Maximum number of searches with refined trial focal lengths, and relative spread above which they end."""
 _MOST_REFUSED = 0.5
-"""Total probability of the focal lengths with a refused horizon above which the image is refused."""
+"""Largest accepted total probability of the trial focal lengths whose horizons are refused."""
 
 
 def nadir_of_uncertain_field(
@@ -245,10 +248,12 @@ def nadir_of_uncertain_field(
 ) -> HorizonSolution:
     """Return the nadir if the camera's focal length has the relative standard deviation `sigma`.
 
-    The image is searched with eleven trial focal lengths. Nadir and altitude are means over the horizons of
-    all focal lengths. The weight of a horizon is the probability of its focal length and of its misfit. The
-    uncertainties include their differences. A horizon that contradicts the brightness keeps its weight. If
-    such horizons have more than half of the total weight, the image is refused. See `find_nadir`.
+    The image is searched with eleven trial focal lengths. Nadir and altitude are weighted means over the
+    horizons of all focal lengths. The weight of a horizon is the probability of its focal length and of its
+    misfit. The uncertainties of nadir and altitude include the scatter of the individual nadirs and altitudes
+    about the means. A horizon that is refused, for example because the brightness of the image contradicts
+    it, is also included in the means. If refused horizons have half of the total weight or more, the image is
+    refused. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)
@@ -445,7 +450,11 @@ def _hypotheses(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> list[Hypothesis]:
-    """Return the horizons fitted to the cones with which most edges agree, in descending order of quality."""
+    """Return the horizons found in the image, the best first.
+
+    A horizon is fitted to the edges that agree with each of the best cones. Accepted horizons come before
+    refused horizons, and horizons with more edges before horizons with fewer edges.
+    """
     if place is None:
         least, most = settings.altitudes
         low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
@@ -499,7 +508,7 @@ def _angle(one: FloatArray, other: FloatArray) -> float:
 
 
 def _is_limb(one: Hypothesis) -> bool:
-    """Return whether a horizon is significant and has edges of the width expected from the air."""
+    """Return whether a horizon is significant and its edges are about as wide as the atmosphere's profile."""
     return one.chance < _MOST_CHANCE and _BREADTH[0] < one.breadth < _BREADTH[1]
 
 
@@ -555,7 +564,10 @@ def _measurement(
 
 
 def limited_normal(mean: float, sigma: float, limits: tuple[float, float]) -> tuple[float, float]:
-    """Return the mean of a normal distribution limited to a range, and its variance divided by sigma^2."""
+    """Return the mean of a truncated normal distribution, and its variance divided by `sigma`^2.
+
+    The distribution with mean `mean` and standard deviation `sigma` is truncated at the two `limits`.
+    """
     low, high = ((limit - mean) / sigma for limit in limits)
     x = np.linspace(max(low, min(-8.0, high - 1.0)), min(high, max(8.0, low + 1.0)), 2001)
     # The density is normalised to its maximum in the range, so that it does not underflow if the range is far
@@ -572,8 +584,8 @@ _IMPROBABLE = 1e-6
 _COMMON = 2.0
 """Assumed ratio of the variance of the difference of two nadirs to the sum of their variances.
 
-The ratio is above 1, because an unknown height of the air displaces the nadirs from opposite limbs in
-opposite directions.
+The ratio of variances is above 1, because an unknown limb height displaces the nadirs measured on opposite
+sides of the Earth in opposite directions.
 """
 _UNKNOWN_TURN = 1.0
 """Prior standard deviation of an unknown rotation about nadir (rad)."""

@@ -153,8 +153,9 @@ class HorizonSettings:
     Attributes:
         edges: settings of the search for edges.
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default standard deviation
-            of the limb height is valid for air of unknown scale height (6.5 to 9.5 km) and unknown haze. If
-            scale height and haze are known, a standard deviation of 1,000 m is valid.
+            of the limb height is valid for an atmosphere of unknown scale height (6.5 to 9.5 km) and unknown
+            haze. If scale height and haze are known, 1,000 m is a sufficient standard deviation of the limb
+            height.
         altitude_sigma: standard deviation of the altitude of a known position, m.
         altitudes: range of an unknown altitude, m. The default range covers low orbits. An unlimited range
             would accept any bright disc as the Earth, for instance a lens ghost.
@@ -165,10 +166,10 @@ class HorizonSettings:
         some_edges: number of edges in an image below which the image is not searched again.
         candidates: maximum number of candidate horizons in one image.
         tries: maximum number of pairs or triples of edges that are tried for each horizon.
-        sphere_sigma: standard deviation per axis, rad, of the limb's tilt by the Earth's flattening for a
-            camera close to the surface. The tilt is added to the uncertainty of nadir if the direction of the
-            flattening is unknown. The tilt of the limb decreases with the square of the distance from the
-            Earth's centre.
+        sphere_sigma: standard deviation per axis, rad, of the tilt of the limb that the Earth's flattening
+            causes for a camera close to the surface. The tilt is added to the uncertainty of nadir if the
+            direction of the flattening is unknown. The tilt of the limb decreases with the square of the
+            distance from the Earth's centre.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)

@@ -24,7 +24,7 @@ _CHANGE = 0.08
 _MOVED = 0.25
 """Minimum fraction of changed blocks for a frame to be counted."""
 _QUIET_FRAMES = 12
-"""Number of counted frames without a change after which a block shows structure."""
+"""Number of successive counted frames in which a block must be unchanged to count as structure."""
 _LARGEST = 0.4
 """Largest fraction of the image that an estimated mask may cover.
 
@@ -71,7 +71,7 @@ class StructureMap:
 
     @classmethod
     def of(cls, configured: BoolArray) -> StructureMap:
-        """Return the map before the first frame, from the mask (rows, columns) of the configuration."""
+        """Return a map with only the configured structure, given its mask `configured` (rows, columns)."""
         blocks = np.asarray(_blocks(configured.astype(float)) > 0.0)
         rows, columns = configured.shape
         return cls(rows, columns, blocks, np.zeros((0, 0)), np.zeros(blocks.shape, dtype=np.int64))
@@ -93,11 +93,11 @@ class StructureMap:
 
     @property
     def mask(self) -> BoolArray | None:
-        """The mask (rows, columns) of the structure's pixels, or None without structure.
+        """The mask (rows, columns) of the pixels that show the spacecraft's structure, or None if none do.
 
-        The estimated structure is widened by one block, because blocks at its border show structure and
-        scene. An unchanged block counts as structure only if at least two of its neighbours are also
-        unchanged.
+        The estimated structure is widened by one block, because a block at the border of the structure shows
+        partly the spacecraft and partly the scene. An unchanged block counts as structure only if at least
+        two of its neighbours are also unchanged.
         """
         learned = self.quiet >= _QUIET_FRAMES
         learned &= _neighbours(learned) >= 2
