@@ -79,8 +79,8 @@ class HorizonCameraResult:
 
     Attributes:
         sun, nadir: measured directions of Sun and nadir, body axes; None if there is none.
-        false: reasons, by camera index, why an image contradicts an accurately known attitude. If the
-            attitude is not accurately known, images are not checked and `false` is None.
+        false: reasons, by camera index, why an image contradicts an accurately known attitude, or None if the
+            attitude is not known accurately enough to check the images.
         structure: maps of the spacecraft's own structure, updated with these images, by camera index.
     """
 
@@ -171,7 +171,7 @@ def _masks(job: HorizonCameraJob) -> dict[int, BoolArray]:
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the nadir (3,) in body axes predicted by a rough attitude, or None if it is too uncertain."""
+    """Return the nadir (3,), body axes, from a rough attitude, or None if the attitude is too uncertain."""
     rough, position = knowledge.attitude, knowledge.position
     if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
         return None
@@ -179,7 +179,10 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
 
 
 def _expected_sun(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the Sun direction (3,), body axes, predicted by a rough attitude; None if too uncertain."""
+    """Return the Sun direction (3,), body axes, from a rough attitude.
+
+    Returns None if the rough attitude is too uncertain or the position of the Sun is unknown.
+    """
     rough = knowledge.attitude
     if rough is None or rough.sigma > LIT_SIGMA or knowledge.sun is None:
         return None

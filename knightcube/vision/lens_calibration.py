@@ -92,8 +92,8 @@ class LensPrior:
     Attributes:
         focal_length: relative error of the focal length. The default `focal_length` allows any lens with a
             roughly known field of view.
-        centre: error of the optical axis in the image, per axis, px. The default `centre` allows a sensor
-            that was positioned by hand.
+        centre: error of the optical axis in the image, per axis, px. The default `centre` allows for the
+            position error of a sensor that was mounted by hand.
         k1, k2: errors of the radial distortion coefficients. The default `k1` and `k2` allow any lens except
             a fisheye.
         pixels: errors of aspect and shear. The default `pixels` means square pixels.
@@ -336,11 +336,11 @@ class DeterminedLens:
 
 
 def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -> DeterminedLens:
-    """Return the lens of the frames from a fit of the determined terms only, starting from `initial`.
+    """Return the lens fitted to the frames with only those lens terms that the frames determine.
 
-    Lens terms are omitted one at a time, starting with k2, if they are undetermined or if a distortion
-    coefficient is smaller than its standard deviation. The remaining terms are fitted again after each
-    omission. Raises CalibrationError.
+    The fit starts from the lens `initial`. Lens terms are omitted one at a time, starting with k2, if they
+    are undetermined or if a distortion coefficient is smaller than its standard deviation. The remaining
+    terms are fitted again after each omission. Raises CalibrationError.
     """
     prior = _shape_prior(frames, initial)
     whole = found = calibrate(frames, initial, prior)
@@ -398,9 +398,9 @@ def lens_accuracy(
 
     The standard deviations of focal length and centre are taken from the fit `found`, which does not include
     the omitted terms. The standard deviation of the focal length includes its difference from the fit
-    `whole`, which includes all terms. The standard deviation of the distortion is the relative displacement
-    of an image corner. The standard deviation of the distortion includes the uncertainty of the fit with all
-    terms and the difference between the two fits.
+    `whole`, which includes all terms. The distortion is expressed as the displacement of an image corner,
+    relative to the distance of the corner from the image centre. The standard deviation of the distortion
+    includes the uncertainty of the fit with all terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -567,7 +567,10 @@ def calibrate_lens(
 
 
 def _mirrored_back(found: LensCalibration) -> LensCalibration:
-    """Return the calibration of mirrored images, given the calibration of these images after mirroring."""
+    """Return the calibration of images that show the mirrored sky.
+
+    The argument `found` is the calibration of the same images after each row was reversed.
+    """
     if found.determined is None:
         return replace(found, mirrored=True)
     determined = found.determined

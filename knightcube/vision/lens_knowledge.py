@@ -52,7 +52,7 @@ _MIN_INDEPENDENCE = 1e-10
 _MIN_COSINE = 0.05
 """Minimum cosine of the angle between a star in the image and the optical axis."""
 NONE = 1e-7
-"""Prior standard deviation by which a lens term is fixed at zero."""
+"""Prior standard deviation of a lens term that is held at zero."""
 MIN_SIGMA_PX = 0.02
 """Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 
@@ -71,9 +71,9 @@ class MatchedFrame:
         directions: unit vectors (n, 3) to the stars in any reference frame.
         covariance: covariances (n, 2, 2) of the star positions, px^2, used instead of `sigma`, or None if the
             errors along both axes are equal.
-        late: derivatives (n, 2) of the star positions by the line time of the shutter, px/s. If `late` is
-            given, the line time is the tenth parameter of the fit. If `late` is None, the fit has nine lens
-            parameters.
+        late: derivatives (n, 2) of the star positions with respect to the line time of the shutter, px/s. If
+            `late` is given, the line time is the tenth parameter of the fit. If `late` is None, the fit has
+            nine lens parameters.
     """
 
     points: FloatArray
@@ -150,7 +150,7 @@ def _pixels(fit: LensFit) -> FloatArray:
 
 
 def _tangential_slopes(tangent: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 2, 2) of distorted tangents by the coefficients p1 and p2."""
+    """Return the derivatives (n, 2, 2) of distorted tangents with respect to the coefficients p1 and p2."""
     x, y = tangent.T
     cross, square = 2.0 * x * y, x * x + y * y
     return np.stack([np.stack([cross, square + 2.0 * y * y]), np.stack([square + 2.0 * x * x, cross])]).T
@@ -210,9 +210,10 @@ def step(
 def _linearised(
     frame: MatchedFrame, fit: LensFit, number: int, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return weighted derivatives by lens parameters (2n, 9 or 10) and rotation (2n, 3), and residuals (2n,).
+    """Return weighted derivatives (2n, p) and (2n, 3) of n star positions, and weighted residuals (2n,).
 
-    The lens parameters are those of `Lens`. A small rotation moves a direction v by v x rotation.
+    The derivatives are with respect to p lens parameters (9 or 10) and to a small rotation. The lens
+    parameters are those of `Lens`. A small rotation moves a direction v by v x rotation.
     """
     misfit = residuals(frame, fit, number)
     usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
@@ -318,7 +319,8 @@ LEARNED = (*PARAMETERS[:5], "line_time", "psf_sigma")
 """Names of the parameters estimated from frames, in the units px, px, px, none, none, s and px."""
 _LINE_TIME, _PSF = 9, 10
 _AT = np.array([0, 1, 2, 3, 4, _LINE_TIME, _PSF])
-"""Indices of the estimated parameters LEARNED in an array of PARAMETERS, line time and point-spread width."""
+"""Indices of the parameters LEARNED in an array that contains PARAMETERS, line time and point-spread width.
+"""
 _SECOND_TERM = 1.0 / 3.0
 """Ratio of the prior standard deviations of the second and the first distortion term, at an image corner."""
 _FOURTH_LEFT = 0.058

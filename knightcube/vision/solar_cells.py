@@ -6,16 +6,16 @@ string's normal, and zero if the Sun is behind the string. The Earth also illumi
 at most a third of the intensity of the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of
 the light from the half of the sky that is centred on nadir e. Light from the Earth causes correlated errors
 of the strings. The correlation of the errors can be computed if nadir is known; otherwise the mean
-correlation over all nadir directions is used. The covariance of the Sun direction includes the correlation of
-the strings' errors by light from the Earth.
+correlation over all nadir directions is used. The covariance of the Sun direction includes the correlated
+errors that light from the Earth causes.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if one
 string fails, in whatever way. The magnetic field does not determine the rotation about the field direction.
 The estimator therefore tries rotations by all angles about the field direction, and predicts for each the
-illumination of the strings by Sun and Earth. A trial rotation is possible if all strings agree with it, or if
-all readings contradict it in at most one string, which is the same in each reading. Between readings, the
-possible rotations are propagated with the gyro. The covariance of the attitude includes all possible
-rotations (solution separation as in receivers of satellite navigation, Brown 1992, Navigation 39).
+illumination of the strings by Sun and Earth. A trial rotation is possible if no string contradicts it, or if
+a single string contradicts it and this string is the same in all readings. Between readings, the possible
+rotations are propagated with the gyro. The covariance of the attitude includes all possible rotations
+(solution separation as in receivers of satellite navigation, Brown 1992, Navigation 39).
 """
 
 from __future__ import annotations
@@ -250,8 +250,8 @@ class FieldAndStrings:
     """Attitude estimator that keeps track of the possible rotations about the magnetic field.
 
     Attributes:
-        wrong: description of a fault that the last reading shows. The description `wrong` is empty if all
-            strings agree.
+        wrong: description of a fault that the last reading shows. The description is empty if the last
+            reading shows no fault.
     """
 
     def __init__(self, strings: SolarStringModel) -> None:
@@ -263,7 +263,7 @@ class FieldAndStrings:
         self.wrong = ""
 
     def forget(self) -> None:
-        """Reset all rotations about the field to possible, after the body has rotated without gyro data."""
+        """Mark all rotations about the field as possible, after the body has rotated without gyro data."""
         self._base = None
         self._against[:] = 0.0
 

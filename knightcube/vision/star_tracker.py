@@ -38,8 +38,7 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 UNKNOWN_FOV_DEG = 4.0, 60.0
 """Range of the field of view (deg) that is searched if the field of view is unknown."""
 _SQUARES, _LEAST_COARSE_PX = (3, 5), 330
-"""Side lengths (px) of squares over which an unsolved image is summed, and shortest side (px) of the result.
-"""
+"""Bin sizes (px) with which an unsolved image is binned, and minimum side length (px) of the binned image."""
 FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, relative to the field of view."""
 
@@ -52,7 +51,7 @@ class MatchedStars:
         hip: Hipparcos numbers (m,) of the stars. For a group of stars that the image does not resolve, `hip`
             is the number of the brightest star.
         magnitude: Johnson V magnitudes (m,). For stars that the image does not resolve, `magnitude` is their
-            joint magnitude.
+            combined magnitude.
         directions: unit vectors (m, 3) to the stars, ICRS, at the epoch of the image.
         points: measured positions (m, 2), x and y, px. The position of a streaked star is that at
             mid-exposure.
@@ -275,7 +274,7 @@ class StarTracker:
         return _solution(frame, sky, settings.velocity, exposure is not None)
 
     def _solved_coarser(self, image: Image, sky: SkyIndex, settings: SolveSettings) -> FrameSolution | None:
-        """Return the solution of a large image after its pixels are summed in squares, or None if it fails.
+        """Return the solution of a large image after binning, or None if no binned image is solved.
 
         The stars of large photographs are often several pixels wide. Compression or interpolation correlates
         the noise of neighbouring pixels, so that the computed uncertainties of the star positions are too
@@ -303,7 +302,10 @@ class StarTracker:
         )
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
-        """Return the camera for an image of `shape`, and the limits of the scale of field-angle tangents."""
+        """Return the camera for an image of `shape`, and the lowest and highest possible scale.
+
+        The scale is the factor on the tangents of the observed field angles, see `camera_of_field`.
+        """
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
@@ -318,9 +320,9 @@ class StarTracker:
 
 
 def _summed(image: Image, size: int) -> Image:
-    """Return an image (rows, columns) whose pixels are the sums of squares of `size` x `size` px.
+    """Return a binned image (rows, columns), whose pixels are sums over bins of `size` x `size` px.
 
-    The squares are centred in the image. `size` is odd, so that the margins can be equal on both sides.
+    The bins are centred in the image. `size` is odd, so that the margins can be equal on both sides.
     """
     rows, columns = (_squares(length, size) for length in image.shape)
     top, left = (
@@ -332,13 +334,19 @@ def _summed(image: Image, size: int) -> Image:
 
 
 def _squares(length: int, size: int) -> int:
-    """Return the largest number of squares of odd `size` px that leaves equal margins in `length` px."""
+    """Return the largest number of bins along `length` px that leaves equal margins at both ends.
+
+    Each bin is `size` px wide, where `size` is odd.
+    """
     count = length // size
     return count - (length - size * count) % 2
 
 
 def _in_whole_image(found: FrameSolution, size: int, shape: tuple[int, ...]) -> FrameSolution:
-    """Return a solution of summed pixels (`_summed`) in the pixels of the image of `shape`."""
+    """Return the solution of a binned image (`_summed`), converted to pixels of the original image.
+
+    The argument `size` is the bin size, px, and `shape` is the shape of the original image.
+    """
     rows, columns = shape
     margin = [0.5 * (length - size * _squares(length, size)) for length in (columns, rows)]
     offset = np.array(margin) + 0.5 * (size - 1)
@@ -365,7 +373,9 @@ def field_of_view(camera: CameraModel) -> float:
 def camera_of_field(
     fov_deg: float | None, error_deg: float | None, shape: tuple[int, ...]
 ) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a pinhole camera for a field of view, and the limits of the scale of field-angle tangents.
+    """Return a pinhole camera for a field of view, and the lowest and highest possible scale.
+
+    The tangents of the observed field angles must be multiplied by the scale for the true field of view.
 
     Args:
         fov_deg: field of view across the columns, deg. If `fov_deg` is None, the range `UNKNOWN_FOV_DEG` is

@@ -174,7 +174,8 @@ _STEP = 0.5
 _ROUNDS = 3
 """Maximum number of times a rim is traced, each time from the centre of the last fitted circle."""
 _NEAR = 0.5
-"""Distance (px) of the fitted centre from the origin of the spokes below which the rim is not retraced."""
+"""Largest distance (px) between the fitted centre and the origin of the spokes in the last tracing of a rim.
+"""
 
 
 def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = None) -> SunSolution:
@@ -395,7 +396,7 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
     backward = np.linalg.inv(disc.scale)
     floor = settings.floor_sigma**2 * backward @ backward.T
     axis = disc.axis
-    # The basis vectors of the rim are made normal to the direction of the fitted centre.
+    # The basis of the tangent plane in which the rim was traced is made normal to the fitted direction.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
     return SunMeasurement(
@@ -420,9 +421,10 @@ _MOST_CORRELATED = 0.9
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Fraction of the best circle's number of points with which a smaller circle is preferred.
+"""Minimum ratio of the number of points on a smaller circle to that on the best circle.
 
-Stray light enlarges discs, so that a smaller circle is more likely the Sun.
+A smaller circle that reaches this ratio is preferred. Stray light enlarges discs, so that a smaller circle is
+more likely the Sun.
 """
 
 
@@ -490,9 +492,10 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the circle (x, y, radius) through three points that has most points within the distance `gate`.
+    """Return the best circle (x, y, radius) through three of the points, or None if there is no circle.
 
-    The three points of a circle have equal spacings, between an eighth and a third of the rim.
+    The best circle is the smallest of the circles that have nearly the most points within the distance
+    `gate`. The three points of a circle have equal spacings, between an eighth and a third of the rim.
     """
     count = len(points)
     place = np.arange(0, count, 3)
@@ -524,7 +527,8 @@ _SIGMAS = 3.0
 _RING = 12
 """Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _SHARES = (1.0 / 6.0, 1.0 / 3.0, 0.5, 2.0 / 3.0, 5.0 / 6.0, 1.0)
-"""Angular distances from the coarse Sun direction at which directions are tested, relative to the largest."""
+"""Angular distances of the tested directions from the coarse Sun direction, relative to the largest distance.
+"""
 _CONTRADICTED = 5.0
 """Largest accepted angle between measured and coarse Sun direction, in standard deviations of the latter."""
 _CUT = np.radians(0.05)
@@ -604,8 +608,8 @@ def sun_of_cameras(
 ) -> SunOfCameras:
     """Return the Sun direction in body axes from the first camera that finds it, or from the solar strings.
 
-    A camera is not read if the solar strings exclude that the Sun is in its field of view. A measured Sun
-    that contradicts the solar strings is rejected.
+    A camera is not read if, according to the solar strings, the Sun cannot be in its field of view. A
+    measured Sun that contradicts the solar strings is rejected.
 
     Args:
         images: images (rows, columns) taken at one instant, by camera index.

@@ -165,7 +165,7 @@ _AFTER, _BEFORE = [1, 2, 0], [2, 0, 1]
 
 
 def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (n,), rad, of rays (n, 3), and gradients (n, 5) with respect to the fitted parameters."""
+    """Return residuals (n,), rad, of rays (n, 3), and gradients (n, 5) with respect to the fit parameters."""
     stretching = view.surface.stretching(view.limb_height)
     by_height = view.surface.stretching_by_height(view.limb_height)
     centre = -(stretching @ view.position)

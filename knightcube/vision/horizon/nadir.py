@@ -248,12 +248,10 @@ def nadir_of_uncertain_field(
 ) -> HorizonSolution:
     """Return the nadir if the camera's focal length has the relative standard deviation `sigma`.
 
-    The image is searched with eleven trial focal lengths. Nadir and altitude are weighted means over the
-    horizons of all focal lengths. The weight of a horizon is the probability of its focal length and of its
-    misfit. The uncertainties of nadir and altitude include the scatter of the individual nadirs and altitudes
-    about the means. A horizon that is refused, for example because the brightness of the image contradicts
-    it, is also included in the means. If refused horizons have half of the total weight or more, the image is
-    refused. See `find_nadir`.
+    Nadir and altitude are weighted means over the horizons of eleven trial focal lengths. The weight of a
+    horizon is the probability of its focal length and of its misfit. The uncertainty of each mean includes
+    the scatter of the individual horizons. Refused horizons also contribute to the means, but the image is
+    refused if they have half of the total weight or more. See `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     first = find_nadir(image, camera, knowledge, settings, hidden)

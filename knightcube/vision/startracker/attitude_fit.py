@@ -80,7 +80,7 @@ class ScaleSteps:
     """Steps of the range of possible scales within which the side ratios of triangles are nearly constant.
 
     Attributes:
-        middle: scale in each step for which the side ratios of triangles are computed (s,).
+        middle: scales (s,), one in each step, at which the side ratios of triangles are computed.
         lowest, highest: limits of the scale of each step (s,).
     """
 
@@ -269,11 +269,11 @@ def _refined_numpy(
     scale: float,
     free_scale: bool,
 ) -> _Refined:
-    """Return whether the fit converged, matrix, scale, covariance and squares of the `Refinement`."""
+    """Return whether the fit converged, and the four attributes of the resulting `Refinement`."""
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
-    # The 9 x 9 Gram matrix of weighted predictions, residuals and derivatives by the scale contains all terms
-    # of the normal equations.
+    # The 9 x 9 Gram matrix of weighted predictions, residuals and derivatives with respect to ln scale
+    # contains all terms of the normal equations.
     rows = np.zeros((len(observed), 9))
     normal = np.zeros((parameters, parameters))
     failed = False, matrix, scale, np.zeros((parameters, parameters)), np.zeros(len(observed))
@@ -382,7 +382,7 @@ def _fill_rows(
     scale: float,
     rows: FloatArray,
 ) -> None:
-    """Write weighted predictions, residuals and derivatives by ln scale to `rows` (n, 9)."""
+    """Write weighted predictions, residuals and derivatives with respect to ln scale to `rows` (n, 9)."""
     squared = scale * scale
     for k in range(len(observed)):
         z, w = observed[k, 2], weight[k]

@@ -51,7 +51,7 @@ _NEAR = 1.4
 _TWIN = 2.0
 # Largest distance (px) between a measured star and its catalogue star, and minimum ratio of their fluxes.
 _SAME, _ALIKE = 5.0, 0.3
-# Distance (px) from a catalogue star's streak within which a measured star is a segment of this streak.
+# Distance (px) from a catalogue star's streak within which a measured star counts as part of the streak.
 _BESIDE = 2.5
 # Relative error of a star's flux that is predicted from the catalogue.
 _LIGHT_ERROR = 0.15
@@ -134,7 +134,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # If the attribute `hidden` is None, no further fit with fewer streaks is made.
+    # With `hidden` set to None, `with_rate` does not repeat the fit with fewer streaks.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:

@@ -41,7 +41,7 @@ from knightcube.vision.startracker.sky_map import ASPECT, BENDS, bend_slope, ben
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
-# Step (px) for the numerical derivative of a star's direction by its image position.
+# Step (px) for the numerical derivative of a star's direction with respect to its image position.
 _STEP_PX = 0.5
 # Value of chi-square (2 degrees of freedom) that is exceeded with a probability of 0.1 %, and the median of
 # chi-square.
@@ -55,7 +55,7 @@ _LEAST_AGREEING = 4
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
 # Number of parameters of attitude and scale.
 _POSE = 4
-# Maximum number of repeated selections of the stars that agree, each with larger variances.
+# Maximum number of times that the common variance is estimated and the agreeing stars are selected.
 _AGREEMENT_ROUNDS = 3
 
 
@@ -97,8 +97,8 @@ class ImageFit:
         delay: fitted error of the shutter's line time, in standard deviations.
         excess: chi-square per degree of freedom of the stars that agree with each other, for the measured
             variances of their positions; 1 unless it is significantly larger. Only attitude and scale are
-            counted as parameters, so that few stars are not regarded as contradictory because lens errors are
-            fitted.
+            counted as fitted parameters. With fitted lens errors also counted, a frame with few stars would
+            have too few degrees of freedom.
         agree: mask of the stars that were used for the attitude (n,).
     """
 
@@ -131,7 +131,7 @@ def fit_in_image(
 
     Raises AttitudeError if the stars do not determine the parameters.
     """
-    # The array `slopes` (n, 3, 2) contains the derivatives of the directions by the image positions.
+    # The array `slopes` (n, 3, 2) contains the derivatives of the directions with respect to the positions.
     moved = [
         camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
         for offset in _STEP_PX * np.eye(2)
@@ -147,7 +147,8 @@ def fit_in_image(
     factor = inflation(squares[agree], seen.parameters(pose))
     if unknowns.scatter or factor > 1.0:
         other, shifted, more = _with_scatter(seen, pose, agree)
-        # For points, the residuals decide between a factor and an added variance common to all stars.
+        # Two explanations of the residuals of points are compared, and the more likely one is used. Either
+        # all variances are too small by a common factor, or a common variance must be added to all variances.
         if unknowns.scatter or _surprise(other, shifted, more, 1.0) < _surprise(seen, pose, more, factor):
             seen, pose, agree = other, shifted, more
             squares = seen.squares(pose)
@@ -164,7 +165,7 @@ def fit_in_image(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FittedPose:
-    """Fitted attitude matrix (3, 3), scale, lens errors (bend, (8,)) and delay, and their covariance."""
+    """Fitted attitude matrix (3, 3), scale, lens errors `bend` (8,), shutter delay, and their covariance."""
 
     matrix: FloatArray
     scale: float
@@ -185,7 +186,7 @@ class _Seen:
         unknowns: parameters that are fitted together with the attitude.
         whitener: transformation (n, 2, 3) of a direction error into two components of unit variance.
         late: displacement of each direction due to a line time error of one standard deviation (n, 3), rad.
-        before: reciprocal prior variances of the last parameters: the lens errors (bend) and the delay.
+        before: reciprocal prior variances of the fitted lens errors `bend` and of the fitted delay.
     """
 
     observed: FloatArray
@@ -263,11 +264,11 @@ def _fitted_numpy(
     held: FloatArray,
     free_scale: bool,
 ) -> _Fitted:
-    """Return whether the stars agree, and matrix, scale, last parameters `held` and covariance of a fit.
+    """Return whether the stars agree, and the fitted matrix, scale, lens errors with delay, and covariance.
 
-    The parameters are the rotation, ln scale if `free_scale`, some of the lens errors, and the delay unless
-    `late` is empty. The lens errors and the delay, `held`, have the reciprocal prior variances `known`.
-    Raises LinAlgError if the normal matrix is singular.
+    The fitted parameters are a rotation, ln scale if `free_scale` is true, some of the lens errors, and the
+    delay if `late` is not empty. The array `held` contains the initial lens errors and delay, and `known`
+    contains their reciprocal prior variances. Raises LinAlgError if the normal matrix is singular.
     """
     whitener = whitener * np.sqrt(weight)[:, None, None]
     bend, first, bends = np.zeros(BENDS), 3 + int(free_scale), len(held) - int(len(late) > 0)
@@ -297,8 +298,8 @@ def _normal(
 ) -> tuple[FloatArray, FloatArray]:
     """Return normal matrix (p, p) and gradient (p,) of the residuals, scaled to unit variance.
 
-    The p parameters are the rotation, ln scale if `scale`, the first `bends` lens errors, and the delay
-    unless `late` is empty.
+    The p parameters are a rotation, ln scale if `scale` is true, the first lens errors (`bends` of the
+    eight), and the delay of the shutter if `late` is not empty.
     """
     slopes = [-whitener @ cross_matrices(predicted)]
     if scale:
@@ -397,7 +398,7 @@ def _write_normal(
 
 @loop_helper
 def _see(observed: FloatArray, scale: float, bend: FloatArray, seen: FloatArray) -> None:
-    """Write the unit vector `observed` (3,) to `seen` after `stretched` and `bent`."""
+    """Write the unit vector `observed` (3,), corrected for scale and lens errors, to `seen`."""
     squared, z = scale * scale, observed[2]
     shrink = 1.0 / math.sqrt(squared + (1.0 - squared) * z * z)
     x, y, z = observed[0] * scale * shrink, observed[1] * scale * shrink, z * shrink
@@ -419,7 +420,7 @@ def _see(observed: FloatArray, scale: float, bend: FloatArray, seen: FloatArray)
 def _write_slopes(
     seen: FloatArray, predicted: FloatArray, scale: bool, bends: int, slope: FloatArray
 ) -> None:
-    """Write the derivatives of a residual by rotation, scale and lens errors to `slope` (3, p)."""
+    """Write derivatives of a residual with respect to rotation, scale and lens errors to `slope` (3, p)."""
     (x, y, z), (px, py, pz) = seen, predicted
     slope[0, 0], slope[0, 1], slope[0, 2] = 0.0, pz, -py
     slope[1, 0], slope[1, 1], slope[1, 2] = -pz, 0.0, px
@@ -537,7 +538,8 @@ def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen,
         excess = float(np.sum(missed**2)) - (2 * len(missed) - seen.parameters(pose))
         if excess <= _EXPLAINED or len(missed) <= _LEAST_AGREEING:
             break
-        # The Newton step uses the derivative of chi-square by the common variance for a fixed pose.
+        # The Newton step uses the derivative of chi-square with respect to the common variance, at constant
+        # pose.
         variance += excess / float(np.sum(np.linalg.solve(root.swapaxes(1, 2), missed[..., None]) ** 2))
         seen = replace(seen, covariance=own + variance * np.eye(2))
         pose = seen.fitted(pose, weight)

@@ -243,7 +243,8 @@ _WIDEST_CORE = 7.0
 _SHARPER, _BROADER = 0.55, 1.8
 _SURE = 3.0
 _LONGER_THAN_COMA = 12.0
-# Radius (px) around a source within which most sources must look like stars for the source not to be clutter.
+# Radius (px) around a source. If most sources within this radius do not look like stars, the source is
+# clutter.
 _ABOUT = 48.0
 _ODD_PART, _LEAST_ODD = 0.5, 8
 _ODD_WIDTH, _ODD_LENGTH = 1.25, 2.5
@@ -330,7 +331,10 @@ def looks_odd(quality: IntArray, shapes: Shapes, spread: FrameSpread) -> BoolArr
 
 
 def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
-    """Return which sources (n,) at `points` (n, 2), px, have mostly `odd` sources (n,) around them."""
+    """Return which of n sources are mostly surrounded by sources that do not look like stars.
+
+    The sources are at `points` (n, 2), px. The mask `odd` (n,) marks the sources that do not look like stars.
+    """
     near = np.sum((points[:, None] - points) ** 2, axis=-1) < _ABOUT**2
     strange = near @ odd.astype(float)
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))

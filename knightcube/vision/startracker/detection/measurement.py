@@ -223,15 +223,18 @@ def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Ce
 
 
 def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: float) -> Centroid:
-    """Return centroids with a Gaussian weight that moves with the centroid from the centre of mass."""
+    """Return centroids with a Gaussian weight that is centred on the last centroid in each iteration.
+
+    The iteration starts from the centre of mass `start`.
+    """
     steps = np.stack([np.broadcast_to(step, clean.shape[1:]) for step in _steps(clean)])
     place, reach = start[0].copy(), (clean.shape[1] - 1) / 2.0
     for _round in range(_ROUNDS + 1):
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # The variable `gain` is the derivative of the weighted sum by the position of the weight, about half
-        # of the sum.
+        # The variable `gain` is the derivative of the weighted sum with respect to the position of the
+        # weight, which is about half of the sum.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -253,7 +256,8 @@ def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float)
     columns = np.stack([np.ones_like(x), x, y, -(x * x + y * y)], axis=1).reshape(len(clean), 4, -1)
     weighed = columns * weight.reshape(len(clean), 1, -1)
     normal = weighed @ columns.transpose(0, 2, 1) + 1e-12 * np.eye(4)
-    # The array `moved` contains the derivatives of the four unknowns by the logarithm of each pixel.
+    # The array `moved` contains the derivatives of the four unknowns with respect to the logarithm of each
+    # pixel's count.
     moved = np.linalg.solve(normal, weighed)
     found = np.sum(moved * np.log(light).reshape(len(clean), 1, -1), axis=2)
     bend = np.where(found[:, 3] > 0.0, found[:, 3], np.inf)
@@ -335,7 +339,7 @@ def centre_of_mass(
 
 
 def _places(window: FloatArray, variance: FloatArray, psf_sigma: float, method: Method) -> Centroid:
-    """Return the centroids from a method, and their derivatives by the pixels inside the window's border."""
+    """Return centroids, and their derivatives with respect to the pixels inside the border of the window."""
     offset, flux, sky = _moments(window)
     clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
     half = window.shape[1] // 2

@@ -142,9 +142,9 @@ _BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the fraction (n, k) of a star's flux in each of k = 2 half + 1 pixels along one axis.
 
-    The second and third returned arrays are the derivatives of the fraction (n, k), 1/px, by `offset` and by
-    `sigma`. The position of the star relative to the centre of the middle pixel is `offset` (n,), px, and the
-    standard deviation of the PSF is `sigma` (n,), px.
+    The second and third returned arrays (n, k) are the derivatives of the fraction, 1/px, with respect to
+    `offset` and with respect to `sigma`. The position of the star relative to the centre of the middle pixel
+    is `offset` (n,), px, and the standard deviation of the PSF is `sigma` (n,), px.
     """
     from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
 
@@ -221,8 +221,8 @@ def measure_noise(
     """Return the noise model from the residuals of a fit of stars; a given gain is kept.
 
     The squared residual minus the squared sky noise is modelled as a sum of non-negative multiples of light
-    and light^2, found by least squares. The weights of the least-squares fit are the reciprocal variances of
-    the square of a normal residual.
+    and light^2, found by least squares. Each squared residual is weighted with the reciprocal of its
+    variance, which is computed for normally distributed residuals.
 
     Args:
         residual: residuals of the fit (n, k, k), counts.
@@ -325,7 +325,10 @@ def _non_negative(
 ) -> tuple[float, float]:
     """Return the non-negative coefficients a, b of a fit of light and light^2, from two normal equations.
 
-    The equations are of_light a + of_both b = along and of_both a + of_square b = across.
+    The coefficient a belongs to light, and b to light^2. The first three arguments are the weighted sums of
+    light^2, light^3 and light^4 over the pixels. The arguments `along` and `across` are the weighted sums of
+    the excess variance times light and of the excess variance times light^2. The normal equations are
+    of_light a + of_both b = along and of_both a + of_square b = across.
     """
     determinant = of_light * of_square - of_both**2
     if determinant > 1e-12 * of_light * of_square:
@@ -383,7 +386,7 @@ class PsfFit:
         return select(self, chosen)
 
     def replaced(self, chosen: IntArray, part: PsfFit) -> PsfFit:
-        """Return these fits with the fits of the stars `chosen` (k,) replaced by `part`."""
+        """Return a copy in which `part` replaces the fits of the stars with the indices `chosen` (k,)."""
         out = {item.name: getattr(self, item.name).copy() for item in fields(self)}
         for name, values in out.items():
             values[chosen] = getattr(part, name)
@@ -550,7 +553,7 @@ def _solve(
 def _derivatives(
     value: FloatArray, shift: FloatArray, share: FloatArray, size: int, jacobian: FloatArray
 ) -> None:
-    """Write the derivatives (5, k * k) of the counts of one star by its parameters `value` (5,)."""
+    """Write the derivatives (5, k * k) of one star's counts with respect to its parameters `value` (5,)."""
     across, down = np.empty((3, size)), np.empty((3, size))
     jacobian[:] = 0.0
     for node in range(len(share)):
@@ -604,7 +607,7 @@ def _inner(first: FloatArray, second: FloatArray) -> float:
 
 @loop_helper
 def _profile(offset: float, sigma: float, out: FloatArray) -> None:
-    """Write `profile` of one star to `out` (3, k): the fractions, and their derivatives."""
+    """Write the three arrays that `profile` returns, for one star, to the rows of `out` (3, k)."""
     size = out.shape[1]
     edge = (-0.5 * size - offset) / sigma
     whole, slope = 0.5 * math.erfc(-edge * _ROOT_HALF), _BELL * math.exp(-0.5 * edge * edge) / sigma
@@ -652,8 +655,8 @@ def _invert(normal: FloatArray, out: FloatArray) -> None:
 def _model(values: FloatArray, shift: FloatArray, share: FloatArray, jacobian: FloatArray) -> FloatArray:
     """Return the modelled counts of the stars (n, k, k), and write their derivatives to `jacobian`.
 
-    The array `jacobian` (n, p, k * k) receives the derivatives by the first p of the parameters `values`
-    (n, 5), where p is 4 or 5.
+    The derivatives (n, p, k * k) are with respect to the first p of the five parameters `values` (n, 5) of
+    each star, where p is 4 or 5.
     """
     flux, size, count = values[:, FLUX, None], math.isqrt(jacobian.shape[2]), jacobian.shape[1]
     total = jacobian.reshape(len(values), count, size, size)

@@ -1,4 +1,4 @@
-"""The survey of a frame: sky background, areas above the noise, and classification as points or streaks.
+"""Sky background of a frame, areas of pixels above the noise, and classification as points or streaks.
 
 `survey` smooths the frame, finds the pixels above the noise and joins them into connected areas. The shapes
 of the brightest areas distinguish a frame of points from a frame of streaks.
@@ -72,7 +72,10 @@ class Surface:
         return among_blocks(self.values, self.shape, column, row)
 
     def factors(self) -> tuple[Float32Array, Float32Array]:
-        """Return two matrices (rows, down), (down, columns) whose product is the surface at every pixel."""
+        """Return two matrices (rows, down) and (down, columns), whose product is the value at every pixel.
+
+        The number of rows of blocks is `down`.
+        """
         down, across = (
             interpolation_weights(pixels, blocks)
             for pixels, blocks in zip(self.shape, self.values.shape, strict=True)
@@ -139,7 +142,7 @@ def in_counts(pixels: Image) -> tuple[Image, float]:
 def measure_sky(pixels: Image, single: Background | None = None) -> SkyBackground:
     """Return the sky background and noise of a frame (rows, columns), before and after smoothing.
 
-    The background `single` of single pixels is measured unless it is given.
+    If the background before smoothing, `single`, is not given, it is measured.
     """
     shape = (pixels.shape[0], pixels.shape[1])
     single = estimate_background(pixels, _SKY_BLOCK, _SINGLE_STRIDE) if single is None else single
@@ -365,14 +368,14 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
 
 
 def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return each block's relative upper noise tail, and a mask of the blocks with clipped noise.
+    """Return the length of each block's upper noise tail, and a mask of the blocks with clipped noise.
 
     In a normal distribution, 2.3 % of the pixels of a block exceed the mean by more than two standard
     deviations, and 2.3 % are below the mean by more than two standard deviations. If a sky is clipped at zero
     counts, its moments underestimate the noise. For each block, the median over the 3 x 3 blocks around it is
     used, because a few stars hardly change the median. A textured foreground has a long tail, whereas the sky
-    beside it has no long tail. The upper noise tail is relative to that of a normal distribution, and is at
-    least 1.
+    beside it has no long tail. The length of the upper noise tail is relative to that of a normal
+    distribution, and is at least 1.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
