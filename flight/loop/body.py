@@ -134,7 +134,8 @@ class ReadingAgreement:
 
     Attributes:
         holds: whether at least one quantity of the reading agrees, so that the estimate counts as measured.
-        objection: name of the quantity that does not agree; empty if all quantities agree.
+        objection: name of a quantity of the reading that contradicts the estimate; empty if all quantities
+            agree.
     """
 
     holds: bool
@@ -305,11 +306,11 @@ class BodyTargets(Protocol):
         """Return the angle (rad) between body and target."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle (rad) of the body from the attitude that is due now, or None while none is due."""
+        """Return the angle (rad) between body and attitude required now, or None while none is required."""
 
 
 class BodyView(Protocol):
-    """Telemetry packets and texts of a kind of body."""
+    """Telemetry packets, event texts and progress texts of one kind of body."""
 
     def record_cycle(self, output: ControlOutput) -> None:
         """Record the packets of this kind of body for a control cycle."""
@@ -335,7 +336,7 @@ class HorizonCameraUse(Protocol):
         """Whether the body needs horizon frames often, because its attitude is poorly known."""
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
-        """Return the worker's job for frames, which are given by camera number."""
+        """Return the worker's job for `frames`, a mapping from camera numbers to frames."""
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
         """Accept the directions of Sun and nadir at a time; return whether each of them was used."""
@@ -374,7 +375,7 @@ class BodyEstimation(Protocol):
         return learned_of(estimate)
 
     def coils_corrected(self, change: FloatArray, deviations: FloatArray) -> None:
-        """Adapt the estimation to a correction, which multiplies the described coil dipoles by `change` (n,).
+        """Adapt the estimation to corrected coil dipoles: the former dipoles multiplied by `change` (n,).
 
         The relative standard deviations of the corrected dipoles are `deviations` (n,). The default method
         does nothing, for a filter that does not estimate the coils separately.

@@ -100,8 +100,8 @@ class Sampling:
 
 
 NEWEST = Sampling(0.2, 1.0)
-"""Error bounds of one ADC sample at an unknown time in its window. Chopping alone causes 18 %
-(`hal.drivers.ina219`).
+"""Error bounds of one ADC sample at an unknown time in its window. The PWM chopping of the current alone
+causes an error of 18 % (`hal.drivers.ina219`).
 """
 MEAN = Sampling(0.02, 0.25)
 """Error bounds of the mean of five ADC samples.
@@ -114,9 +114,9 @@ An error of 7 % that is common to all readings is part of the gain error instead
 class Predicted:
     """A reading (A) of the supply current, and the current (n, v), A, predicted for each axis and variant.
 
-    The prediction consists of the mean over the time window (`mean`), its error bound without chopping
-    (`slack`) and the error bound due to chopping (`chopped`). A reading that is `clipped` is a lower bound of
-    the current.
+    The prediction consists of the mean over the time window (`mean`), the error bound due to the PWM chopping
+    of the coil currents (`chopped`) and the error bound due to all other causes (`slack`). A reading that is
+    `clipped` is a lower bound of the current.
     """
 
     current: float

@@ -5,28 +5,28 @@ In each cycle, the loop passes the commands (`commanded`, `interrupted`), the sa
 reads the results: `verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and
 `monitor_doubted`. No call waits.
 
-The current monitor measures the sum of |I| over all H-bridges. The current monitor cannot detect a
-reversed coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
-prediction of each hypothesis (`flight.loop.coil_currents`). A hypothesis is that all coils are healthy, or
-that one axis is open, shorted, or has one leg of an input stuck. A verdict on a broken coil is given when the
-hypothesis `healthy` is rejected and all hypotheses that explain the later readings concern the same axis.
-Several axes remain possible if no axis or several axes are driven. Each of these axes is then driven alone by
-a small probe current, one after another. The other coils carry no current for the 1.6 s of a probe, so that
-one probe shows whether its coil draws current. A reversed coil is detected from the angular acceleration,
-which also distinguishes a faulty current monitor from a broken coil. Averaged over longer bins, the
-acceleration reveals missing torque at currents that are too small for the current monitor. The probe then
-shows whether the coil is open.
+The current monitor measures the sum of |I| over all H-bridges. The current monitor cannot detect a reversed
+coil, and it detects an open coil only while that coil is driven. Every reading is compared with the
+prediction of each hypothesis (`flight.loop.coil_currents`). One hypothesis is that all coils are healthy.
+Each other hypothesis assumes one fault of one coil: the coil is open or shorted, or one leg of its H-bridge
+is stuck. A coil is diagnosed as broken when the readings reject the hypothesis of healthy coils, and all
+hypotheses that explain the later readings concern this coil. Several axes remain possible if no axis or
+several axes are driven. Each of these axes is then driven alone by a small probe current, one after another.
+The other coils carry no current for the 1.6 s of a probe, so that one probe shows whether its coil draws
+current. A reversed coil is detected from the angular acceleration, which also distinguishes a faulty current
+monitor from a broken coil. Averaged over longer bins, the acceleration reveals missing torque at currents
+that are too small for the current monitor. The probe then shows whether the coil is open.
 
 An output leg that is stuck high is found by commanding zero currents and braking the bridges. Braking (both
 inputs high) removes the voltage from a coil, whether its bridge is healthy or not. If the supply current is
-far too large or too small, all coils are commanded to zero. If current still flows at zero commands, there is
-a fault, and all bridges are braked at once. If braking stops the current, the bridges are released one by
-one. If the current returns when a bridge is released, that bridge is broken. During the search for a stuck
-leg, no healthy coil carries current, and no other verdict is given. The search ends if neither zero commands
-nor braking change the current, as with a shorted coil or a faulty current monitor. If the commands change
-continuously, as in the windows of B-dot detumbling, the command that was in force during an ADC sample is
-ambiguous. While commands change continuously, all coils are commanded to zero every few seconds as a check,
-even without a suspicion.
+far too large or too small, all coils are commanded to zero. If current still flows although zero is
+commanded, there is a fault, and all bridges are braked at once. If braking stops the current, the bridges are
+released one by one. If the current returns when a bridge is released, that bridge is broken. During the
+search for a stuck leg, no healthy coil carries current, and no other fault is diagnosed. The search ends if
+neither commanding zero currents nor braking changes the current, as with a shorted coil or a faulty current
+monitor. If the commands change continuously, as in the windows of B-dot detumbling, the command that was in
+force during an ADC sample is ambiguous. While commands change continuously, all coils are commanded to zero
+every few seconds as a check, even if no fault is suspected.
 
 A reversed coil draws the same supply current as a healthy coil, so only the motion of the body can reveal it.
 A coil that rotates the body in the wrong direction is not isolated, but used with the opposite sign. A coil
@@ -37,9 +37,9 @@ reviewed when the body is slower than `tumble_rate`. The motion then confirms th
 changed again. A coil whose sign changes more than twice in ten minutes is kept at zero current until the body
 is slow, or for ten minutes.
 
-A verdict on a broken coil is not final. While the body is slow, a broken coil is used again for a trial ten
-minutes after its verdict, and at most three times. If the fault persists, the coil is diagnosed as broken
-again.
+The diagnosis of a broken coil is not final. While the body is slow, a broken coil is used again for a trial
+ten minutes after its diagnosis, and at most three times. If the fault persists, the coil is diagnosed as
+broken again.
 
 The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
 and 18 % for a single ADC sample of the chopped current (`hal.drivers.ina219`).
@@ -85,7 +85,7 @@ _SURE = 2
 _PATIENCE = 12
 """Number of ADC samples without agreement after which a step of the search is abandoned."""
 _PAUSE = 50
-"""Number of ADC samples between a check at zero command without a finding and the next check."""
+"""Minimum number of ADC samples from a check at zero current that finds no fault to the next check."""
 _UNCLEAR = 20
 """Number of consecutive ADC samples with ambiguous commands after which the coils are checked at zero."""
 
@@ -99,7 +99,7 @@ class _Step(Enum):
 
 
 class StuckLeg:
-    """Searches for an output leg that is stuck high, by zero commands and braking of the bridges.
+    """Searches for an output leg that is stuck high by commanding zero currents and braking the bridges.
 
     Attributes:
         brake: indices of the bridges that must be braked now.
@@ -134,7 +134,7 @@ class StuckLeg:
         return supplied.current > supplied.most + self._excess
 
     def ask_for_rest(self, why: str) -> None:
-        """Request zero commands, unless a search is running or the last request is too recent."""
+        """Request zero currents in all coils, unless a search is running or the last request is recent."""
         if self._step is _Step.WATCHING and not self._pause:
             self._rest(why)
 
@@ -142,7 +142,7 @@ class StuckLeg:
         """Process an ADC sample, and return the axis with a stuck leg once it is identified."""
         self._pause = max(self._pause - 1, 0)
         if self.rest and supplied.driven:
-            return None  # zero commands are not yet in force
+            return None  # the commanded zero currents are not yet in force
         high = self.exceeds(supplied)
         short = supplied.current < supplied.least - self._excess
         self._high = self._high + 1 if high else 0
@@ -256,7 +256,7 @@ class BrakeProof:
         return bool(self._axes)
 
     def add(self, axis: int) -> None:
-        """Add an axis that is braked because of a verdict and not yet confirmed."""
+        """Add an axis that is braked because of a diagnosis that is not yet confirmed."""
         self._axes.add(axis)
 
     def discard(self, axis: int) -> None:
@@ -280,7 +280,7 @@ class BrakeProof:
 
 @dataclass(frozen=True, slots=True)
 class CoilVerdict:
-    """The fault of one axis, which is the index of a coil."""
+    """The diagnosed fault of one coil, whose index is `axis`."""
 
     axis: int
     fault: CoilFault
@@ -290,7 +290,7 @@ class CoilVerdict:
 
 @dataclass(frozen=True, slots=True)
 class CoilMonitorSettings:
-    """Properties of the coil circuit and of the current monitor, and limits of the verdicts.
+    """Properties of the coil circuit and of the current monitor, and thresholds for a diagnosis.
 
     Attributes:
         full_current: current (A) of each coil when fully on, which is the supply voltage divided by its
@@ -301,16 +301,16 @@ class CoilMonitorSettings:
         monitor_noise: error bound (A) of the current monitor at any current.
         window_ns: time (ns) over which the current monitor averages. After a longer gap between readings, the
             evidence is discarded.
-        persistence: number of consecutive readings that raise a suspicion if they contradict a healthy
-            circuit.
+        persistence: number of consecutive readings after which a fault is suspected if these readings
+            contradict a healthy circuit.
         settle: number of readings after a fault until the averaging window excludes the time before it.
-        evidence: number of readings that are needed for a verdict.
+        evidence: number of readings that are needed for a diagnosis.
         probe_current: amplitude (A) of the square wave that reveals which of several axes is faulty.
         probe_half_ns: half the period (ns) of the probe's square wave.
         response: settings for evaluating the coils from the body's motion, or None if the motion is not used.
         slow: settings like `response` with longer bins, which reveal missing torque at small currents.
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
-        trial_after_ns: time (ns) from the verdict on a coil to its next trial.
+        trial_after_ns: time (ns) from the diagnosis of a broken coil to its next trial.
         trials: largest number of trials of each coil.
         self_test: settings of the self-test, or None if the coils are not tested.
         absent: axes without a coil.
@@ -348,9 +348,9 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int, prime: int | None = None) -> int | None:
-        """Begin a wave on the next untried axis of `axes`; return its end (ns), or None after all axes.
+        """Drive the next untried axis of `axes` by a square wave, and return the end time (ns) of the wave.
 
-        The axis `prime` is tried first.
+        The axis `prime` is tried first. The result is None if all axes have been tried.
         """
         candidates = axes - self._tried
         if not candidates:
@@ -367,7 +367,7 @@ class Probe:
         self._tried.clear()
 
     def wave(self, now_ns: int) -> FloatArray | None:
-        """Return the probe's currents (n,), A, at `now_ns`, or None while no wave is running."""
+        """Return the currents (n,), A, of the square wave at `now_ns`, or None while no wave is applied."""
         if self._running is None:
             return None
         axis, since_ns = self._running
@@ -387,16 +387,18 @@ _LEAST_SHORT = 0.02
 """Smallest excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
 _IN_DOUBT = 5
-"""Number of readings after which a verdict may identify the axis while the kind of fault is uncertain."""
+"""Number of readings after which an axis may be diagnosed as faulty although the kind of fault is
+uncertain."""
 _AGAIN_NS = 60_000_000_000
-"""Shortest time (ns) between two series of probes for missing torque."""
+"""Shortest time (ns) between two searches for an axis without torque, each of which drives axis after
+axis."""
 
 
 class CoilMonitor:
     """Detects broken coils from the commands and readings of the last seconds.
 
-    The class is longer than 200 lines, because its methods share the state of one suspicion from detection to
-    verdict.
+    The class is longer than 200 lines, because its methods share the state of one suspected fault from its
+    detection to its diagnosis.
 
     Attributes:
         tumble_rate: body rate (rad/s) below which corrections are reviewed and broken coils are tried again.
@@ -417,7 +419,7 @@ class CoilMonitor:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # time (ns) after which a verdict may leave the fault uncertain
+        self._judge_ns = 0  # time (ns) after which a diagnosis may leave the kind of fault open
         self._sound_ns = 0  # time (ns) at which a driven coil last drew the expected current
         self._unmixed_ns = 0  # time (ns) from which readings show one circuit state
         self._evidence = Evidence(self._bounds)
@@ -436,7 +438,7 @@ class CoilMonitor:
         self._compared: tuple[int, CoilFault] | None = None
         self._verdicts: dict[int, CoilVerdict] = {}
         self.correction = CoilCorrection(coils)
-        self._news: list[str] = []  # texts of the changes of the correction
+        self._news: list[str] = []  # texts about corrected signs and gains
         self._trials = [0] * coils
         self._speed = math.inf
         # Axes that are kept at zero current, with start time (ns) and reason.
@@ -449,7 +451,7 @@ class CoilMonitor:
 
     @property
     def verdicts(self) -> tuple[CoilVerdict, ...]:
-        """The verdicts on broken axes, at most one per axis, in order of time; they last until `forget`."""
+        """The diagnoses of broken axes, at most one per axis, in order of time; they last until `forget`."""
         return tuple(self._verdicts.values())
 
     @property
@@ -494,7 +496,7 @@ class CoilMonitor:
         return self._leg.rest
 
     def forget(self, axis: int) -> None:
-        """Discard the verdict on an axis, as commanded by the ground.
+        """Discard the diagnosis of an axis, as commanded by the ground.
 
         If the fault persists, it is detected again.
         """
@@ -516,7 +518,7 @@ class CoilMonitor:
         return None
 
     def news(self) -> list[str]:
-        """Return the texts of the changes of the correction since the last call."""
+        """Return texts about coil signs and gains that were corrected or confirmed since the last call."""
         news, self._news = self._news, []
         return news
 
@@ -535,7 +537,7 @@ class CoilMonitor:
         """
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
-        # If the monitor gives no readings, the search is ended, because it could not finish.
+        # Without readings of the current monitor, the search for a stuck leg cannot succeed, and is ended.
         if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.reset()
         effective = tuple(self.correction.effective(currents).tolist())
@@ -552,14 +554,14 @@ class CoilMonitor:
                 self._judge_motion(response, time_ns)
 
     def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
-        """Correct sign or gain of a coil, and raise a suspicion about an axis without torque."""
+        """Correct sign or gain of a coil, and suspect a fault of an axis without torque."""
         slow = response.fastest <= self.tumble_rate
         for axis in self.correction.unreviewed:
             if slow and response.is_healthy(axis):
                 self.correction.confirm(axis)
                 self._tell(axis, f"{response.text(axis)} while the body is slow, which confirms its sign")
         known = self._verdicts.keys() | self._rests.keys() | self._settings.absent
-        # An uncommanded current also makes a torque, which could be mistaken for that of a reversed coil.
+        # An uncommanded current also produces a torque, which could be mistaken for that of a reversed coil.
         if not self._leg.suspicion and (not self._strangeness or self._prime is not None):
             for axis in response.axes(Finding.REVERSED):
                 if axis not in known:
@@ -708,7 +710,7 @@ class CoilMonitor:
         }
 
     def _look_at_legs(self, reading: PowerReading) -> None:
-        """Search for a leg stuck high if the ADC sample was made under the present braking."""
+        """Search for a leg stuck high if the present brakes were in force during the whole ADC sample."""
         commands = self._commands
         if commands.braked != self.braked or not commands.is_known_since(reading.newest_since_ns):
             return
@@ -763,7 +765,7 @@ class CoilMonitor:
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
-        """Give a verdict if all evidence concerns one axis; end the suspicion if readings are normal."""
+        """Diagnose a fault if all evidence concerns one axis, or suspect no fault if readings are normal."""
         evidence = self._evidence
         if len(evidence) < self._settings.evidence:
             return
@@ -777,8 +779,8 @@ class CoilMonitor:
             if waited:
                 self._conclude(*self._compared, now_ns)
             return
-        # The only remaining axis may be healthy if the fault has ended or only the motion raised the
-        # suspicion.
+        # The only remaining axis may be healthy if the fault has ended, or if only the motion indicated a
+        # fault.
         certain = len(axes) == 1 and evidence.rejects_healthy_now(self._known)
         if certain and (len(left) == 1 or waited):
             axis, fault = left[0]

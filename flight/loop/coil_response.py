@@ -1,4 +1,4 @@
-"""Evaluation of the coils' responses to commands from the body's motion and the supply current.
+"""Evaluation of the coils' responses to commands, as shown by the body's motion and the supply current.
 
 The class `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some
 seconds. The measured rate and the commanded rate change, which is the integral of J^-1 (m x B), are averaged
@@ -10,11 +10,11 @@ standard deviation of the gain is large, and no finding about the axis is made. 
 `LARGEST_GAIN` is physically impossible and shows that the model is wrong, so that no finding about any axis
 is made.
 
-The torques of the coils are normal to the field, so that their gains can hardly be separated from each
-other within a short time. The gain of each coil is therefore estimated under the assumption that the other
-coils are healthy. The gains of healthy coils may differ from 1 by the accuracy with which the coils are
-described. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of
-another axis. A coil is considered reversed if this hypothesis is far more likely than that of healthy coils.
+The torques of the coils are normal to the field, so that their gains can hardly be separated from each other
+within a short time. The gain of each coil is therefore estimated under the assumption that the other coils
+are healthy. The gains of healthy coils may differ from 1 by the relative errors of the configured coil
+dipoles. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of another
+axis. A coil is considered reversed if this hypothesis is far more likely than that of healthy coils.
 
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils appear reversed. The fit therefore subtracts the
@@ -27,7 +27,7 @@ fit uses the field measured in the last pause of the coils, rotated with the bod
 
 The residual accelerations, computed for healthy coils, are stored for a longer time. If the residual
 accelerations change together with the supply current, a coil is broken; otherwise the current monitor is
-faulty (`observed_share`). The class `MotionWitness` checks verdicts on broken coils by the residual
+faulty (`observed_share`). The class `MotionWitness` compares diagnoses of broken coils with the residual
 accelerations.
 """
 
@@ -55,7 +55,7 @@ from knightcube.gnc.estimation.rigid_body import (
 
 _SAMPLES_NS = 25_000_000
 _NOTED_LATE_NS = 25_000_000
-"""Delay (ns) of one cycle from the sending of a command to its record."""
+"""Time (ns) from the sending of a command to its record, which is one control cycle."""
 
 
 class CoilCommands:
@@ -204,13 +204,13 @@ _STRONG_GAIN = 1.25
 LEAST_GAIN, _EXACT = 0.1, 0.1
 """Smallest gain at which a weak coil is used, and largest standard deviation of a used gain."""
 _STEADY = 2.0
-"""Largest difference between the gain of the newest half of the bins and that of all bins, in standard
-deviations of the gain of the newest half."""
+"""Threshold for a steady gain: the largest difference between the gain from the newest half of the bins and
+the gain from all bins, divided by the standard deviation of the former."""
 _CLEARLY, _CERTAINLY, _WORSE = 9.0, 20.0, 25.0
-"""Thresholds for the differences of weighted sums of squares between hypotheses. A fault of one coil must
-explain the motion better than a fault of another coil by the first threshold, and a reversed coil better than
-healthy coils by the second threshold. A fit of all gains may explain the motion better than a fault of
-one coil by less than the third threshold."""
+"""Thresholds for differences of cost between hypotheses. The cost of a hypothesis is the weighted sum of the
+squared residuals of its fit. A fault of one coil is accepted if its cost is lower by `_CLEARLY` than the cost
+of a fault of any other coil, and exceeds the cost of a fit of all gains by less than `_WORSE`. A reversed
+coil is accepted if its cost is also lower by `_CERTAINLY` than the cost of healthy coils."""
 
 
 class CoilResponse:
@@ -278,9 +278,9 @@ class CoilResponse:
         self._turned: FloatArray = np.zeros(3)
         self._spun: FloatArray = np.zeros(6)  # integrals of the rate products, rad^2/s
         self._quiet_field: FloatArray | None = None
-        # Each bin has a row (f, n + 3 + k) for f free axes, n coils and k inertia error modes.
-        # The first columns of a row are n coil accelerations and the observed acceleration.
-        # The other columns of a row are mean rate, angle, and the accelerations by the k error modes.
+        # Each bin has a row (f, n + 3 + k) for f free axes, n coils and k inertia error modes. The first
+        # columns of a row are n coil accelerations and the observed acceleration. The other columns of a row
+        # are mean rate, angle, and the accelerations that the k error modes cause.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = self._walk = 0.0
@@ -355,7 +355,7 @@ class CoilResponse:
         return axis in self.axes(Finding.SOUND)
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
-        """Return the observed fraction of a hypothetical change of torque.
+        """Return the observed change of torque, divided by the change that a suspected fault would cause.
 
         The hypothesis is that the coil carries `constant` A instead of its command. The residuals before
         `since_ns` are compared with those after `settled_ns`. The result is None if the change is too small
@@ -375,9 +375,9 @@ class CoilResponse:
 
     @property
     def strength(self) -> FloatArray | None:
-        """Angular acceleration (n,), rad/s^2 per ampere, by each coil in the field of the coils' last pause.
+        """Angular acceleration (n,), rad/s^2 per ampere, by each coil in the quiet magnetic field.
 
-        The result is None before the first pause.
+        The quiet field is measured in a pause of the coils. The result is None before the first pause.
         """
         if self._quiet_field is None:
             return None
@@ -482,7 +482,7 @@ class CoilResponse:
         sound_cost, reversed_costs = costs[coils], costs[coils + 1 :]
         alone, is_reversed = [], []
         for axis in range(coils):
-            # Limit of the sum of squares of a hypothesis that only this axis is broken.
+            # The hypothesis that only this axis is broken is accepted if its cost is below this limit.
             limit = min(costs[other] for other in range(coils) if other != axis) - _CLEARLY
             limit = min(limit, free_cost + _WORSE)
             alone.append(costs[axis] < limit)
@@ -498,7 +498,11 @@ class CoilResponse:
         )
 
     def _inputs_and_outputs(self, rows: FloatArray, span: float) -> tuple[FloatArray, FloatArray]:
-        """Return the inputs (m f, p) of p fit parameters and the whitened accelerations (m f,) of m bins."""
+        """Return the whitened linear system of the fit: its matrix (m f, p) and its right side (m f,).
+
+        The matrix multiplies the p fit parameters. The right side holds the observed accelerations of m bins
+        about f free axes.
+        """
         count, coils = len(self._free), self._count_of_coils
         white = self._whitened(rows, span)
         inputs = np.zeros((len(white), count, len(self._prior)))
@@ -540,9 +544,11 @@ class CoilResponse:
             counts[axis] = counts[axis] + 1 if holds else 0
 
     def _whitened(self, rows: FloatArray, span: float) -> FloatArray:
-        """Return the rows (m, f, n + 3 + k) of m bins, with noise of variance 1 and without a constant part.
+        """Return the rows (m, f, n + 3 + k) of m bins, whitened and without the effect of a constant.
 
-        The noise of the mean rate of a bin enters two differences of neighbouring bins with opposite signs.
+        The attribute `_rows` describes a row. Whitened rows have independent noise of variance 1. Whitening
+        is needed because the noise of the mean rate of a bin enters two differences of neighbouring bins with
+        opposite signs.
         """
         settings = self._settings
         # The span is rounded to ns, so that equal spans use the stored matrix.
@@ -644,7 +650,8 @@ class GainEquations(NamedTuple):
         covariance = np.linalg.inv(normal)
         right = self.right + weights * expected
         gains = (covariance @ right[:, :, None])[:, :, 0]
-        # The squares of the expected gains are 1, so the prior adds the sum of the weights.
+        # The prior adds weight * (gain - expected)^2 to the cost for each gain. The term weight * expected^2
+        # of this square equals the weight, because expected gains are 1 or -1.
         costs = self.constant + weights.sum(axis=1) - (right * gains).sum(axis=1)
         return GainFits(gains, np.asarray(covariance.diagonal(axis1=1, axis2=2), dtype=np.float64), costs)
 
@@ -656,10 +663,10 @@ _MOST_CHANGES = 2
 
 
 class CoilCorrection:
-    """Sign and gain of each coil relative to its description, and the corrections still to be reviewed.
+    """Sign and gain of each coil relative to its configuration, and the corrections still to be reviewed.
 
     Attributes:
-        factors: dipole (n,) of each coil relative to the described dipole at the same current: 1 for a
+        factors: dipole (n,) of each coil divided by its configured dipole at the same current: 1 for a
             healthy coil, -1 for a reversed coil.
         deviations: relative standard deviations (n,) of the estimated gains; zero for coils without an
             estimated gain.
@@ -684,7 +691,7 @@ class CoilCorrection:
 
     @property
     def unreviewed(self) -> frozenset[int]:
-        """The axes whose sign was changed in a tumble and has not been reviewed while the body is slow."""
+        """The axes whose sign was changed in a tumble, and must be confirmed when the body is slow."""
         return frozenset(self._unreviewed)
 
     def reverse(self, axis: int, now_ns: int, *, in_tumble: bool) -> bool:
@@ -748,11 +755,12 @@ _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
 """Sign of the continuous current through the coil, for each kind of fault with a leg stuck high."""
 _LITTLE_RESPONSE = 0.4
 _DOUBTED_FOR_NS = 60_000_000_000
-"""Time (ns) after a refuted verdict for which further verdicts are rejected if the motion is inconclusive."""
+"""Time (ns) after a diagnosis was found to be wrong. Within this time, the next diagnoses are rejected if the
+motion is inconclusive."""
 
 
 class MotionWitness:
-    """Checks verdicts from the supply current against the torque observed in the body's motion.
+    """Checks diagnoses that are based on the supply current against the torque observed in the body's motion.
 
     Attributes:
         doubt: the reason why the current monitor is considered faulty; empty while it is trusted.
@@ -776,8 +784,8 @@ class MotionWitness:
     def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
         """Return whether the coil's torque has not changed, so that the current monitor must be faulty.
 
-        The coil last drew the expected current at `begun_ns`, so that the fault began later. The fault was
-        suspected at `suspected_ns`, and the newest reading was made at `now_ns`.
+        The coil last drew the expected current at `begun_ns`, and the fault began after this time. The fault
+        was suspected at `suspected_ns`, and the newest reading was made at `now_ns`.
         """
         if self._response is None:
             return False
@@ -788,7 +796,8 @@ class MotionWitness:
         if observed is None:
             return fault not in _DRIVEN and self._response.is_healthy(axis)
         if math.isnan(observed):
-            # Without data from before the fault, the present torque of the coil decides.
+            # Without data from before the fault, only the present torque of the coil shows whether it is
+            # healthy.
             return fault in _DRIVEN or self._response.is_healthy(axis)
         return observed < _LITTLE_RESPONSE
 
@@ -798,10 +807,11 @@ _MOST_EVIDENCE, _MOST_SEGMENTS = 40, 4
 
 
 class Evidence:
-    """Predictions of the readings since a suspicion. Each probe begins a new segment.
+    """Predictions of the current readings since a fault was suspected. Each probe begins a new segment.
 
-    A hypothesis must explain the readings of each segment. Otherwise, the few readings of a probe that reject
-    a hypothesis would be treated as outliers among the many readings that do not depend on the hypothesis.
+    A hypothesis must explain the readings of each segment. Without segments, the few readings of a probe that
+    contradict a hypothesis would be treated as outliers, because the many other readings agree with every
+    hypothesis.
     """
 
     def __init__(self, bounds: Bounds) -> None:
@@ -862,8 +872,8 @@ class Evidence:
     ) -> bool:
         """Return whether the newest readings agree with healthy coils.
 
-        The newest readings must also reject the `possible` faults, unless all coils were commanded to zero.
-        Coils at zero show no fault, and their currents are known.
+        Unless all coils were commanded to zero, the newest readings must also contradict each of the
+        `possible` faults. Coils at zero current show no fault, and their currents are known.
         """
         newest = self.readings()[-8:]
         if not fits(newest, self._bounds, known):

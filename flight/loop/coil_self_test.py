@@ -4,10 +4,10 @@ While a satellite points, its coil currents of a few mA reveal neither an open n
 that the motion has not confirmed for `interval_ns` is therefore driven alone by a known current with the
 signs +, -, -, + in four equal quarters. After these four quarters, neither the rate nor the attitude has
 changed. Duration and current of a test follow from the gyro's noise, so that a test measures the gain of a
-healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation during a test is the angular
-acceleration times the square of the duration of a quarter. `CoilResponse` evaluates the response, with the
-errors of the inertia as nuisance parameters. The current monitor compares the supply current with the
-command, as at any other time.
+healthy coil with a standard deviation of 1/`_SHOWN`. The largest rotation angle during a test is the angular
+acceleration times the square of the duration of one of the four quarters. `CoilResponse` evaluates the
+response, with the errors of the inertia as nuisance parameters. The current monitor compares the supply
+current with the command, as at any other time.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class SelfTestSettings:
 _SHOWN = 8.0
 """Gain of a healthy coil divided by the standard deviation with which a self-test measures the gain."""
 _EFFICIENCY = 0.7
-"""Standard deviation of a gain without estimation of a constant torque, divided by that with this
-estimation."""
+"""Ratio of two standard deviations of a gain: without and with the simultaneous estimation of a constant
+torque."""
 _SHORTEST_QUARTER, _LONGEST_QUARTER = 1.0, 4.0
 """Minimum and maximum duration (s) of each of the four quarters of a test."""
 _GAP_NS = 400_000_000
@@ -78,9 +78,9 @@ class SelfTest:
         self._tested.clear()
 
     def wave(self, wanted: FloatArray, usable: BoolArray, now_ns: int) -> FloatArray | None:
-        """Return the currents (n,), A, of a test instead of the `wanted` effective currents (n,), or None.
+        """Return the test currents (n,), A, that replace the `wanted` currents (n,), or None without a test.
 
-        Only coils that are `usable` (n,) are tested.
+        The currents `wanted` are effective currents. Only coils that are `usable` (n,) are tested.
         """
         if (np.abs(wanted) > _QUIET * self._settings.limits).any():
             self._loud_ns, self._running = now_ns, None

@@ -292,7 +292,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command of a step of the time line.
+    """Return the command that a step of the configured time line contains.
 
     Raises CommandError unless the step contains exactly one command.
     """

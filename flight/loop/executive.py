@@ -1,9 +1,9 @@
 """The executive, which runs rate groups on a given clock, and job runners, which run jobs outside its thread.
 
 Each rate group has a fixed grid of time slots. The executive runs the groups one at a time, in the order in
-which they are due. A slot is run if it starts less than half a period late; otherwise it is skipped and
-counted. Two cycles of a group are therefore never closer than half a period, and missed cycles are not run
-later in a burst. The number of slots that were run or skipped always equals the number of slots elapsed.
+which they are due. The cycle of a slot is run if it starts less than half a period late; otherwise the slot
+is skipped and counted. Two cycles of a group are therefore never closer than half a period, and missed cycles
+are not run later in a burst. The number of run and skipped slots always equals the number of slots elapsed.
 
 Rate groups are listed in order of importance. If several groups are due at the same time, the most important
 one runs first. The executive's task runner is one of the documented containment boundaries: an exception in a
@@ -251,7 +251,7 @@ class CyclicExecutive:
         self._stop = False
 
     def stop(self) -> None:
-        """Let the running cycle end, and then return from `run`. A signal handler may call this method."""
+        """Let `run` return after the current cycle. A signal handler may call this method."""
         self._stop = True
 
     def run(self, epoch_ns: int, until_ns: int) -> None:

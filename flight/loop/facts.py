@@ -1,12 +1,14 @@
-"""Events, facts and streams, by which the loop detects and reports faults, and the services of all tasks.
+"""Events, monitored conditions and streams, which reveal faults to the loop, and the services of all tasks.
 
-Events are written to the flight log and trigger their reactions. The first event of a kind is written at
-once. Later, at most one event of each kind is written per `THROTTLE_NS`, together with the number of events
-held back. A fault in every 40 Hz cycle therefore writes only one event every few seconds.
+Events are written to the flight log, and each event triggers the reaction that belongs to its kind. The first
+event of a kind is written at once. Later, at most one event of each kind is written per `THROTTLE_NS`,
+together with the number of events held back. A fault in every 40 Hz cycle therefore writes only one event
+every few seconds.
 
-A fact is a condition whose state is updated by monitors. As in NASA's Limit Checker, a fact becomes active
-after N violations in a row; an unknown state (None) leaves the count unchanged. A latching fact stays active
-until a command clears it. The count of a fact is reset in modes in which the fact is not watched.
+A monitored condition (class `Fact`) is active or inactive. As in NASA's Limit Checker, it becomes active
+after N consecutive updates in which the condition is true; an update with an unknown state (None) leaves the
+count unchanged. A latching condition stays active until a command clears it. In modes in which a condition is
+not monitored, its count is reset.
 
 A stream is a series of readings of one kind, with nominal rate, age limit and valid range. As in openpilot's
 SubMaster, age, rate and range are checked separately, so that a stale value is not used even if it is
@@ -36,7 +38,7 @@ Sink = Callable[[EventKind, int, int, str], None]
 """Function that writes an event; its arguments are kind, time (ns), number of events held back, and text."""
 
 Reactor = Callable[[EventKind, int, str], None]
-"""Function that carries out the reaction of an event, given its kind, time (ns) and text."""
+"""Function that carries out the reaction to an event, given its kind, time (ns) and text."""
 
 
 class EventLog:
@@ -88,15 +90,15 @@ _DRIVEN = STEERING | {Mode.DETUMBLE}
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A row of the fact table: the conditions and events of the beginning and end of a fact.
+    """A monitored condition, with the events that are reported when it becomes active and inactive.
 
-    Facts are updated either in every control cycle (40 Hz) or in every run of the health task.
+    Conditions are updated either in every control cycle (40 Hz) or in every run of the health task.
 
     Attributes:
-        after: number of consecutive updates with a true condition that make the fact active.
-        mended_after: number of consecutive updates with a false condition that make the fact inactive.
-        latching: whether only a command can make the fact inactive.
-        modes: modes in which the fact is watched; in other modes it is inactive.
+        after: number of consecutive true updates after which the condition is active.
+        mended_after: number of consecutive false updates after which the condition is inactive again.
+        latching: whether only a command can make the condition inactive.
+        modes: modes in which the condition is monitored; in other modes, it is inactive.
     """
 
     name: str
@@ -164,7 +166,7 @@ COILS_BROKEN = (
     COIL_5_BROKEN,
     COIL_6_BROKEN,
 )
-"""Facts that a coil is broken, in the order of the coils."""
+"""Conditions that are active while a coil is diagnosed as broken, in the order of the coils."""
 FIELD_EXTRAPOLATED = Fact("field-extrapolated", events.FIELD_EXTRAPOLATED)
 GYRO_LOST = Fact("gyro-lost", events.GYRO_LOST, events.GYRO_RECOVERED, after=4, mended_after=4)
 BATTERY_LOW = Fact("battery-low", events.BATTERY_LOW, events.BATTERY_RECOVERED, after=3, mended_after=3)
@@ -183,10 +185,10 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 
 
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
-    """Check the fact table, and raise FlightError with the name of an invalid row.
+    """Check the table of monitored conditions, and raise FlightError with the name of an invalid row.
 
-    `modes_of` is a function that returns the modes in which a reaction has an effect. A fact is invalid if
-    its reaction has no effect in any mode in which the fact is watched.
+    `modes_of` is a function that returns the modes in which a reaction has an effect. A condition is invalid
+    if the reaction to its event has no effect in any mode in which the condition is monitored.
     """
     seen: set[str] = set()
     for fact in facts:
@@ -210,7 +212,7 @@ class _State:
 
 
 class Facts:
-    """The states of all facts; reports an event when a fact becomes active or inactive."""
+    """States of all monitored conditions; reports an event when a condition becomes active or inactive."""
 
     def __init__(self, event_log: EventLog) -> None:
         self._events = event_log
@@ -218,7 +220,11 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update a fact with its condition, which is None if unknown. The text of the event is `text`."""
+        """Update a monitored condition.
+
+        The flag `holds` states whether the condition is true; it is None if unknown. If the condition becomes
+        active or inactive, an event with the text `text` is reported.
+        """
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -236,30 +242,30 @@ class Facts:
             self._events.report(kind, now_ns, text)
 
     def holds(self, fact: Fact) -> bool:
-        """Return whether a fact is active."""
+        """Return whether a monitored condition is active."""
         return self._states[fact.name].holds
 
     def held(self) -> tuple[Fact, ...]:
-        """Return the active facts, in the order of the table."""
+        """Return the active conditions, in the order of the table."""
         return tuple(fact for fact in FACTS if self._states[fact.name].holds)
 
     def cause(self, fact: Fact) -> str:
-        """Return the text of the event with which an active fact began, or "" for an inactive fact."""
+        """Return the event text with which a condition became active, or "" for an inactive condition."""
         return self._states[fact.name].cause
 
     def clear(self, event_name: str) -> bool:
-        """Make the latched facts of an event inactive, and return whether there were any."""
+        """Make the latched conditions that reported an event inactive, and return whether there were any."""
         found = [fact for fact in self.held() if fact.latching and fact.begins.name == event_name]
         for fact in found:
             self._states[fact.name] = _State()
         return bool(found)
 
     def release(self, fact: Fact) -> None:
-        """Make a latched fact inactive, because its cause is examined again."""
+        """Make a latched condition inactive, because its cause is examined again."""
         self._states[fact.name] = _State()
 
     def enter(self, mode: Mode) -> None:
-        """Watch the facts of `mode`, and reset all facts that are not watched in this mode."""
+        """Monitor the conditions of `mode`, and reset all conditions that are not monitored in this mode."""
         self._mode = mode
         for fact in FACTS:
             if mode not in fact.modes:
@@ -293,8 +299,8 @@ class StreamState(IntEnum):
 class StreamLimits:
     """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value in the value's unit.
 
-    `has_silence_alarm` states whether another fact reports missing readings, so that the fact `poor` does not
-    report them.
+    `has_silence_alarm` states whether another monitored condition reports missing readings. The condition
+    `poor` then does not report them.
     """
 
     name: str
@@ -381,7 +387,10 @@ class StreamWatch:
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the stream is poor (None if unknown or reported by another fact), and why."""
+        """Return whether the readings are stale, slow or invalid, and why.
+
+        The first result is None if the state is unknown, or if another monitored condition reports it.
+        """
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"
@@ -403,7 +412,7 @@ class Streams:
         self._watches = {row.name: StreamWatch(row, 0) for row in rows}
 
     def begin(self, time_ns: int) -> None:
-        """Discard earlier readings; rates, and the times without a reading, count from `time_ns` on."""
+        """Discard earlier readings; measure rates and times without a reading from `time_ns` on."""
         for watch in self._watches.values():
             watch.begin(time_ns)
 
@@ -471,7 +480,7 @@ class FlightClock:
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The clock, the workers, the recorder, and the tables of events, facts and streams."""
+    """The clock, the workers, the recorder, and the tables of events, monitored conditions and streams."""
 
     clock: FlightClock
     jobs: JobRunner

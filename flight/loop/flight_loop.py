@@ -57,7 +57,7 @@ class FlightEnding:
         mission_time: s.
         cycles: number of completed control cycles.
         mode: label of the mode.
-        alarms: names of the facts that are active at the end.
+        alarms: names of the monitored conditions that are active at the end.
         faults: number of events of severity fault, by kind, including events that the throttle held back.
         warnings: number of events of severity warning, by kind, including events that the throttle held back.
         causes: text of the first event of each kind of fault and warning, and text with which each alarm
@@ -131,7 +131,8 @@ class FlightLoop:
         self._output: ControlOutput | None = None
         self._groups = self._rate_groups()
         tasks.health.watch(self._groups)
-        # Jobs of a lock-step simulation run in this thread, and are excluded from execution times.
+        # In a lock-step simulation, this thread also executes the jobs. Their time does not count as
+        # execution time of the rate groups.
         jobs = services.jobs
         self._executive = CyclicExecutive(
             services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
@@ -143,7 +144,7 @@ class FlightLoop:
         return self._tasks.modes.restart
 
     def stop(self, reason: str) -> None:
-        """End the flight after the running cycle. A signal handler may call this method."""
+        """End the flight after the current cycle. A signal handler may call this method."""
         self._stop_reason = reason
         self._executive.stop()
 
@@ -255,7 +256,7 @@ class FlightLoop:
         return clock.utc_ns() - (clock.now_ns() - self._services.recorder.epoch_ns)
 
     def _correct_label(self, now_ns: int) -> None:
-        """Record the properties of the run again after a change of the UTC, and then once a minute.
+        """Record the properties of the run again after a step of the UTC clock, and then once a minute.
 
         Because of the repetitions, a link process that starts later receives the corrected UTC.
         """

@@ -3,9 +3,9 @@
 The health task checks streams, progress and resources, and triggers the watchdog while all rate groups and
 workers make progress. A rate group is stalled if it has not completed a cycle within its time limit. A worker
 is stalled if a job runs longer than its time limit. A stalled ticker job is reported but does not stop the
-watchdog's trigger, because a restart would not cure a slow disk or a hung bus. A `ResourceReader` (`Board` on
-Linux, a script in tests) samples processor load, memory, disk space and temperature on a ticker outside the
-control loop, because the kernel may take milliseconds to answer.
+watchdog's trigger, because a restart would not repair a slow disk or a hung bus. A `ResourceReader` (`Board`
+on Linux, a script in tests) samples processor load, memory, disk space and temperature on a ticker outside
+the control loop, because the kernel may take milliseconds to answer.
 
 Housekeeping records the counters of devices and tasks once a second, and checks the flight log. The
 performance record stores lateness and execution time of the control cycles in a separate log. The observer of
@@ -16,13 +16,13 @@ When the work of a flight exceeds the processor's capacity, the least important 
 (`Shedding`). Control cycles, safety, telemetry and commands are never reduced. All other work is reduced step
 by step, in the order of `LEVELS`: readings of the inertial unit that arrive more often than control cycles,
 then the search for objects, then frames of the star camera, then periodic plans. A plan that is not renewed
-stays in force, and its final attitude is held after its end. Plans for a new target, or after a loss of
-control, are always made.
+stays in force, and its final attitude is held after its end. Plans are always made for a new target and after
+a loss of control.
 
-Overload is recognised by its signs: lost control cycles, frames that arrive while the worker is busy or whose
-processing takes too long, and plans that take too long. Each raise of the level reduces more work. The level
-falls when no sign was seen for some time. If the signs return after a fall, the next fall is later, so that
-the level does not oscillate.
+Overload is recognised by its symptoms: lost control cycles, frames that arrive while the worker is busy or
+whose processing takes too long, and plans that take too long. Each increase of the shedding level reduces
+more work. The shedding level is decreased when no symptom has occurred for some time. If symptoms occur again
+after a decrease, the next decrease is made later, so that the shedding level does not oscillate.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class ResourceState:
 
 
 class ResourceMonitor:
-    """Stores the newest samples of resources, and updates the facts about them."""
+    """Stores the newest samples of resources, and updates the monitored conditions about them."""
 
     def __init__(self, settings: Health) -> None:
         self._settings = settings
@@ -131,7 +131,7 @@ class ResourceMonitor:
         self.state = ResourceState(sample, share, self._slope())
 
     def report(self, facts_: Facts, now_ns: int) -> None:
-        """Update the facts about resources from the newest sample."""
+        """Update the monitored conditions about resources from the newest sample."""
         sample, limits = self.state.sample, self._settings
         if sample is None:
             return
@@ -480,7 +480,7 @@ class HealthWatch:
         self._recorder = services.recorder
         self._events = services.events
         self._jobs = services.jobs
-        # Worker events are not throttled, because the limited number of restarts limits them.
+        # Worker events need no throttle, because each of them belongs to a restart, and restarts are limited.
         self._worker_events = EventLog(services.recorder.event, 0)
         self._facts = services.facts
         self._streams = services.streams
@@ -497,7 +497,7 @@ class HealthWatch:
         self._counted = (self._control.cycles, self._control.completed)
 
     def read_resources(self, read: ResourceReader, period_ns: int) -> None:
-        """Read the board's resources on a ticker, outside the loop, until `close`."""
+        """Sample the use of the board's resources periodically in another thread, until `close` is called."""
 
         def sample() -> None:
             self._sample = read(self._clock.now_ns())
@@ -592,14 +592,14 @@ class HealthWatch:
 
 @dataclass(frozen=True, slots=True)
 class ShedLevel:
-    """Reduced work of a level.
+    """The work that is done at one shedding level.
 
     Attributes:
-        every_reading: whether all readings of the inertial unit are used, not only the newest of each cycle.
+        every_reading: whether all readings of the inertial unit are used, or only the newest of each cycle.
         search: whether frames are searched for objects.
         frame_every: number n such that every n-th due exposure of the star camera is made.
         plan_every: number n such that every n-th due periodic plan is made.
-        text: description of the reduced work for events.
+        text: description of the reduced work, for the texts of events.
     """
 
     every_reading: bool
@@ -622,23 +622,24 @@ LEVELS: tuple[ShedLevel, ...] = (
 """Levels of load shedding, from no reduction to the strongest reduction of the work."""
 
 _WINDOW_NS = 60 * SECOND_NS
-"""Time (ns) in which the signs of an overload are counted."""
+"""Time (ns) over which the symptoms of an overload are counted."""
 _SETTLE_NS = 10 * SECOND_NS
-"""Shortest time (ns) from a change of the level to the next raise, in which the change takes effect."""
+"""Shortest time (ns) from a change of the shedding level to its next increase. The change takes effect within
+this time."""
 _SHORTEST_QUIET_NS = 60 * SECOND_NS
 _LONGEST_QUIET_NS = 960 * SECOND_NS
-"""Times (ns) without a sign of overload after which the level falls: initial value, and maximum after
-repeated doubling."""
+"""Times (ns) without a symptom of overload after which the shedding level is decreased: initial value, and
+maximum after repeated doubling."""
 
 
 @dataclass(eq=False)
 class OverloadSign:
-    """A sign of overload, which is detected from a counter.
+    """A symptom of overload, which is detected from a counter.
 
     Attributes:
-        text: name of the sign for events.
-        count: function that returns how often the sign has occurred since start.
-        needed: number of occurrences within a minute that raise the level.
+        text: name of the symptom, for the texts of events.
+        count: function that returns how often the symptom has occurred since start.
+        needed: number of occurrences within a minute that increase the shedding level.
     """
 
     text: str
@@ -648,7 +649,7 @@ class OverloadSign:
     _times: deque[int] = field(default_factory=deque)
 
     def look(self, now_ns: int) -> bool:
-        """Return whether the sign occurred since the last call; several occurrences count once."""
+        """Return whether the symptom occurred since the last call; several occurrences count once."""
         count = self.count()
         occurred, self._counted = count > self._counted, count
         if occurred:
@@ -659,11 +660,11 @@ class OverloadSign:
 
     @property
     def is_overload(self) -> bool:
-        """Whether the sign occurred often enough to raise the level."""
+        """Whether the symptom occurred often enough to increase the shedding level."""
         return len(self._times) >= self.needed
 
     def forget(self) -> None:
-        """Discard the occurrences before a change of the level."""
+        """Discard the counted occurrences of the symptom, because the shedding level has changed."""
         self._times.clear()
 
 
@@ -688,7 +689,7 @@ class Shedding:
     """Task that reduces the workers' jobs while they exceed the processor's capacity; runs once a second.
 
     Attributes:
-        plans_shed: number of periodic plans that were not made since start.
+        plans_shed: number of periodic plans that were omitted since start.
     """
 
     def __init__(
@@ -699,12 +700,12 @@ class Shedding:
         frames: Callable[[], tuple[int, int]],
         services: Services,
     ) -> None:
-        """Start with all work.
+        """Start at the shedding level without reductions.
 
         Args:
-            signs: signs of overload.
+            signs: symptoms of overload.
             plans: counter of plans that are late.
-            apply: function that applies a level to navigation and imaging.
+            apply: function that applies a shedding level to navigation and imaging.
             frames: function that returns the numbers of frames not taken, and of frames that are late.
             services: services of the loop.
         """
@@ -718,13 +719,13 @@ class Shedding:
         self.plans_shed = 0
 
     def makes_plan(self, slot: int) -> bool:
-        """Return whether the periodic plan of the time slot `slot` is made, and count it if not."""
+        """Return whether to make the periodic plan of the time slot `slot`; an omitted plan is counted."""
         made = slot % LEVELS[self._level].plan_every == 0
         self.plans_shed += not made
         return made
 
     def run(self, lost_cycles: int, now_ns: int) -> None:
-        """Evaluate the load, change the level by at most one, and record changes.
+        """Evaluate the load, change the shedding level by at most one, and record changes.
 
         The number of control cycles lost since start is `lost_cycles`.
         """

@@ -34,7 +34,7 @@ class HorizonCameraSettings:
     Attributes:
         exposures_ns: exposure time (ns) of each camera.
         period_ns: time (ns) between triggers while the body needs frames often.
-        fine_period_ns: time (ns) between triggers while the attitude is fine.
+        fine_period_ns: time (ns) between triggers while the attitude estimate is accurate (`Knowledge.FINE`).
         late_ns: longest time (ns) from a trigger to the arrival of a frame.
         max_age_ns: time (ns) without a frame after which a camera is reported as lost.
     """
@@ -67,7 +67,8 @@ class HorizonCameraTask:
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
         self._pictures = [b""] * len(cameras)
-        # The job is described by time of exposure (ns), bit mask of cameras, and time of submission (ns).
+        # The tuple of a job holds the time (ns) at which its exposures began, the bit mask of its cameras,
+        # and the time (ns) of its submission.
         self._job: tuple[int, int, int] | None = None
 
     def begin(self, time_ns: int) -> None:

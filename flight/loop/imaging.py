@@ -1,4 +1,4 @@
-"""Imaging: triggers the star camera, passes its frames to the vision worker, and the results to navigation.
+"""Imaging: triggers the star camera, passes frames to the vision worker, and passes results to navigation.
 
 The star camera is monitored by sequence number, pixels and age of its frames, and by whether the detected
 stars match the catalogue. Objects that vision detects are tracked from frame to frame.
@@ -81,8 +81,8 @@ class ImagingSettings:
 
     Attributes:
         exposures: exposure time as a function of the body rate.
-        fine_rest_ns: minimum time (ns) between exposures while the attitude is fine, the body rotates slowly
-            and no object is searched for.
+        fine_rest_ns: minimum time (ns) between exposures while the attitude estimate is accurate, the body
+            rotates slowly and no object is searched for.
         seeks: function that returns whether the body searches for an object.
         calm: function of a time and an exposure time that returns the first later start time of an exposure
             during which no coil is switched.
@@ -247,7 +247,7 @@ def middle_ns(frame: Frame) -> int:
 
 
 _MANY_STARS = 12
-"""Number of unmatched detections from which a frame is considered not to show the sky."""
+"""Minimum number of unmatched detections in a frame that is considered not to show the sky."""
 _NAMED_ELSEWHERE = {
     StreakStatus.TOO_SHORT,  # no motion
     StreakStatus.BLACK,
@@ -648,9 +648,10 @@ class Imaging:
         self._rest_ns = round((seconds - 0.5) * 1e9)
 
     def reduce(self, search: bool, frame_every: int) -> None:
-        """Search frames for objects only if `search` is true, and make one of `frame_every` exposures.
+        """Set how much work is done: the search for objects, and the fraction of exposures that are made.
 
-        The largest permitted age of the newest frame limits how many exposures are left out.
+        Objects are searched only if `search` is true, and only every n-th exposure is made (n is
+        `frame_every`). The largest permitted age of the newest frame limits how many exposures are left out.
         """
         self._searches = search
         self._frame_every = max(min(frame_every, self._settings.most_every), 1)
@@ -670,8 +671,9 @@ class Imaging:
         """Order the next exposure of the star camera, if one may be made now.
 
         No exposure is made while the body rotates faster than permitted, or too soon while the battery is
-        low. Exposures are less frequent while the attitude is fine and the body rotates slowly. An exposure
-        starts when no coil will be switched until its end, so that the body rate is nearly constant.
+        low. Exposures are less frequent while the attitude estimate is accurate and the body rotates slowly.
+        An exposure starts when no coil will be switched until its end, so that the body rate is nearly
+        constant.
         """
         speed, rested_ns = self._navigation.speed, cycle.start_ns - self._triggered_ns
         if speed > self._settings.max_rate or rested_ns < self._rest_ns:
@@ -693,7 +695,7 @@ class Imaging:
         self._expose(now_ns)
 
     def _expose(self, now_ns: int) -> None:
-        """Start the ordered exposure when its start time is reached."""
+        """Start the scheduled exposure when its start time is reached."""
         if self._ordered is None or now_ns < self._ordered[0]:
             return
         (_, exposure_ns), self._ordered = self._ordered, None

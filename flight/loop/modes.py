@@ -239,7 +239,7 @@ class HoldTimer:
 
 
 class AttitudeWatch:
-    """Finds the triggers between acquisition and pointing, and controls what a body does in SAFE.
+    """Triggers changes between acquisition and pointing, and controls what a body does in the mode SAFE.
 
     Attributes:
         follows: mode that follows the acquisition, or None if the body stays in ACQUIRE.
@@ -304,7 +304,7 @@ class AttitudeWatch:
 
 
 class PointingWatch:
-    """Monitors rate and pointing error, and updates the facts TUMBLING and HOLD_IMPOSSIBLE."""
+    """Monitors rate and pointing error, and updates the conditions TUMBLING and HOLD_IMPOSSIBLE."""
 
     def __init__(self, settings: Modes, targets: BodyTargets, facts_: Facts) -> None:
         self._settings = settings
@@ -322,14 +322,14 @@ class PointingWatch:
         self._off.reset()
 
     def watch_rate(self, rate: float, now_ns: int) -> None:
-        """Update the fact TUMBLING from the magnitude (rad/s) of the body rate."""
+        """Update the monitored condition TUMBLING from the magnitude (rad/s) of the body rate."""
         limit = self._settings.tumble_rate
         self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
 
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
-        """Update both facts from the pointing error `off` (rad), and return this error.
+        """Update TUMBLING and HOLD_IMPOSSIBLE from the pointing error `off` (rad), and return this error.
 
-        While no attitude is due, `off` is None and the returned error is 0.
+        While no attitude is required, `off` is None and the returned error is 0.
         """
         settings = self._settings
         self.watch_rate(self._targets.speed(estimate), now_ns)
@@ -388,8 +388,8 @@ class ModeControl:
     ) -> None:
         """Connect the state machine with the body, the steering and the event log.
 
-        Raises FlightError for a fact whose reaction has no effect, and ConfigError for an initial mode that
-        the body does not have.
+        Raises FlightError for a monitored condition whose event triggers a reaction without effect. Raises
+        ConfigError for an initial mode that the body does not have.
         """
         facts.check(facts.FACTS, modes_moved_by)
         self._settings = settings.modes
@@ -418,7 +418,7 @@ class ModeControl:
         self.restart = ""
         self.wanted: Target | None = None
         self._pointed: Target | None = None
-        self._returns: Trigger | None = None  # trigger that leaves a SAFE whose cause is the battery
+        self._returns: Trigger | None = None  # trigger that ends the mode SAFE after a low battery caused it
         services.events.react_by(self.react)
 
     @property
@@ -480,7 +480,7 @@ class ModeControl:
         Args:
             estimate: state estimate of this cycle, or None while the attitude is not known.
             rate: magnitude (rad/s) of the newest body rate measured in this cycle, or None without a reading.
-            overdue: angle (rad) between body and due attitude, or None while no attitude is due.
+            overdue: angle (rad) between body and attitude required now, or None while none is required.
             coils_answer: whether the PWM chip acknowledges commands.
             now_ns: time (ns) of the cycle.
             accurate: whether the estimate is accurate enough for driving the coils.
@@ -519,8 +519,8 @@ class ModeControl:
     def command(self, mode: Mode, now_ns: int, wanted: float | PointingTarget | None = None) -> str:
         """Execute a mode command, and return why it is refused, or an empty text.
 
-        The value `wanted` is the target of SLEW or POINT. A POINT without a target returns to the configured
-        targets.
+        The value `wanted` is the target of SLEW or POINT. After a command POINT without a target, the body
+        follows the configured targets again.
         """
         trigger = COMMANDS.get(mode)
         if trigger is None or mode not in self._modes:
@@ -550,7 +550,7 @@ class ModeControl:
         return ""
 
     def react(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Carry out the reaction of an event. The event log calls this method."""
+        """Carry out the reaction to an event. The event log calls this method."""
         reaction = kind.reaction
         if reaction is Reaction.COILS_OFF:
             self._steering.zero()
@@ -651,7 +651,7 @@ class ModeControl:
 
 
 def _barred(known: Facts) -> str:
-    """Return a text about the latched facts that keep the body in SAFE; empty if there are none."""
+    """Return a text about the latched conditions that keep the body in SAFE; empty if there are none."""
     held = [
         fact.begins.name for fact in known.held() if fact.latching and fact.begins.reaction is Reaction.SAFE
     ]

@@ -64,7 +64,7 @@ class NavigationSettings:
 
 
 _UNSEEN_NS = 600_000_000
-"""Largest age (ns) of a PWM error at its detection; the driver reads its outputs back twice a second."""
+"""Longest time (ns) from a PWM error to its detection; the driver reads its outputs back twice a second."""
 _UNSUSPECTED_NS = 800_000_000
 """Longest time (ns) from a coil fault until it is suspected, after four readings of the current monitor."""
 STOOD_NS = 200_000_000
@@ -76,7 +76,7 @@ class CurrentValidity:
     """Validity of the recorded coil currents.
 
     Attributes:
-        now: whether the currents in force are known.
+        now: whether the present currents are known.
         since_last_look: whether the PWM chip kept all commands since the previous call.
         since_ns: time (ns) since which the currents have been known.
         uncertain_since_ns: time (ns) since which currents recorded as known are uncertain, or None.
@@ -236,7 +236,7 @@ class Navigation:
         if polled:
             self._unit_ns = polled[-1].time_ns
         fields: list[ImuReading] = []
-        with suppress(DeviceError):  # a failed magnetometer gives no readings, which other facts report
+        with suppress(DeviceError):  # other conditions report a failed magnetometer
             fields = magnetometer.poll()
         replaced = now_ns - self._unit_ns > self._settings.max_age_ns
         if replaced is not self._replaced:

@@ -19,17 +19,19 @@ from flight.schema.devices import Battery, Power
 from hal.interfaces.devices import PowerMonitor, PowerReading
 
 CORRECTION_TIME = 1800.0
-"""Time constant (s) with which the voltage corrects the integrated current."""
+"""Time constant (s) with which the voltage corrects the state of charge that follows from the integrated
+current."""
 VOLTAGE_TIME = 60.0
-"""Time constant (s) of the correction without the battery's current, or after a contradiction."""
+"""Time constant (s) of the correction by the voltage if the battery's current is unknown, or if the
+integrated current contradicts the voltage."""
 CONTRADICTION = 0.25
 """Difference between the integrated state of charge and that from the voltage, above which the latter is
 used."""
 LONGEST_STEP = 5.0
 """Longest time (s) over which one current is integrated, and largest age (s) of a reading."""
 STUCK_FOR, STUCK_RANGE = 10.0, 0.02
-"""Time (s), and range (V) of the other monitor's voltage in this time, after which an unchanged reading
-counts as stuck.
+"""A monitor counts as stuck if its reading does not change for `STUCK_FOR` s, while the voltage of the other
+monitor changes by `STUCK_RANGE` V.
 
 Both monitors measure the same voltage, and 0.02 V are five steps of the converter.
 """
@@ -100,7 +102,7 @@ class MonitorWatch:
 
 @dataclass(frozen=True, slots=True)
 class Sheddable:
-    """Loads that a low battery sheds.
+    """Loads that are reduced while the battery is low.
 
     Attributes:
         limit_coils: function that sets the fraction of the current limits that the coils may use.
@@ -196,7 +198,7 @@ class PowerTask:
         return f"the battery monitor shows {battery.voltage:.2f} V, the bus monitor {bus.voltage:.2f} V"
 
     def _judge(self, charge: float, now_ns: int) -> None:
-        """Update the facts about the battery, and shed loads or switch them on again."""
+        """Update the monitored conditions about the battery, and shed loads or switch them on again."""
         limits = self._section.low_battery
         levels = (
             (facts.BATTERY_LOW, limits.low),

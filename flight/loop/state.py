@@ -281,8 +281,8 @@ def start_from(
 ) -> tuple[SlowPrior, list[str]]:
     """Return the filter's prior, and the reasons why learned parameters were rejected.
 
-    The prior without learned parameters is `configured`. The assumed change of a value since the last boot
-    has a standard deviation of `changed` times that in `configured`.
+    The prior without learned parameters is `configured`. A value may have changed since the last boot. The
+    standard deviation of this change is `changed` times the standard deviation of the value in `configured`.
     """
     problems: list[str] = []
 
@@ -343,7 +343,7 @@ class LinuxFiles:
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
 
     def write(self, file: int, data: bytes) -> int:
-        """Write `data` or a first part of it, and return the number of bytes written."""
+        """Write `data` or only its beginning, and return the number of bytes written."""
         return os.write(file, data)
 
     def sync(self, file: int) -> None:
@@ -679,9 +679,10 @@ def open_state(
 ) -> StateKeeper | None:
     """Open the stored state and count this boot, or return None if no state is stored.
 
-    The folders `runs` of the newest runs, of which the last is the present run, contain files with boot
-    numbers. When `stack` closes, the final state is written, as a clean end unless an exception was raised. A
-    DeviceError counts as a clean end, because it is reported as a device error and safe mode would not help.
+    The sequence `runs` holds the folders of the newest runs, which contain files with boot numbers. The last
+    folder is that of the present run. When `stack` closes, the final state is written, as a clean end unless
+    an exception was raised. A DeviceError counts as a clean end, because it is reported as a device error and
+    safe mode would not help.
     """
     folder = state_folder(config, environment)
     if folder is None:

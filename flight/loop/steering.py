@@ -2,8 +2,8 @@
 
 The coil drive excludes failed axes, and reallocates the current among the remaining axes so that the
 direction of the torque is preserved. The sent commands are compared with the supply current and the body's
-motion (`flight.loop.coil_monitor`). A verdict that a coil is broken activates a fact. The fact reports an
-event, whose reaction excludes the axis.
+motion (`flight.loop.coil_monitor`). When a coil is diagnosed as broken, a monitored condition becomes active
+and reports an event. The reaction to this event excludes the axis.
 
 All currents in the loop are effective currents: those of healthy coils with the same dipole. The coil drive
 converts effective currents to actual coil currents by the signs and gains that the coil monitor has
@@ -70,7 +70,7 @@ class CoilDrive:
         self._settings = settings
         self._facts = services.facts
         self._events = services.events
-        self._reported: set[int] = set()  # axes whose verdict was reported
+        self._reported: set[int] = set()  # axes whose diagnosis was reported
         self._braked = NO_AXES
         self._has_rate = True  # without a rate, a self-test of the coils has no result
         self.available = watch.available
@@ -105,7 +105,7 @@ class CoilDrive:
 
     @property
     def is_suspect(self) -> bool:
-        """Whether a coil without a verdict may carry a current that differs from its command."""
+        """Whether a coil without a diagnosed fault may carry a current that differs from its command."""
         return self._watch.doubts_currents
 
     def look(
@@ -219,7 +219,7 @@ class CoilDrive:
         self._coils.command(self.command)
 
     def _brake(self, axes: Axes) -> None:
-        """Brake the H-bridges of failed coils: a leg stuck high would drive a coil even at zero command."""
+        """Brake the H-bridges of failed coils: a leg stuck high drives a coil even without a command."""
         if axes != self._braked:
             self._coils.brake(axes)
             self._braked = axes
@@ -242,7 +242,7 @@ class Steering:
         self._body = body
         self._drive = drive
         self._facts = services.facts
-        self._has_rate = True  # whether the newest reading had a rate, or another rate replaced it
+        self._has_rate = True  # whether a body rate is known: from the newest reading or a substitute
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
         """Follow the path or hold its end. The estimate must be None unless it is based on measurements.

@@ -39,7 +39,7 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 BUDGET = 10
-"""Number of deaths in a row after which restarts pause.
+"""Number of consecutive unexpected exits of a worker after which restarts pause.
 
 The delays of the restarts before the pause add up to 127.5 s.
 """
@@ -50,13 +50,13 @@ REST_NS = 600 * SECOND_NS
 
 
 class Attempts:
-    """Counts the deaths of a worker since it last ran for more than a minute."""
+    """Counts the unexpected exits of a worker since it last ran for more than a minute."""
 
     def __init__(self) -> None:
         self.deaths = 0
 
     def died(self, lived_ns: int) -> int:
-        """Count a death after a running time of `lived_ns`, and return the delay (ns) of the restart."""
+        """Count an unexpected exit after `lived_ns` of running, and return the delay (ns) of the restart."""
         if lived_ns >= STEADY_NS or self.is_spent:
             self.deaths = 0
         self.deaths += 1
@@ -111,14 +111,14 @@ class WorkerProcess:
         function = f"{worker.function.__module__}:{worker.function.__qualname__}"
         words = [function, str(line), str(memory), str(os.getpid()), ",".join(map(str, sorted(cores)))]
         return subprocess.Popen(
-            # A service runs isolated: its working folder and environment provide no modules.
+            # With -I, as in a service, modules are not imported from the working folder or the environment.
             [sys.executable, *(["-I"] if sys.flags.isolated else []), "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
             # A separate process group protects the worker from Ctrl-C; the control process ends its worker.
             # The group stays in the session of the control process. If the control process dies while a
-            # worker is stopped, the group is orphaned. In an orphaned group, the kernel ends a stopped worker
-            # by SIGHUP and SIGCONT at any time.
+            # worker is stopped, the group is orphaned. The kernel then sends SIGHUP and SIGCONT to the group,
+            # which ends the stopped worker.
             process_group=0,
         )
 
@@ -224,7 +224,7 @@ class _Kept:
         return min([*dues, *([] if self.process.ready else [self._begun_ns + START_LIMIT_NS])], default=-1)
 
     def serve(self) -> tuple[list[JobResult], list[WorkerNews]]:
-        """Start or reap the worker process, or exchange messages with it, and return results and news."""
+        """Start, reap or communicate with the worker process, and return job results and state changes."""
         now_ns = self._clock.now_ns()
         try:
             if self.process is None:
