@@ -62,10 +62,10 @@ class BatchSizes:
     """Sizes of the successive batches of triangles that are looked up in the index.
 
     Attributes:
-        bright: numbers of triangles of the brightest stars in each batch, for each step of scale; these
-            batches identify most frames.
-        spread: numbers of triangles of many stars in each batch, for frames whose brightest points are not
-            stars.
+        bright: number of triangles in each batch with only the brightest stars; these batches identify most
+            frames.
+        spread: number of triangles in each batch that also includes faint stars, for frames whose brightest
+            points are not stars.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -77,8 +77,9 @@ def batches_of(
 ) -> Iterator[tuple[IntArray, bool]]:
     """Yield batches of triangles (t, 3), and whether each batch includes faint stars.
 
-    The size of a batch of the brightest stars is divided by the square root of the number of `steps` of
-    scale. The function `spread` returns the batches of many stars, which most frames do not need.
+    The size of a batch with only the brightest stars is divided by the square root of the number of scale
+    steps, `steps`. The function `spread` returns the batches that include faint stars, and is called last,
+    because most frames are identified by their brightest stars.
     """
     brightest = triples(min(len(field), _BRIGHTEST))
     begin = 0
@@ -92,10 +93,11 @@ def batches_of(
 
 
 def spread_batches(field: StarField, sizes: BatchSizes) -> list[IntArray]:
-    """Return batches of triangles (t, 3) of many stars.
+    """Return batches of triangles (t, 3) of bright and faint stars.
 
-    For points that are not sorted by brightness, or too many for triangles of all, the last batch includes
-    triangles of neighbouring stars. The mirrored field has the same batches.
+    The last batch also includes triangles of neighbouring stars if the field has more than `_MOST_STARS`
+    points, or more than `_BRIGHTEST` points of unknown magnitude. A field and its mirror image have the same
+    batches.
     """
     batches = np.split(middle_sized(field, sum(sizes.spread)), np.cumsum(sizes.spread)[:-1])
     if len(field) > (_BRIGHTEST if field.magnitude is None else _MOST_STARS):
@@ -159,7 +161,8 @@ class TriangleMatches:
         star: indices of the guide stars at the corresponding corners (k, 3), uint16.
         scale: factor on the observed tangents for which both triangles of a match have equal longest sides
             (k,).
-        code: hash code of each pair of an observed star and a guide star at a similar scale (k, 3), uint32.
+        code: hash codes (k, 3), uint32, of the three pairs of an observed star and a guide star in each
+            match. In two matches of similar scale, the same pair has the same code.
     """
 
     observed: npt.NDArray[np.uint16]
@@ -299,7 +302,7 @@ def _look_up_numpy(
     entry = entry[chosen]
     query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
     longest = (key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
-    # The ranges of entries also contain some triangles that are too small or too large for the step of scale.
+    # The ranges of index entries also contain triangles that are too small or too large for the scale step.
     fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
     scale = longest / size[query] * scales[step[query]]
@@ -371,8 +374,8 @@ def _add_runs(
 ) -> int:
     """Write the ranges of keys that may contain triangles similar to an observed triangle to `runs`.
 
-    A range is the first and the last + 1 index, and the lowest and highest positions of both side ratios in
-    their cells. Returns the number of ranges.
+    Each row of `runs` contains the first index of a range, the index after the last, and the lowest and
+    highest possible positions of both side ratios within their cells. Returns the number of ranges.
     """
     cells, fine, size_bits, run_bits = layout
     sizes = 1 << size_bits
@@ -517,7 +520,7 @@ def _sorted_sides(seen: FloatArray, triangle: IntArray, side: FloatArray, corner
 
 @loop_helper
 def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) -> tuple[int, int]:
-    """Return the lowest and the highest position within a cell that agree with a side ratio."""
+    """Return the lowest and highest position within a cell that differ from `ratio` by at most `slack`."""
     wanted = ratio * (cells * fine) - 0.5 - cell * fine
     reach = slack * (cells * fine) + 0.5
     lowest = min(max(math.ceil(wanted - reach), 0), fine - 1)
@@ -527,7 +530,7 @@ def _place_limits(ratio: float, slack: float, cell: int, cells: int, fine: int) 
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position in a cell that agrees with each ratio, and the number of higher ones.
+    """Return the lowest position in a cell that agrees with each ratio, and how many higher positions agree.
 
     A position agrees with a side ratio if the two differ by at most `slack`.
     """
@@ -607,8 +610,8 @@ class IdentificationSettings:
         work: maximum number of index entries to read.
         verified: maximum number of candidate attitudes to verify after each batch of triangles.
         mirror: whether the mirrored field is searched for as well.
-        hint_error: factor by which the true scale may be below or above a narrow range of scales; 1 if the
-            range is certain. A calibrated scale, (1, 1), is always regarded as certain.
+        hint_error: factor by which a narrow range of scales is extended at both ends if no match is found; 1
+            for no extension. The range (1, 1) of a calibrated camera is never extended.
         verification: settings of the verification of candidates.
     """
 
@@ -622,12 +625,12 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor by which the tolerance and the number of verified candidates are smaller for triangles of many stars.
-# The factor is below 1, because many true triangles vote for the same stars.
+# Factor on the tolerance and on the number of verified candidates for triangles that include faint stars. The
+# factor is below 1, because many true triangles vote for the same stars.
 _OF_SPREAD = 0.6
 # Number of matches with the most votes that are considered for each candidate to be verified.
 _RANKED = 8
-# Factor by which chance matches must be less likely to accept a mirrored field or a scale outside the range.
+# Factor on the expected number of chance matches for a mirrored field or a scale outside the given range.
 _RARE = 10.0
 DEFAULT = IdentificationSettings()
 
@@ -855,7 +858,7 @@ def _most_voted(votes: IntArray, wanted: int) -> IntArray:
 
 @loop_helper
 def _into_frame(corners: FloatArray) -> None:
-    """Replace the unit vectors (columns of `corners`) by the axes of `_frame` (rows of `corners`)."""
+    """Replace the columns of `corners`, three unit vectors, by the axes that `_frame` returns as rows."""
     mx = corners[0, 0] + corners[0, 1] + corners[0, 2]
     my = corners[1, 0] + corners[1, 1] + corners[1, 2]
     mz = corners[2, 0] + corners[2, 1] + corners[2, 2]

@@ -8,8 +8,8 @@ The conversion also includes lens errors: tilt and decentring, which displace th
 centre, and distortion. The lens errors displace a point with the tangents u by (u . a) u + |u|^2 b + k |u|^2
 u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966). Pixels that are not square, for
 example in a picture that was scaled differently along its two axes, displace the point by p (u_x, -u_y) + q
-(u_y, u_x), with the aspect p and the shear q. The eight lens errors form the vector (a, b, k, l, p, q), which
-is named `bend` in the code.
+(u_y, u_x), with the aspect p and the shear q. The vector `bend` in the code contains the eight lens errors:
+the two components of a, the two components of b, and k, l, p and q.
 
 `Pointing` gives the right ascension, declination and roll of an attitude.
 """
@@ -119,7 +119,7 @@ def _bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
 
 
 def bend_slope(seen: FloatArray) -> FloatArray:
-    """Return derivatives (n, 3, 8) of unit vectors `seen` (n, 3) by the eight lens errors."""
+    """Return derivatives (n, 3, 8) of unit vectors `seen` (n, 3) with respect to the eight lens errors."""
     tangent = seen[:, :2] / seen[:, 2:]
     square = np.sum(tangent**2, axis=1, keepdims=True)
     # Tilt and distortion scale a tangent u by relative amounts proportional to u_x, u_y, |u|^2 and |u|^4.

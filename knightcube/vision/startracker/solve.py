@@ -125,7 +125,7 @@ MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """Weights by which the attitude measured in a frame is a mean of the attitudes during the exposure.
+    """Weights that express the attitude measured in a frame as a mean of the attitudes during the exposure.
 
     Attributes:
         weights: weights of the rotations since mid-exposure at the times `NODES`; the weight of mid-exposure
@@ -143,7 +143,10 @@ MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
 """Weighting for streaks that are fitted with a constant rate, or of which only the ends are measured."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
-"""Weighting for streaks fitted with an acceleration, from the best-fitting parabola at mid-exposure."""
+"""Weighting for streaks that are fitted with an acceleration.
+
+The measured attitude is the value at mid-exposure of the parabola that fits the rotation best.
+"""
 
 
 def weighting_of(motion: FrameMotion) -> Weighting:
@@ -174,8 +177,8 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
 
     If the rate changes, only the brightness along a streak determines the star's position at mid-exposure. An
     error of the acceleration shifts all stars along their paths by the same time interval, which does not
-    average out over the stars. The common error is at most the uncertainty along its path of the most
-    accurate star.
+    average out over the stars. The time error common to all stars is at most the time error of the star with
+    the most accurate position along its path.
     """
     if motion.acceleration is None or motion.rate is None:
         return np.zeros((3, 3))
@@ -203,7 +206,7 @@ _CONTRADICTED = 1.5
 _UNCALIBRATED_SIGMA_PX = 0.3
 # Attitude error (px) from an uncalibrated lens and from refraction that remains after the fit of the lens.
 # For the rotation about the boresight, an attitude error in px is measured at the image edge.
-# The value is the difference between the attitudes of one photograph from different solvers.
+# The error is the difference between the attitudes that different solvers find for the same photograph.
 _UNCALIBRATED_LENS_PX = 0.25
 # Minimum flux of a streak used for identification, in standard deviations of the flux.
 _LEAST_SIGNIFICANCE = 5.0
@@ -237,7 +240,8 @@ class SolveSettings:
             positions.
         velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
             of aberration, or None for no correction.
-        lens: standard deviations of a lens of known focal length, or None if the lens is exact.
+        lens: standard deviations of the parameters of a lens with known focal length, or None if the
+            parameters are exact.
         uncalibrated_lens: whether a displaced optical axis and distortion are also fitted for a lens of
             uncertain focal length.
     """
@@ -359,7 +363,7 @@ def points_near(
     """Return the stars detected near the predicted positions of the brightest guide stars.
 
     If the prior attitude is too uncertain, no stars are returned. The argument `trails` describes the motion
-    of the stars during the exposure, if this motion is known and at most a few pixels.
+    of the stars during the exposure, if the motion is known and no longer than a few pixels.
     """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
@@ -547,11 +551,12 @@ def _with_attitude(
 
 
 def _contradiction(seen: FrameSolution, fit: ImageFit) -> str:
-    """Return why the points contradict their uncertainties too much for an attitude, or an empty string.
+    """Return why an attitude is rejected because of too large residuals of the points, or an empty string.
 
     If the positions are wrong, for example because a defocused lens images stars as rings, only points that
-    are within the gate by chance match. If fewer than half of the points match, the candidate attitude
-    selected them, and their scatter does not show the error of the attitude.
+    are within the gate by chance match. If fewer than half of the points match, the matching points may be
+    only those that lie near stars by chance. The residuals of such points do not show the error of the
+    attitude.
     """
     count, agreeing = len(seen.points), int(np.count_nonzero(fit.agree))
     if seen.kind is not FrameKind.POINTS or 2 * agreeing >= count or fit.excess < _CONTRADICTED:
@@ -566,9 +571,9 @@ def _split_doubt(seen: FrameSolution, chosen: IntArray) -> FloatArray:
     """Return the attitude covariance (3, 3), rad^2, due to star images that consist of several points.
 
     A star in a defocused or shaken image appears as several points, of which one matches the star. If the
-    same part of each star's image matches, all positions have a common error, which the residuals do not
-    show. The common error is about half of the distance to the other points of the same star. The array
-    `chosen` contains the indices of the matched points.
+    matched point is in the same part of every star's image, all star positions have a common error, which the
+    residuals do not show. The common position error is about half of the distance between the points of one
+    star. The array `chosen` contains the indices of the matched points.
     """
     doubt = np.zeros((3, 3))
     if seen.kind is not FrameKind.POINTS:
@@ -588,7 +593,8 @@ def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
     camera = camera.rescaled(1.0 / found.scale)
     if found.distortion == 0.0 or not isinstance(camera, Pinhole):
         return camera
-    # The coefficient `distortion` refers to tangents relative to the corner's tangent, unlike k1.
+    # The coefficient `distortion` applies to tangents divided by the tangent at the image corner, whereas k1
+    # applies to undivided tangents.
     corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
     try:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)

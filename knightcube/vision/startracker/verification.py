@@ -2,11 +2,11 @@
 
 The guide stars predicted in the field are compared with the observed stars. Attitude and scale are refined
 with the matched stars, and the comparison is repeated until the set of matched stars is constant. The
-significance of a match is an upper bound of the expected number of attitudes, among the searched attitudes,
+significance of a match is an upper bound on the expected number of attitudes, among the searched attitudes,
 at which random stars would match at least as well. If the expected number of chance matches is far below one,
-it is also an upper bound of the probability of a false match. The bound of chance matches does not depend on
-how a candidate attitude was found. The bound is multiplied by the number of alternatives among which gate,
-brightness limit and test are chosen (Bonferroni).
+it is also an upper bound on the probability of a false match. The bound on the number of chance matches does
+not depend on how a candidate attitude was found. The bound is multiplied by the number of alternatives among
+which gate, brightness limit and test are chosen (Bonferroni).
 
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
 all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
@@ -67,11 +67,11 @@ class Chance:
     enough: float
 
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
-        """Return log10 of an upper bound of the expected number of chance matches as good as a given match.
+        """Return log10 of an upper bound on the expected number of chance matches as good as a given match.
 
-        The faintest expected star that is compared is also selected for the most significant match. Because
-        of the selection of the faintest star, the bound is multiplied by j^2 pi^2/6, where j - 1 is the
-        number of brighter expected stars without a match.
+        Only expected stars down to a brightness limit are compared, and the limit with the most significant
+        match is selected. Because of this selection, the bound is multiplied by j^2 pi^2/6, where j - 1 is
+        the number of expected stars down to the limit that have no match.
 
         Args:
             gate: half-width within which a star matches, in standard deviations.
@@ -98,8 +98,8 @@ class Chance:
         first star. The radius of the ring is the distance of the first two matched stars. The width of the
         ring is computed from the range of the scale and from the gate. Every further matched star lies within
         the gate of an expected star. The probability is multiplied by the number of ways to choose the
-        matched stars among the observed stars. The fit reduces the distances of the matched stars. The gate
-        is therefore increased by the factor 1/(1 - leverage).
+        matched stars among the observed stars. The fit of the attitude reduces the distances between observed
+        and expected stars. The gate is therefore increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
@@ -161,7 +161,7 @@ class _Matching:
     Attributes:
         candidate: index of the candidate attitude.
         observed, star: indices of the matched observed stars and of their guide stars (k,).
-        log10_chance: log10 of the bound of chance matches.
+        log10_chance: log10 of the upper bound on the expected number of chance matches.
         expected: indices of the guide stars that are expected in the field, the brightest first.
     """
 
@@ -496,7 +496,7 @@ def _pair_numpy(
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Return the nearest guide star (n,) of each of `seen` (n, 3), and the squared distance in variances.
 
-    The distance is infinite if the nearest guide star of an observed star has a nearer observed star.
+    The distance is infinite if another observed star is nearer to the guide star.
     """
     cosines = seen @ (matrix @ guide.T)
     nearest = cosines.argmax(axis=1)
@@ -658,9 +658,9 @@ def _pair(
 ) -> None:
     """Write the nearest expected star of each observed star and its squared distance in standard deviations.
 
-    The distance is infinite if the nearest expected star of an observed star has a nearer observed star, or
-    if every expected star is farther away than the chord `reach`. The `tangent` (n,), at scale 1, of the
-    observed stars along the first axis ascends in the given `order`.
+    The distance is infinite if another observed star is nearer to the expected star, or if no expected star
+    is within the chord `reach`. The array `order` (n,) sorts the observed stars by their field-angle tangent
+    along the first axis, and `tangent` (n,) contains the sorted tangents at scale 1.
     """
     closest, owner = np.full(len(seen), -2.0), np.full(len(expected), -1)
     nearest[:] = 0
@@ -688,7 +688,7 @@ def _pair(
 
 @loop_helper
 def _widest_difference(seen: FloatArray, reach: float) -> float:
-    """Return a bound of the difference between the tangents of two stars at most `reach` apart.
+    """Return an upper bound on the difference between the tangents of two stars at most `reach` apart.
 
     A gnomonic image is enlarged by at most 1 + t^2 between two stars, where t is the larger field angle's
     tangent.
@@ -712,7 +712,10 @@ def _best_gate(
     fields: float,
     scales: float,
 ) -> tuple[float, float]:
-    """Return the most significant gate and log10 of its chance matches; a gate of 0 if few stars match."""
+    """Return the gate with the most significant match, and log10 of the expected number of chance matches.
+
+    The returned gate is 0 if fewer than `least` stars match.
+    """
     best, bound, matched = 0.0, math.inf, least - 1
     for gate in gates:
         within, rank = _within(squared, nearest, gate)

@@ -7,18 +7,18 @@ begin at multiples of 64 bytes. The same columns always give a file with the sam
 
 Guide stars are the catalogue stars as a given lens resolves them (Michalski, section 3.3). Proper motion is
 applied up to the epoch of observation. Stars that an image cannot resolve are merged into one star at their
-centroid, with their joint magnitude. Aberration is not included in the index, because it depends on the
+centroid, with their combined magnitude. Aberration is not included in the index, because it depends on the
 velocity of the camera; it is applied to the matched directions on board.
 
-The index contains only triangles of stars that are bright relative to the size of the triangle. The reach of
-a star is its distance from the `rank`-th nearest of all stars that are brighter than the star itself. A star
-is among the `rank` brightest stars of every circle around the star whose radius is below its reach. The index
-contains a triangle if its longest side is at most the reach of each of its stars. The index does not depend
-on the field of view. About the same number of triangles of the brightest stars is found in frames of any
-field of view. Every part of the sky has about the same number of stars with a given reach, so dense regions
-do not add triangles. Near a cluster of bright stars, all stars have a short reach. To cover the neighbourhood
-of clusters of bright stars, the index also contains the triangles of the `few` brightest stars of circles of
-several radii that cover the sky.
+The index contains only triangles of stars that are bright relative to the size of the triangle. The distance
+from a star to the `rank`-th nearest of all brighter stars is called the reach of the star. The index contains
+a triangle if its longest side is at most the reach of each of its three stars. Each star of the triangle is
+then one of the `rank` brightest stars in the circle around the star with the longest side as radius. The
+index does not depend on the field of view. About the same number of triangles of the brightest stars is found
+in frames of any field of view. Dense regions of the sky do not have more triangles than sparse regions,
+because the stars of dense regions have a shorter reach. Near a cluster of bright stars, the reach of all
+stars is so short that there would be too few triangles. The sky is therefore also covered by circles of
+several radii, and the triangles of the `few` brightest stars of each circle are added to the index.
 
 The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
 first part of a key is the orientation (left or right) of the triangle's corners, ordered by the lengths of
@@ -83,7 +83,7 @@ class TableKind:
 
 
 def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> None:
-    """Write a table of `columns` and single numbers (`facts`) to the file `path`, in one atomic operation."""
+    """Write a table of `columns` and metadata (`facts`) to the file `path`, in one atomic operation."""
     little = {name: _little(column) for name, column in columns.items()}
     contents: dict[str, Any] = {"facts": facts, "columns": {}}
     offset = 0
@@ -102,7 +102,7 @@ def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> N
 
 
 def load_table(path: Path, kind: TableKind) -> tuple[Columns, Facts]:
-    """Return the columns of a table, memory-mapped and read-only, and its single numbers (facts).
+    """Return the columns of a table, memory-mapped and read-only, and its metadata (`facts`).
 
     Raises InputError if the file is missing, damaged, of another kind or of another version.
     """
@@ -147,7 +147,7 @@ class GuideStars:
     Attributes:
         hip: Hipparcos numbers (n,), int32; for merged stars, the number of the brightest star.
         direction: unit vectors to the stars (n, 3), ICRS, at `epoch`.
-        magnitude: Johnson V magnitudes (n,); for merged stars, the joint magnitude.
+        magnitude: Johnson V magnitudes (n,); for merged stars, the combined magnitude.
         epoch: Julian year of the directions.
     """
 
@@ -212,7 +212,10 @@ CELL = 1.0 / CELLS
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Resolution of the longest side (a chord below 1) in the key of a triangle."""
+"""Quantisation step of the longest side in the key of a triangle.
+
+The longest side is a chord of the unit sphere and is below 1.
+"""
 RUN_BITS = 12
 """Binary logarithm of the interval between the key values of two entries of `TriangleIndex.below`."""
 # Number of boxes along each axis of the cube around the unit sphere, which is divided to find stars by
@@ -228,7 +231,8 @@ LEAST_RATIO = 0.1
 _CIRCLES_APART = 0.7
 # Mean number of stars per circle in the first search, relative to the number of stars needed.
 _ENOUGH = 4.0
-# Mean number of the brightest stars within the smallest useful reach, relative to the rank.
+# Mean number of stars within the distance `least` of a star in the fast comparison of the function `reach`,
+# as a multiple of `rank`.
 _BRIGHTER = 2.0
 
 
@@ -278,16 +282,16 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
     """Return the reach of each star (n,): the chord to its `rank`-th nearest brighter star.
 
     The reach is at most `farthest`, which is also the reach of a star with fewer than `rank` brighter stars.
-    The result may be zero for a star with a reach below `least`. The unit vectors `direction` (n, 3) are in
-    order of brightness, the brightest first.
+    The result may be zero for a star whose `rank`-th nearest brighter star is closer than `least`. The unit
+    vectors `direction` (n, 3) are in order of brightness, the brightest first.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     count = len(direction)
     result = np.full(count, farthest)
     wanted = np.arange(count)
-    # A fast comparison with the brightest stars of the sky shows which stars have a small reach; most stars
-    # do.
+    # A fast comparison with the brightest stars of the sky shows which stars have a reach below `least`; most
+    # stars do.
     brightest = math.ceil(4.0 * _BRIGHTER * rank / least**2) if least > 0.0 else count
     if brightest < count:
         near = cKDTree(direction[:brightest]).query_ball_point(
@@ -321,9 +325,10 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
     Args:
         direction: unit vectors to the stars (n, 3), the brightest first.
         sizes: limits (b + 1,) of the b bands in which triangles are sorted by their longest side, as chords.
-        ranks: rank of the brighter star that defines a star's reach, for each band (b,).
-        few: number of the brightest stars of a circle on the sky whose triangles are added. The circles on
-            the sky have the radii `sizes` and cover the sky.
+        ranks: limit for each band (b,). A star is a corner of triangles of a band only if fewer brighter
+            stars than this limit are closer to the star than the triangle's longest side.
+        few: number of stars per circle. The sky is covered by circles with the radii `sizes`, and the
+            triangles of the `few` brightest stars of each circle are added.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
@@ -380,13 +385,14 @@ def evenly_spread(count: int) -> FloatArray:
 def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:
     """Return the triangles (m, 3) with a longest side between `smallest` and `largest`.
 
-    For the given `rank`, the reach of each star of a triangle is at least the longest side.
+    Each star of a triangle has fewer than `rank` brighter stars that are closer than the longest side.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     limit = reach(direction, rank, largest, smallest)
     able = np.flatnonzero(limit >= smallest)
-    # Stars are sorted by reach, so that each triangle is found once, from the star with the smallest reach.
+    # The stars are sorted by `limit`, so that each triangle is found only once, from its star with the
+    # smallest `limit`.
     able = able[np.argsort(-limit[able], kind="stable")]
     limit, place = limit[able] * (1.0 + TIE), direction[able]
     first, last = np.sort(cKDTree(place).query_pairs(largest, output_type="ndarray"), axis=1).T
@@ -481,7 +487,7 @@ class SkyIndex:
 
     @cached_property
     def boxes(self) -> tuple[npt.NDArray[np.int32], FloatArray, npt.NDArray[np.int32]]:
-        """The guide stars (n,) sorted by box, their directions (n, 3), and the first star of each box.
+        """The guide stars (n,) sorted by spatial box, their directions (n, 3), and the first star of each box.
 
         The cube around the unit sphere is divided into equally many boxes along each axis. The stars of a box
         are in order of brightness, the brightest first.
