@@ -487,7 +487,7 @@ class SkyIndex:
 
     @cached_property
     def boxes(self) -> tuple[npt.NDArray[np.int32], FloatArray, npt.NDArray[np.int32]]:
-        """The guide stars (n,) sorted by spatial box, their directions (n, 3), and the first star of each box.
+        """The guide stars (n,) by spatial box, their directions (n, 3), and the first star of each box.
 
         The cube around the unit sphere is divided into equally many boxes along each axis. The stars of a box
         are in order of brightness, the brightest first.
