@@ -580,7 +580,7 @@ class CoilMonitor:
                 self._probe_weak_coil(feeble[0], now_ns)
 
     def _probe_weak_coil(self, axis: int, now_ns: int) -> None:
-        """Start probes, by which the current monitor decides whether a coil is open."""
+        """Start probe currents, from which the current monitor decides whether a coil is open."""
         silent = now_ns - self._reading_ns > self._settings.window_ns
         if silent or self._suspected_ns is not None or now_ns - self._weak_ns < _AGAIN_NS:
             return

@@ -514,7 +514,7 @@ class CoilResponse:
         return inputs.reshape(-1, len(self._prior)), white[:, :, coils].reshape(-1)
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
-        """Count the fits in a row that agree on an axis.
+        """Count the consecutive fits that agree on an axis.
 
         Args:
             axis: index of the axis.

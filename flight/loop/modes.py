@@ -363,7 +363,7 @@ class ModeSettings:
     Attributes:
         low_rate, low_for: limits of detumbling, which ends when the rate has been below `low_rate` (rad/s)
             for `low_for` (s).
-        stop: function that ends the flight after the running cycle; its argument is the reason.
+        stop: function that ends the flight after the current cycle; its argument is the reason.
     """
 
     modes: Modes

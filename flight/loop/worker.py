@@ -184,7 +184,7 @@ def _field_names(kind: Any) -> tuple[str, ...] | None:
 SLAB_BYTES = 64 * 1024 * 1024
 """Size (bytes) of the shared memory for a job's arrays; unused pages occupy no memory."""
 LONGEST_BYTES = 16 * 1024 * 1024
-"""Largest length (bytes) of a message without its arrays; a larger length is a sign of damage."""
+"""Largest length (bytes) of a message without its arrays; a larger length indicates damage."""
 
 _HEADER = struct.Struct("<QQI")
 """Header of a message: length of the list of array sizes, length of the body, and CRC-32 of both."""

@@ -81,7 +81,7 @@ class UnitCalibration(Section, frozen=True, kw_only=True):
 
 
 class UnitSection(Section, frozen=True, kw_only=True):
-    """The keys of every inertial unit, to which the section of a driver adds further keys.
+    """The configuration keys that all inertial units share; the section of each driver adds keys of its own.
 
     The coils are switched off if a reading would become older than `max_age` s before the next reading is
     used.
@@ -116,9 +116,10 @@ class Sensor(Section, frozen=True, kw_only=True):
     The value `part` is `icm20948`, `lis3mdl`, `adis16470`, or `module:class` of a CircuitPython driver. The
     sensor has the I2C `address` on the bus `bus`, by default the bus of the coils, or it is the SPI device
     `spi`. The mapping `measures` names the quantities that are read from the sensor, and for each quantity
-    the sensor's axis along the axes x, y and z of the unit, such as `gyro: [y, -x, z]`. The attributes `set`
-    of the CircuitPython driver are set after each start, for example a data rate. The value `emulator` names
-    the emulator of another sensor, as `module:function`.
+    the sensor's axis along the axes x, y and z of the unit, such as `gyro: [y, -x, z]`. The mapping `set`
+    names attributes of the CircuitPython driver, for example a data rate, and the values that these
+    attributes receive after each start. The value `emulator` names the emulator of another sensor, as
+    `module:function`.
     """
 
     part: Annotated[str, Meta(min_length=1, max_length=200)]
@@ -229,8 +230,8 @@ class Coils(Section, frozen=True, kw_only=True):
         """The coils in the order of the flight application; the last coil may be fictitious.
 
         If the coils lie in a plane, a fictitious coil along the normal of the plane is appended. This coil
-        has half the dipole moment of the weakest coil, so that plans use it little, and two free PWM
-        channels.
+        has two free PWM channels. Its dipole moment is half that of the weakest coil, so that plans use it
+        little.
         """
         axes = np.array([coil.direction() for coil in self.windings]).T
         if np.linalg.matrix_rank(axes, LEAST_SPREAD) == 3:
@@ -351,8 +352,8 @@ class LowBattery(Section, frozen=True, kw_only=True):
 
     Below `low`, the coils carry at most the fraction `coil_share` of their current limits. Below `very_low`,
     the star camera takes a frame every `camera_period` s at most. Below `critical`, the mode changes to safe.
-    A load is switched on again when the state of charge exceeds its limit by `hysteresis`; above `critical`,
-    the flight then leaves the mode safe by itself.
+    A load is switched on again when the state of charge exceeds its limit by `hysteresis`. When the state of
+    charge exceeds `critical` by `hysteresis`, the satellite leaves the mode SAFE without a command.
     """
 
     low: Share = 0.4
@@ -613,7 +614,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:
-    """Return the calibrated camera of a section with a lens, or a pinhole camera of its field of view.
+    """Return the model of a configured camera: its calibrated lens, or a pinhole with its field of view.
 
     Raises LensError for a lens that cannot exist.
     """
@@ -649,7 +650,7 @@ def structure_mask(camera: WideCamera, *, of_file: bool = True) -> BoolArray:
 
 
 def camera_knowledge(camera: Camera) -> CameraKnowledge:
-    """Return the uncertainty of the pinhole camera by which the streak fit represents the camera.
+    """Return the uncertainty of the pinhole model with which the streak fit represents the camera.
 
     The streak fit has no lens model, so the difference between a calibrated lens and the pinhole adds to the
     uncertainty.
@@ -781,7 +782,10 @@ SENSOR_PARTS: Mapping[str, str] = {
 
 
 def axis_matrix(names: Sequence[str]) -> FloatArray:
-    """Return the matrix (3, 3) from sensor to unit axes; each name is the sensor axis along a unit axis."""
+    """Return the matrix (3, 3) from sensor axes to axes of the inertial unit.
+
+    The `names` are the signed sensor axes along the axes x, y and z of the unit.
+    """
     return np.array([[(1.0, -1.0)[name[0] == "-"] * (name[-1] == axis) for axis in "xyz"] for name in names])
 
 

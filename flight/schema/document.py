@@ -76,8 +76,8 @@ class Document:
 
 
 MODULES = "KNIGHTCUBE_MODULES"
-"""Environment variable of a flight computer: path of the file of further permitted objects
-`module:object`."""
+"""Environment variable of a flight computer: path of a file that lists objects (`module:object`) that a
+configuration may import, in addition to the known objects."""
 
 
 def imported(key: str, named: str, known: Mapping[str, str], environment: Mapping[str, str]) -> Any:
@@ -146,7 +146,8 @@ class _Loader(yaml.SafeLoader):
 
 
 _TOLERATED = re.compile("[\t!?\ufeff]|[|>][0-9+-]*#")
-"""Characters that libyaml accepts at more positions, or interprets differently, than PyYAML's own parser."""
+"""Characters that libyaml accepts in more places of a YAML text, or interprets differently, than PyYAML's own
+parser."""
 
 
 class _FastLoader(_Loader):
@@ -251,7 +252,10 @@ def merged_text(text: str, name: str) -> str:
 
 
 def _extended(document: Document, above: tuple[str, ...]) -> Document:
-    """Return a document merged with the file that it extends. The files `above` extend this document."""
+    """Return a document merged with the file that it extends.
+
+    The names `above` are those of the files that extend this document, directly or through other files.
+    """
     if EXTENDS not in document.values:
         return document
     named = document.values.pop(EXTENDS)
@@ -302,7 +306,7 @@ def _read_single(text: str, name: str) -> Document:
     return replace(read, values=copy.deepcopy(read.values), lines=dict(read.lines))
 
 
-@lru_cache(maxsize=8)  # a command reads a text up to seven times
+@lru_cache(maxsize=8)  # a command reads a configuration up to seven times
 def _read_once(text: str, name: str) -> Document:
     lines: dict[str, int] = {}
     try:
@@ -483,7 +487,10 @@ def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
 
 
 def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
-    """Return the types permitted at a key or index of a type; for the tag of a union, its choices."""
+    """Return the types that a value at `key` or `index` may have within the type `kind`.
+
+    The type of a union's tag is the literal type of its permitted value.
+    """
     if isinstance(kind, inspect.StructType) and key:
         if key == kind.tag_field:
             return [inspect.LiteralType((kind.tag,))]

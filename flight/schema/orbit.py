@@ -1,4 +1,4 @@
-"""The configuration of a satellite in orbit, whose sections supplement those of every body."""
+"""The configuration of a satellite in orbit: sections in addition to those that all bodies share."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
 
 class CraftAccuracy(Section, frozen=True, kw_only=True):
-    """Largest errors of the description of the satellite; the true errors are assumed uniform within them.
+    """Largest errors of the configured satellite; the true errors are assumed uniform within them.
 
-    `centre_of_mass` (m) is the distance of the true from the described centre of mass, whose default is the
+    `centre_of_mass` (m) is the distance of the true from the configured centre of mass, whose default is the
     largest offset that the CubeSat Design Specification permits.
 
     `moments` is the relative error of the principal moments of inertia, and `axes_deg` the rotation of the
@@ -102,11 +102,11 @@ class Craft(Section, frozen=True, kw_only=True):
 
 
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
-    """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control`).
+    """Detumbling by a minimum-time plan of the angular momentum in the measured magnetic field.
 
     The noise `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. The noise
     `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques; without it, it is computed
-    (`OrbitConfig.torque_noise`). The momentum plan covers `horizon` s and
+    (`OrbitConfig.torque_noise`). The plan (`knightcube.gnc.control.field_detumbler`) covers `horizon` s and
     is renewed every `replan` s. A body that starts slower than `gentle` rad/s should not exceed its initial
     rate; a faster body may reach `spin_up` times its initial rate.
     """
@@ -270,11 +270,12 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         return _two_digits(0.1 * torque * float(np.sqrt(np.mean(rates**2))))
 
     def dipole_errors(self) -> tuple[float, float]:
-        """Return the largest errors (A m^2, each axis) of the residual dipole and its increase in sunlight.
+        """Return the largest errors (A m^2, each axis) of two dipoles: residual, and additional in sunlight.
 
         The default error of the residual dipole in shadow is proportional to the mass, as for a satellite
         with some magnetic cleanliness. A missing mass is computed from the moments of inertia of a
-        homogeneous box. The error of the increase in sunlight is three tenths of the default error in shadow.
+        homogeneous box. In sunlight, an additional dipole arises, whose largest error is three tenths of the
+        default error in shadow.
         """
         craft = self.craft
         mass = craft.mass
@@ -287,9 +288,9 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         """Return the amplitude (N m) and random walk (N m per sqrt(s)) of the disturbance torques at 500 km.
 
         The default amplitude is the torque of air drag and solar radiation pressure on the largest face, with
-        the sum of the described and the unknown offset of the centre of mass as lever arm. The default random
-        walk is the amplitude times 2e-3 per sqrt(s), because plans extrapolate an estimated torque along the
-        field for an hour.
+        the sum of the configured and the unknown offset of the centre of mass as lever arm. The default
+        random walk is the amplitude times 2e-3 per sqrt(s), because plans extrapolate an estimated torque
+        along the field for an hour.
         """
         craft, section = self.craft, self.estimation
         x, y, z = craft.size

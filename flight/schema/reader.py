@@ -194,7 +194,7 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
 
 
 def _check_cones(camera: Camera, cones: ExclusionCones, refuse: Refuse) -> None:
-    """Refuse an exclusion cone that is too small to keep its body out of the star camera's field of view."""
+    """Refuse a cone too small to keep the Sun, Moon or Earth out of the star camera's field of view."""
     half_width = math.tan(math.radians(0.5 * camera.field_of_view_deg))
     corner = math.degrees(math.atan(half_width * math.hypot(1.0, camera.rows / camera.columns)))
     for name, angle in cones.angles().items():

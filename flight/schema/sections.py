@@ -188,16 +188,17 @@ class Link(Section, frozen=True, kw_only=True):
 
     The folder `keys` contains keys and counters (`knightcube keys`), and `spacecraft` is the identifier in
     each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
-    Without `peers`, a loopback address accepts frames from this machine, any other address from its network
-    of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated
-    senders, to `telemetry_to` (HOST:PORT, UDP), to `serial` and to the TNC at `kiss` (HOST:PORT, TCP). With
-    the two `call_signs` (to, from), KISS frames contain AX.25 frames. Telemetry frames have `frame_bytes`
-    bytes, and telecommand frames have at most `command_frame_bytes` bytes. Each line carries at most `rate`
-    bytes/s of telemetry frames. Idle frames raise the rate to `idle_rate` bytes/s. Telemetry is always
-    authenticated, and readable without a key if `encrypt_telemetry` is false. The section `coding` describes
-    the channel coding. After `command_loss` s with power without an authentic frame, a flight computer
-    returns to its previous release, after the same time again to its previous configuration, then to the
-    configuration accepted on the ground; 0 disables these returns.
+    Without `peers`, a loopback address accepts frames only from this machine, and any other address accepts
+    frames only from its own /24 network (256 addresses). The value `serial` describes the line of a radio.
+    Telemetry is sent to authenticated senders, to `telemetry_to` (HOST:PORT, UDP), to `serial` and to the TNC
+    at `kiss` (HOST:PORT, TCP). With the two `call_signs` (to, from), KISS frames contain AX.25 frames.
+    Telemetry frames have `frame_bytes` bytes, and telecommand frames have at most `command_frame_bytes`
+    bytes. Each line carries at most `rate` bytes/s of telemetry frames. Idle frames raise the rate to
+    `idle_rate` bytes/s. Telemetry is always authenticated, and readable without a key if `encrypt_telemetry`
+    is false. The section `coding` describes the channel coding. A flight computer returns to its previous
+    release if it has power and receives no authentic frame for `command_loss` s. After this time has passed
+    once more, it returns to its previous configuration, and after a third time to the configuration accepted
+    on the ground. The value 0 disables these returns.
     """
 
     keys: Annotated[str, Meta(min_length=1)]
@@ -284,7 +285,7 @@ class Config(Section, frozen=True, kw_only=True):
         return 0.0, self.inertial_unit.field_range
 
     def replan_period(self) -> float | None:
-        """Return the period (s) of planning from the newest estimate, or None for a body without plans."""
+        """Return the time (s) from one periodic plan to the next, or None for a body without plans."""
         return None
 
     def hardware(self) -> tuple[Section, ...]:

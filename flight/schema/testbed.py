@@ -137,7 +137,7 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
         return 0.2 * self.plant.field, 3.0 * self.plant.field
 
     def replan_period(self) -> float:
-        """Return the period (s) of planning from the newest estimate."""
+        """Return the time (s) from one periodic plan, which starts from the newest estimate, to the next."""
         return self.guidance.replan_period
 
     def hardware(self) -> tuple[Section, ...]:

@@ -72,13 +72,13 @@ _OWN = {
     "ground": ("latitude_deg", "longitude_deg"),
     "object": ("right_ascension_deg", "declination_deg"),
 }
-"""Keys that a goal requires and no other goal accepts; the goal `object` may lack both of its keys."""
+"""Keys that a goal requires and no other goal accepts. The goal `object` may have both keys or none."""
 _LENGTH_ERROR = 1e-3
 """Largest accepted deviation of a commanded quaternion's norm from 1."""
 
 
 def inertia_matrix(inertia: Inertia) -> FloatArray:
-    """Return the inertia tensor (3, 3), kg m^2. Raises ValueError if moments and rows are mixed."""
+    """Return the inertia tensor (3, 3), kg m^2. Raises ValueError if moments are mixed with matrix rows."""
     given = np.array(inertia, dtype=float)
     return np.diag(given) if given.ndim == 1 else given
 
@@ -114,7 +114,7 @@ class Aim(Section, frozen=True, kw_only=True):
 
 
 def check_aim(dotted: str, aim: Aim, goal: str | None, refuse: Callable[[str, str], None]) -> None:
-    """Report wrong values through `refuse`: missing values, and values of another goal or without a goal."""
+    """Report missing values, values of other goals, and values without a goal through `refuse`."""
     for owner, names in _OWN.items():
         needed = owner == goal and (
             owner != "object" or any(getattr(aim, name) is not None for name in names)

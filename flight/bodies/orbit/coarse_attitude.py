@@ -53,7 +53,7 @@ CLOUDS = 0.5
 """Relative variation of the Earth's irradiance due to clouds."""
 LEAST_ALBEDO = 0.02
 STUCK = 3
-"""Number of identical solar cell readings in a row that indicate a fault.
+"""Number of consecutive identical solar cell readings that indicate a fault.
 
 Readings of working cells differ by noise.
 """

@@ -1,10 +1,10 @@
 """The control laws of a satellite in orbit: detumbling, turning to the Sun in SAFE, and pointing.
 
-Detumbling follows the momentum plan in the measured magnetic field, or in the predicted field if attitude and
-orbit are known. In SAFE the satellite turns to the Sun with solar cells, gyro and magnetometer only; orbit,
-attitude and clock may be unknown. Pointing follows a path with the pointing law. Far off the path, the
-rotation is damped before a new path is planned (`PathRecovery` and `damping_dipole` of
-`knightcube.gnc.control.pointing_law`).
+Detumbling follows a minimum-time plan of the angular momentum in the measured magnetic field, or in the
+predicted field if attitude and orbit are known. In SAFE the satellite turns to the Sun with solar cells, gyro
+and magnetometer only; orbit, attitude and clock may be unknown. Pointing follows a path with the pointing
+law. Far off the path, the rotation is damped before a new path is planned (`PathRecovery` and
+`damping_dipole` of `knightcube.gnc.control.pointing_law`).
 
 While pointing, the coils are off at the beginning of each control window, so that the magnetometer can be
 read. At the end of the pause of a control window, one dipole is computed, which is held until the window

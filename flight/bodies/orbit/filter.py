@@ -106,10 +106,10 @@ class StepReplay:
 
     Attributes:
         free: the filter, with the estimate at the end of the newest step.
-        refused_gyros: number of steps in a row whose mean gyro rate contradicts the estimated motion.
-        contradicted: number of steps in a row, with current in the coils, whose gyro contradicts the motion;
-            reset after `FORGOTTEN_NS`, because coils that are off give no evidence.
-        refused_fields: number of magnetic fields in a row that contradict the estimate.
+        refused_gyros: number of consecutive steps whose mean gyro rate contradicts the estimated motion.
+        contradicted: number of consecutive steps, with current in the coils, whose gyro contradicts the
+            motion; reset after `FORGOTTEN_NS`, because coils that are off give no evidence.
+        refused_fields: number of consecutive field measurements that contradict the estimate.
         contradictions: texts about learned states that measurements have contradicted.
     """
 

@@ -436,7 +436,7 @@ AGAIN_NS = 10_000_000_000
 REST_AGAIN_NS = 5_000_000_000
 """Shortest time (ns) between two plans for the rest of a slew."""
 _SMALLEST = 0.5
-"""Smallest plausible principal moment of inertia, relative to the smallest described moment."""
+"""Smallest plausible principal moment of inertia, relative to the smallest configured moment."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -77,7 +77,7 @@ inertial unit."""
 _CONSTANT_FOR = 5.0
 """Time (s) during which the coils' field at the magnetometer is treated as constant."""
 _REFUSED_TO_RESTART = 8
-"""Number of rejected angles in a row, measured with the coils off, after which the filter starts again."""
+"""Number of consecutive rejected angles, measured with the coils off, after which the filter starts again."""
 _VACUUM_PERMEABILITY = 4e-7 * math.pi  # T m/A
 
 
