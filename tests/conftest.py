@@ -23,8 +23,9 @@ from hypothesis import settings
 # `python -m flight` sets the same value: otherwise OpenBLAS's waiting threads would take a third of the
 # processor time. No test imports numpy before this file is read, and started programs inherit the setting.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# The tests compare the numpy forms with their requirements, and the compiled forms with the numpy forms:
-# recorded results stay the same byte for byte, and started programs do not load numba.
+# The tests check the numpy implementations of functions that numba can compile. The compiled implementations
+# are compared with the numpy implementations. So recorded results are the same byte for byte, and started
+# programs do not load numba.
 os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 
 # No test may fail because the machine is busy, or because hypothesis draws a rare example in one of many

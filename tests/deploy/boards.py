@@ -1,8 +1,9 @@
 """Files of a board whose releases are built in a second, because its Python makes empty environments.
 
-The installer receives a script instead of its Python. The script makes virtual environments with itself as
-Python, "installs" by writing one file, and prints its release instead of starting a flight. All other
-programs, such as the installer's own modules, are run by the real Python.
+The installer is given a script instead of a Python interpreter. The script makes virtual environments that
+contain the script itself as Python interpreter, "installs" by writing one file, and prints its release
+instead of starting a flight. All other programs, such as the installer's own modules, are run by the real
+Python.
 """
 
 from __future__ import annotations

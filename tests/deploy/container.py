@@ -70,7 +70,11 @@ def _why_no_cgroup() -> str:
 
 
 def needs_mount(place: Path) -> bool:
-    """Return whether a folder of this machine is not in the overlay of /, or is covered in the container."""
+    """Return whether a folder of this machine must be mounted separately to be visible in the container.
+
+    The root of the container is an overlay of `/`. It does not contain folders of other file systems, and the
+    container's own mounts hide the folders `_HIDDEN`.
+    """
     real = place.resolve()
     covered = any(real.is_relative_to(hidden) for hidden in _HIDDEN)
     return covered or real.stat().st_dev != Path("/").stat().st_dev

@@ -18,7 +18,10 @@ from tests.deploy.scripts import ROOT
 LINK_SERVICE = "knightcube-link.service"
 CONFIG, STATUS = Path("/etc/knightcube/flight.yaml"), Path("/var/lib/knightcube-renewal/status")
 TRIAL = ("--timeout", "600", "--despite-faults")
-"""Options of a trial: on a busy machine devices respond late, which a flight reports as a fault."""
+"""Options of the command that activates an update, with which reported faults do not end its trial.
+
+On a busy machine the emulated devices respond late, which a flight reports as a fault.
+"""
 FUTURE = "from __future__ import annotations\n"
 FAULT = "import sys\nif '--archive' in sys.argv:\n    raise SystemExit('broken on purpose')\n"
 """Fault that the self-test of a release cannot show: it ends every flight of the service."""

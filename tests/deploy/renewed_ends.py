@@ -45,7 +45,7 @@ class RenewedEnds(FiledEnds):
         place.mkdir()
         board.link.rename(place / "keys-of-board")
         super().__init__(place, up_rate=1e6, seed=seed)
-        # The link's state folder of the board is the parent of its keys.
+        # On the board, the folder `keys` lies in the state folder of the link.
         (place / "keys").rename(board.link)
         (place / "keys-of-board").rename(board.link / "moved")
         (place / "keys").symlink_to(board.link)
@@ -77,12 +77,12 @@ class RenewedEnds(FiledEnds):
             self.record(self.mode_packet(Mode.SAFE, "reaction safe"))
 
     def flown_release(self) -> str:
-        """Return the label of the running release, or an empty text if it ends at once."""
+        """Return the label of the running release, or an empty string if its flight ends at once."""
         label = self.board.release()
         return "" if label == self.crashes else label
 
     def _flown(self) -> str:
-        """Return the name of the configuration in use, or an empty text if the flight ends at once."""
+        """Return the name of the configuration in use, or an empty string if the flight ends at once."""
         state = self.board.place / "state"
         state.mkdir(exist_ok=True)
         if not self.flown_release():

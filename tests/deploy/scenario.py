@@ -143,7 +143,7 @@ def _renewal(service: Service) -> dict[str, Any]:
 
 
 def _damaged(service: Service) -> dict[str, Any]:
-    """Flip one bit of the configuration without an accepted copy.
+    """Flip one bit of the configuration while the board has no accepted copy of it.
 
     The service waits until the file is intact.
     """

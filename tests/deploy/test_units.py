@@ -267,7 +267,10 @@ def test_the_flight_opens_the_bus_by_its_lasting_name(tmp_path: Path) -> None:
 
 
 def board(folder: Path, below: str) -> Path:
-    """Return folders like /proc and /sys in which /dev/null (1:3) is a serial line at `below`."""
+    """Return a folder with copies of /proc and /sys in which /dev/null appears as a serial device.
+
+    The device has the numbers 1:3 of /dev/null, and its folder is `below` in sys/devices.
+    """
     (folder / "proc").mkdir(exist_ok=True)
     (folder / "proc/devices").write_text(
         "Character devices:\n  1 ttyUSB\n  4 tty\n\nBlock devices:\n  1 ramdisk\n", encoding="ascii"

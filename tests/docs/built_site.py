@@ -97,7 +97,8 @@ def _served(site: Path) -> Iterator[str]:
 def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> list[str]:
     """Return a line for each search whose first result is not the expected page. Needs Chromium.
 
-    All words are searched on a page that is opened as a file, and the first three on a page from a server.
+    On a page that is opened as a file, all entries of `first_found` are searched. On a page from a server,
+    only the first three entries are searched.
     """
     found: list[str] = []
     item = "li.md-search-result__item > a.md-search-result__link"

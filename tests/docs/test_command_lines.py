@@ -99,7 +99,10 @@ def test_commands_in_a_block_without_a_language_are_found() -> None:
 
 
 def test_the_collector_finds_commands_and_their_marks() -> None:
-    """One block must be run; the other is marked, and indented in a list."""
+    """The first code block must be run.
+
+    The second code block is in a list, and its mark says that it is not run.
+    """
     text = "```sh\nmake a  # why\n# only a remark\nmake b \\\n  c\n```\n\n1. x\n\n"
     text += "    <!-- not run: no need -->\n    ```console\n    $ make d\n    output\n    ```\n"
     first, second = blocks_of(text)

@@ -27,7 +27,10 @@ ENVIRONMENT = {
 }
 READY_S = 100.0
 FIXES_S = 45.0
-"""Mission time (s) after which the log has enough fixes for elements; a reader reaches this step later."""
+"""Mission time (s) from which the log has enough GPS fixes to determine orbital elements.
+
+A person who follows the page reaches the step that needs them later.
+"""
 
 
 @contextlib.contextmanager
