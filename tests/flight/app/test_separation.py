@@ -1,4 +1,4 @@
-"""Tests that the separation inhibit lasts for its powered time over restarts and with a failing disk."""
+"""Tests that the separation inhibit lasts for its powered time, also with restarts or a failing disk."""
 
 from __future__ import annotations
 

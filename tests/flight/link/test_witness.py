@@ -1,4 +1,7 @@
-"""Tests that the witness folder detects a restored key folder, and that old commands are not accepted."""
+"""Tests that a restored backup of the key folder is detected, and that old commands are then refused.
+
+The satellite detects it by the reference folder (`witness`), which is not part of backups.
+"""
 
 from __future__ import annotations
 

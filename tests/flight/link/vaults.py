@@ -39,7 +39,7 @@ def gate(at: Vault) -> Gate:
 
 
 def frame_with(at: Vault, iv: int, data: bytes, spi: int = 1) -> bytes:
-    """Return an authentic telecommand frame with any IV of 96 bits, which no sealer would use."""
+    """Return an authentic telecommand frame with any IV of 96 bits, also one that a sender would not use."""
     entry = at.read(spi)
     assert entry is not None
     header = TelecommandHeader(SPACECRAFT, 0, 0)

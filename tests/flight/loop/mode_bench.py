@@ -1,4 +1,4 @@
-"""A mode control of a body with one angle, for tests that set each condition."""
+"""Test bench with a mode control and a body with one angle, in which tests set each condition."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def target(name: str) -> Any:
 
 
 class OneAngle:
-    """Targets of a body with one angle; the test sets the values of the last estimate."""
+    """Test double of the targets of a body with one angle; a test sets the values that it reports."""
 
     def __init__(self) -> None:
         self.rate, self.off, self.holdable = 0.0, 0.0, True

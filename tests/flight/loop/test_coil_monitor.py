@@ -243,7 +243,7 @@ def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> 
 
 
 def test_braking_that_does_not_help_is_ended() -> None:
-    """A current that stays too large is due to a wrong monitor, or to a leg stuck low under a brake."""
+    """The current stays too large if the monitor is wrong, or if a leg is stuck low while the brake is on."""
     leg = StuckLeg(0.04)
     at_rest = Supplied(0.148, -0.002, 0.002, (0, 1, 2), False)
     asked = []
@@ -385,7 +385,7 @@ def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_ca
 
 
 def windows(time: float, _: ImuReading) -> FloatArray:
-    """Return B-dot's currents for a fast rotation, which are off and fully on four times a second."""
+    """Return the currents (A) of B-dot control during a fast rotation: in each 0.25 s, off and then full."""
     return np.array([0.0 if time % 0.25 < 0.1 else FULL, 0.0, 0.0])
 
 
@@ -405,7 +405,7 @@ def test_a_check_at_rest_does_not_raise_suspicion() -> None:
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
-    """A rest of the coils must end even without readings."""
+    """A pause of the coils must end even if the current monitor gives no readings."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     rested = []
     for cycle in range(160):

@@ -1,4 +1,7 @@
-"""Tests that facts become true after N updates in a row, latch, reset in modes without watch, report once.
+"""Tests of facts, which are monitored conditions such as a silent sensor.
+
+A fact becomes true after N consecutive updates, is reset in modes that do not monitor it, and is reported
+once. Some facts latch.
 
 Liveness, rate and validity of a stream are checked separately; a stale stream is never good.
 """
@@ -67,10 +70,12 @@ PERSISTENCE = {
     **{f"battery-{level}": (3, 3, "") for level in ("low", "very-low", "critical")},
     **{f"{rail}-monitor-lost": (3, 3, "") for rail in ("battery", "bus")},
 } | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
-"""Number of updates until a fact becomes true, number until it ends (None if it latches), and the modes
-that watch it.
+"""Numbers of updates until a fact (a monitored condition) becomes true and until it ends, and its modes.
 
-All other facts become true and end immediately, and are watched in all modes.
+The second number is None if the fact latches. The modes are those in which the fact is monitored; an empty
+string means all modes.
+
+All other facts become true and end immediately, and are monitored in all modes.
 """
 
 EVENTS_OF = {
@@ -105,7 +110,10 @@ EVENTS_OF = {
         for stream in ("imu", "field", "coils", "power", "camera", "gps")
     },
 }
-"""Events at the start and end of a fact; other facts start with the event of their name and end silently."""
+"""Events that report the start and the end of a fact (a monitored condition).
+
+All other facts report their start by the event with their name, and do not report their end.
+"""
 
 
 @pytest.mark.parametrize("fact", FACTS, ids=lambda fact: str(fact.name))

@@ -19,7 +19,7 @@ MINUTE_NS = 60_000_000_000
 
 
 class Board:
-    """The parameters with test doubles of keeper and recorder that store the passed values."""
+    """Onboard parameters with a state keeper and a recorder that only store what they are given."""
 
     def __init__(self, table: KeptTable | None = None, keeps: bool = True) -> None:
         self.noted: list[KeptTable] = []
@@ -50,7 +50,7 @@ class Board:
 
 
 def begun(table: KeptTable | None = None, keeps: bool = True) -> Board:
-    """Return parameters that have begun at time 5."""
+    """Return a board on which the parameters were started at time 5 ns."""
     board = Board(table, keeps)
     board.parameters.begin(5)
     return board

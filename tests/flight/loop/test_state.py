@@ -141,7 +141,7 @@ CHANGED = 0.3
 
 
 def booted(flown: Flight, begin: int, end: int, learned: dict[str, Learned]) -> Estimate:
-    """Return the estimate of a boot that runs some cycles of a run."""
+    """Return the last estimate of a filter that runs over the cycles `begin` to `end` - 1 of a flight."""
     prior, problems = start_from(learned, slow_prior(SUSPENDED, SETTINGS), CHANGED)
     assert not problems
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS, prior)

@@ -42,7 +42,7 @@ FOLDER = Path("/state")
 
 
 def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKeeper:
-    """Return the keeper of a new boot."""
+    """Return a new state keeper, as a flight creates it at its start."""
     notices = Notices()
     return StateKeeper(
         StateStore(folder, notices.report, disk), notices, clock, window=600.0, period_ns=10 * SECOND

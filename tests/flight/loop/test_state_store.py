@@ -65,7 +65,7 @@ def calls_of_one_write(bite: int) -> int:
 
 @pytest.mark.parametrize("bite", [1 << 30, 100])
 def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int) -> None:
-    """All calls of the write are tested, with all possible contents and names of the disk after each call."""
+    """Power is lost before each system call of a write; all files that the disk can then hold are tested."""
     calls, found = calls_of_one_write(bite), 0
     assert calls >= 10
     for stop in range(calls + 1):

@@ -32,7 +32,7 @@ LENS = Lens(1024, 768, 500.0, (511.5, 383.5))
 
 
 class Pair(NamedTuple):
-    """A value of two numbers that messages may contain."""
+    """Pair of numbers, one of the types that a message to a worker may contain."""
 
     first: int
     second: float

@@ -146,6 +146,6 @@ def test_a_default_that_differs_is_found() -> None:
 
 
 def test_the_defaults_are_the_published_ones() -> None:
-    """Configurations may omit these keys, so that a change of a default changes the interface."""
+    """A configuration may omit keys with a default, so a changed default would change its meaning."""
     published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
     assert json.loads(json.dumps(defaults_of(devices, orbit, sections, testbed))) == published

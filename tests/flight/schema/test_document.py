@@ -1,4 +1,4 @@
-"""Tests that YAML 1.2 text is read like by an independent library, or refused with its line."""
+"""Tests that YAML 1.2 text is read as an independent library reads it, or is refused with the line number."""
 
 from __future__ import annotations
 

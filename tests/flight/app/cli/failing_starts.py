@@ -110,7 +110,7 @@ def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Ca
 
 
 def run(place: Path, complete: bool = False) -> None:
-    """Make all starts in the folder `place`, and print the result of each."""
+    """Run all starts of the link in the folder `place`, and print the result of each start."""
     (place / "board").mkdir()
     config = write_linked_config(place / "board", udp="127.0.0.1:0", tcp="127.0.0.1:0")
     words = ["link", str(config), "--log", str(place / "board" / "runs")]

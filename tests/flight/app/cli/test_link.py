@@ -52,7 +52,10 @@ from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """Return the addresses of a link on each kind of line, beside an obeying flight, and its folder."""
+    """Run a link process and a flight that executes every command; return the link's addresses and folder.
+
+    The addresses are of UDP, TCP and a serial line.
+    """
     place = tmp_path_factory.mktemp("link")
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     radio, device = pty.openpty()
@@ -183,7 +186,7 @@ def test_a_ground_station_without_keys_commands_by_the_gateway_and_knows_its_com
     raw[7:15], raw[-CRC_BYTES:] = (
         bytes(8),
         bytes(CRC_BYTES),
-    )  # fields as XTCE clients leave them
+    )  # time and CRC are zero, because XTCE clients do not fill them
     reports: list[Report] = []
     came = b""
     with socket.create_connection(("127.0.0.1", gateway.port)) as station:

@@ -132,7 +132,10 @@ def ahead(degrees: float) -> TwoLineElements:
 
 
 class Flight:
-    """Receiver of a satellite with true elements, some days after their epoch, read every ten seconds."""
+    """GPS receiver of a satellite that moves according to its true elements, read every ten seconds.
+
+    The readings start `days` days after the epoch of the elements.
+    """
 
     def __init__(self, known: TwoLineElements | None, true: TwoLineElements, days: int = 0) -> None:
         self.true, self.days_ns = true, days * DAYS_NS

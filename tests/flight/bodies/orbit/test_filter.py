@@ -162,9 +162,9 @@ def test_a_propagated_estimate_can_be_replaced_copied_and_pickled(
 
 
 def acquired(pulses: bool = False) -> Flown:
-    """Return a body that acquired by a star attitude 0.6 s old, with star attitudes every 5 s.
+    """Return a body whose filter has started with a star attitude 0.6 s old and received more every 5 s.
 
-    Tests share it.
+    The body is a copy, so that a test cannot change the body of another test.
     """
     return deepcopy(_acquired(pulses))
 
@@ -290,7 +290,8 @@ def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
     return SlowStates(values, covariance)
 
 
-# Stored inertia errors, relative to the trace, that are wrong by 10 or 15 % of a moment.
+# Stored estimates of the inertia errors (relative to the trace), which are wrong by 10 or 15 % of a principal
+# moment.
 WRONG_INERTIA = {INERTIA_ERROR.start: (0.052, 1e-4), INERTIA_ERROR.start + 1: (-0.034, 1e-4)}
 KNOWN_COILS = {index: (0.0, 5e-3) for index in range(COILS.start, COILS.stop)}
 

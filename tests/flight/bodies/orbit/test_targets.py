@@ -1,4 +1,4 @@
-"""Tests of the satellite's targets: by mission time, by command, and the present attitude."""
+"""Tests of the satellite's targets, which are set by mission time or command, or are the present attitude."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class User(CfdpUserBase):  # type: ignore[misc]
 
 
 class Faults(DefaultFaultHandlerBase):  # type: ignore[misc]
-    """User callbacks of the handlers that do nothing."""
+    """Fault handler for cfdp-py whose callbacks do nothing."""
 
     def notice_of_suspension_cb(self, *_: Any) -> None:
         pass

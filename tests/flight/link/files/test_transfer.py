@@ -350,7 +350,10 @@ def test_without_an_end_missing_data_are_requested_ten_seconds_after_the_last_da
 
 
 def _sliced(missing: set[int]) -> list[tuple[int, int]]:
-    """Return the first gap, limited to 25, and the last gap that ends above 7, with its start cut at 7."""
+    """Return the first gap between bytes 0 and 25, and the last gap between bytes 7 and 25.
+
+    A gap is a pair (begin, end) of a range of `missing` bytes. The part of a gap below byte 7 is cut off.
+    """
     edges = [n for n in range(26) if (n in missing) != (n - 1 in missing)]
     gaps = list(zip(edges[::2], edges[1::2], strict=True))
     return gaps[:1] + [(max(begin, 7), end) for begin, end in gaps if end > 7][-1:]

@@ -122,9 +122,9 @@ def test_a_file_that_changes_while_it_is_checked_is_chosen_as_it_was_checked(
 def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
     link: FiledEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two files are checked at the same time, and copied next to the same folder.
+    """Two files are requested at once, and each is copied into the same temporary file during its check.
 
-    The longer file comes first, so that the checks overlap.
+    The longer file comes first, so that its check still runs when the second file is requested.
     """
     monkeypatch.setattr(filing, "_PORTION", 1)
     folder = link.place / "keys" / "files"

@@ -21,7 +21,7 @@ DATA = b"a bundle" * 100
 
 
 class Ends(FiledEnds):
-    """Both ends with the status file of a privileged program."""
+    """Satellite and ground end of a link, with the status file that a privileged program writes on board."""
 
     def __init__(self, place: Path) -> None:
         self.renewal = place / "status"
