@@ -8,40 +8,12 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from ground.telemetry import Run
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
+from tests.support.attitude_errors import assert_solved, star_errors
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 _LOST, _TRACKED = 0, 1
-# Bound of the normalised squared error with three degrees of freedom, exceeded by chance once in 1e5 frames.
-# For streaks of 300 px it is four times as large.
-_MOST_MISMATCH = 4.0 * 25.9
-
-
-def errors(run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the error (n, 3) of each star attitude against the truth, and its covariance (n, 3, 3)."""
-    stars, truth = run["stars"], run["truth"]
-    at = np.searchsorted(truth["time_ns"], stars["middle_ns"])
-    # The truth is logged every 25 ms, on which the middle of the exposure falls.
-    np.testing.assert_array_equal(truth["time_ns"][at], stars["middle_ns"])
-    error = to_rotation_vector(multiply(stars["quaternion"], conjugate(truth["quaternion"][at])))
-    xx, yy, zz, xy, xz, yz = stars["covariance"].T
-    packed = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return error, np.moveaxis(packed, -1, 0)
-
-
-def mismatch(run: Run) -> FloatArray:
-    """Return the normalised squared error of each star attitude (three degrees of freedom)."""
-    error, covariance = errors(run)
-    return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error))
-
-
-def assert_solved(run: Run) -> None:
-    """Assert that each attitude comes from identified stars, and its error agrees with its covariance."""
-    assert set(run["stars"]["status"].tolist()) == {b"solved"}
-    assert mismatch(run).max() < _MOST_MISMATCH
 
 
 def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
@@ -59,39 +31,6 @@ def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
     else:
         rigged.at(begin, silence)
     rigged.at(end, speak)
-
-
-@pytest.fixture(scope="module")
-def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a flight of 30 s: release at 0.1 rad/s, streaks of 300 px, and rest at the first target."""
-    return fly(demo_config(30.0), tmp_path_factory.mktemp("stars"))
-
-
-def test_every_frame_of_the_demonstration_gives_an_attitude_that_the_estimate_takes(
-    demonstration: Run,
-) -> None:
-    stars = demonstration["stars"]
-    assert len(stars) == 6
-    assert_solved(demonstration)
-    assert (stars["tracked"] == _TRACKED).all()
-    assert stars["accepted"].all()
-    assert event_names(demonstration) == ["started", "target", "stopped"]
-    statuses = demonstration["streak"]["status"].tolist()
-    assert statuses[0] == b"rate", "streaks first"
-    assert statuses[-1] == b"too-short", "points at rest"
-
-
-def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstration: Run) -> None:
-    """The mean normalised squared error has an upper bound.
-
-    About the thread, the only axis that rotates, it also has a lower bound.
-    """
-    error, covariance = errors(demonstration)
-    about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])
-    assert 0.05 < about_thread < 4.0
-    assert mismatch(demonstration).mean() / 3.0 < 2.5
-    at_rest = np.degrees(np.linalg.norm(error[3:], axis=1)) * 3600.0
-    assert at_rest.max() < 10.0
 
 
 def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
@@ -140,7 +79,7 @@ def test_a_camera_knocked_out_of_place_is_found_out_and_misleads_nobody(tmp_path
     assert set(stars["status"].tolist()) == {b"solved"}
     assert stars["accepted"].tolist() == [1, 1, 0, 0]
     assert stars["tracked"].tolist() == [_TRACKED, _TRACKED, _LOST, _LOST]
-    error, _ = errors(run)
+    error, _ = star_errors(run)
     assert np.degrees(error[2:, 1]) == pytest.approx([3.0, 3.0], abs=0.01)
     assert event_names(run).count("stars-refused") == 2
     angle = 2.0 * np.arcsin(run["truth"]["quaternion"][-1, 1])
