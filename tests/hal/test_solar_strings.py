@@ -76,7 +76,7 @@ def test_a_reading_is_the_current_to_a_step_of_the_converter_and_no_older_than_i
 
 
 def test_a_reset_of_the_whole_bus_costs_a_round_and_no_more() -> None:
-    """The software reset that cures a PWM chip with an external clock also resets the converters."""
+    """The software reset that makes a PWM chip use its own clock again also resets the converters."""
     flown = bench()
     flown.wait(2.1)
     before = flown.driver.latest()

@@ -79,7 +79,11 @@ LEVEL = limb_scene(
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
-    """Return a folder with images of a horizontal camera (two times) and of a camera to its right."""
+    """Return a folder with three images and their nadirs, by name.
+
+    The images `first` and `later` are of a horizontal camera at two times. The image `right` is of a camera
+    that looks to the right of it.
+    """
     folder = tmp_path_factory.mktemp("paper")
     model = EarthCameraModel.fuga15d(seed=1)
     turns = {"first": (0.0, 0.0, 0.0), "right": (0.0, 1.0, 0.0), "later": (0.02, 0.0, 0.0)}

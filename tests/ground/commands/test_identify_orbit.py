@@ -54,7 +54,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 
 
 def ratio_errors(folder: Path) -> list[float]:
-    """Return the largest error of an element of J / trace(J) for the described and identified inertia."""
+    """Return the largest error of an element of J / trace(J) for each inertia that the log of a run states.
+
+    The first inertia is the configured one; the flight estimates the later ones.
+    """
     elements = read_run(folder)["description"]["inertia"].astype(float)
     true = TRUE[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)] / np.trace(TRUE)
     found: list[float] = np.abs(elements / elements[:, :3].sum(axis=1)[:, None] - true).max(axis=1).tolist()

@@ -1,4 +1,4 @@
-"""`python -m tests.ground.identification`: identification in random worlds, flown with the whole software."""
+"""`python -m tests.ground.identification`: identification on random testbeds with the complete software."""
 
 from __future__ import annotations
 

@@ -19,7 +19,10 @@ Identified = tuple[World, Record, PlantFit]
 
 
 def _identified() -> str:
-    """Return four random worlds, flown on the bare testbed and fitted, as text."""
+    """Return a string that encodes four random worlds, their simulated records and their fits.
+
+    The records are of the bare testbed, without the flight software.
+    """
     rng = np.random.default_rng(20)
     worlds = [drawn(rng) for _ in range(4)]
     records = [fly_bare(world, 85.0) for world in worlds]

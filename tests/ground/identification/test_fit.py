@@ -31,7 +31,7 @@ NOISE = noise_of(believed())
 
 
 def chi_square(found: list[Identified], off: float = 1.0) -> float:
-    """Return the chi-square of gain, torsion and damping over all worlds; `off` changes the true gain."""
+    """Return the chi-square of gain, torsion and damping over all worlds; `off` multiplies the true gain."""
     total = 0.0
     for world, _, made in found:
         error = motion_error(replace(world, dipole=world.dipole * off), made.constants)

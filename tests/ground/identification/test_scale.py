@@ -1,4 +1,7 @@
-"""Tests of the scale, which prior and magnetometer determine because motion does not, and its uncertainty."""
+"""Tests of the absolute scale of inertia, dipole and field, and of its uncertainty.
+
+The motion determines only ratios to the inertia. The prior and the magnetometer determine the scale.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,10 @@ def scaled(found: PlantFit, prior: PlantPrior, field: float | None) -> AbsoluteP
 
 
 def test_over_many_worlds_the_uncertainty_of_all_constants_is_true(identified: list[Identified]) -> None:
-    """Worlds are drawn from the prior with known motion; the mean chi-square must be in its band."""
+    """The mean chi-square of 80 worlds that are drawn from the prior must be in its band.
+
+    The constants that the motion determines are the true ones plus random errors of the stated covariance.
+    """
     rng = np.random.default_rng(3)
     _, _, made = identified[0]
     squares, keep = [], [0, 1, 2, 4, 5]
@@ -85,7 +91,7 @@ def test_without_a_magnetometer_the_field_is_as_uncertain_as_believed_and_says_s
 
 
 def test_the_share_of_the_prior_is_how_much_the_answer_follows_it(identified: list[Identified]) -> None:
-    """A prior that is changed by 1 % changes the result by its share of 1 %."""
+    """If the prior changes by 1 %, the result changes by the prior's stated share of that 1 %."""
     world, _, made = identified[0]
     before = scaled(made, PRIOR, world.field)
     moved = replace(PRIOR, inertia=replace(PRIOR.inertia, value=PRIOR.inertia.value * 1.01))

@@ -66,7 +66,7 @@ def believed() -> TestbedConfig:
 
 
 def drawn(rng: np.random.Generator) -> World:
-    """Return a random world: a scale with the stated errors, and a thread of up to three times the usual."""
+    """Return a random world with the stated scale errors and a thread up to three times as stiff as usual."""
     config = believed()
     plant = config.plant
 
@@ -99,7 +99,8 @@ def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
     record = read_record(flights.fly(config, folder, section=section), config.coils.stale_after)
     if record.field is None:
         return record
-    # The emulated magnetometer has no scale error, so it is applied here.
+    # The emulated magnetometer measures without a scale error, so the scale error of the world is applied
+    # here.
     field = replace(record.field, magnitude=record.field.magnitude * world.magnetometer)
     return replace(record, field=field)
 

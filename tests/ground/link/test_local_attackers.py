@@ -297,7 +297,7 @@ _OWN = """([page, command]) => {
 
 @pytest.fixture(scope="module")
 def context(ground: Ground, cookie: str) -> Iterator[Any]:
-    """Open Chromium with the session of the operator; the name evil.example leads to loopback in it."""
+    """Open Chromium with the operator's session; the host name evil.example resolves to 127.0.0.1."""
     if lacks := browser.missing():
         pytest.skip(lacks)
     rules = "--host-resolver-rules=MAP evil.example 127.0.0.1"

@@ -158,6 +158,7 @@ def kernel_in(folder: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch)
     """Replace the kernel's V4L2 by a test double."""
     kernel = IoctlCamera(folder, clock.now_ns)
     monkeypatch.setattr("hal.drivers.v4l2_camera.ioctl", kernel)
-    # Text of the machine's kernel on a driver that is not the test double.
+    # A file in `folder` replaces the file in which the machine's own kernel reports a setting of its UVC
+    # driver.
     monkeypatch.setattr("hal.drivers.v4l2_camera.UVC_STAMPS", folder / "hwtimestamps")
     return kernel

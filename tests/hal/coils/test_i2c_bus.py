@@ -85,7 +85,7 @@ def test_a_time_out_of_nothing_is_refused(kernel: IoctlWire) -> None:
 
 
 def test_the_descriptor_is_reopened_after_the_line_failed_but_not_after_a_nack(kernel: IoctlWire) -> None:
-    """Each opening is counted by its setting of the timeout."""
+    """Each opening of the bus sets the timeout once, so the openings are counted by these settings."""
     bus = LinuxI2cBus("/dev/null")
     with pytest.raises(OSError, match="no acknowledge"):
         bus.read_byte_data(0x22, 0x00)

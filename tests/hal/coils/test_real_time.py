@@ -1,4 +1,7 @@
-"""Tests in real time with the job on its own thread: commands never wait for the bus, and zero arrives."""
+"""Tests in real time with the bus job on its own thread.
+
+Commands never wait for the bus, and the command of zero current reaches the coils.
+"""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ _CALM_S = 1.2
 
 @dataclass(frozen=True)
 class Hurt:
-    """Result of one act: a stop, hang or kill of a process.
+    """Result of one test action (`act`): a stop, hang or kill of a process.
 
-    Times are in s, and the current in A. `recovered` is counted from the end of the act, and None if the
+    Times are in s, and the current in A. `recovered` is counted from the end of the action, and None if the
     process died.
     """
 
@@ -31,7 +31,7 @@ class Hurt:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Results of all acts, the truth and events of the run, and the successive guardian processes."""
+    """Results of all test actions, the truth and events of the run, and the successive guardian processes."""
 
     hurts: list[Hurt]
     truth: CoilTruth
@@ -43,7 +43,7 @@ class Campaign:
 def hurt_in_every_way(folder: Path) -> Campaign:
     """Stop and hang the flight process (two ways), kill and stop the guardian, and kill the flight process.
 
-    The acts take about ten seconds.
+    These test actions take about ten seconds.
     """
     times: list[tuple[str, int, int | None]] = []
     guardians: list[int] = []

@@ -99,7 +99,10 @@ class LiveFlight:
         raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
 
     def wait_until_driven(self, patience: float = 30.0) -> None:
-        """Wait, without a timeout, until the truth ends with a quarter of a second of coil current."""
+        """Wait until the log of true states ends with a quarter of a second in which the coil was driven.
+
+        Raises AssertionError if this takes longer than `patience` s.
+        """
         deadline = time.monotonic() + patience
         begun = 0
         while time.monotonic() < deadline:
@@ -184,7 +187,7 @@ class CoilTruth:
         self.epoch_ns = epoch_ns
 
     def before(self, act_ns: int) -> float:
-        """Return the largest current, A, shortly before an act.
+        """Return the largest current, A, in the quarter of a second before a signal was sent.
 
         On a busy machine, the flight switches the current off for a cycle or two if a reading is late.
         """
@@ -192,7 +195,7 @@ class CoilTruth:
         return float(np.abs(self.current[shortly]).max(initial=0.0))
 
     def zero_after(self, act_ns: int, until_ns: int) -> float:
-        """Return the time, s, from an act until the current was zero and stayed zero until `until_ns`."""
+        """Return the time, s, from a signal until the current was zero and stayed zero until `until_ns`."""
         inside = (self.time_ns >= act_ns) & (self.time_ns <= until_ns)
         driven = np.flatnonzero(inside & (self.current != 0.0))
         first = int(driven[-1]) + 1 if len(driven) else int(np.flatnonzero(inside)[0])
@@ -201,7 +204,7 @@ class CoilTruth:
         return float(self.time_ns[first] - act_ns) * 1e-9
 
     def driven_after(self, act_ns: int) -> float:
-        """Return the time, s, from an act until a coil was driven."""
+        """Return the time, s, from a signal until a coil was driven."""
         any_current = np.any(self.run["truth"]["current"] != 0.0, axis=1)
         driven = np.flatnonzero((self.time_ns >= act_ns) & any_current)
         return float(self.time_ns[driven[0]] - act_ns) * 1e-9 if len(driven) else float("inf")
