@@ -38,7 +38,7 @@ def sight(
     sigma: float,
     angle: float | None = None,
 ) -> Sight:
-    """Return n stars within `half_field` rad of a random boresight; None distributes them over the whole sky.
+    """Return n stars within `half_field` rad of a random boresight, or in the whole sky if it is None.
 
     `sigma` (rad) is the approximate error of each measured direction; `angle` (rad) is the rotation about a
     random axis; if None, the rotation is drawn uniformly from all rotations.

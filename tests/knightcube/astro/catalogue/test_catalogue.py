@@ -58,7 +58,7 @@ def test_counts_are_the_published_ones_less_the_entries_without_a_position(
 ) -> None:
     """The table includes three of the stars without position.
 
-    HIP 115125 has V 6.97 and counts only below 7.
+    One of them, HIP 115125, has magnitude V = 6.97, so it is counted only with the limit 7.
     """
     added = 2 if limit < 6.97 else 3
     assert len(STARS.brighter_than(limit)) == published - unplaced + added

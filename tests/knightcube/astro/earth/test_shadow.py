@@ -73,7 +73,7 @@ def test_between_earth_and_sun_it_is_day_everywhere() -> None:
 def test_the_cylinder_is_as_wide_as_the_earth() -> None:
     """By the errata to 2.15, the position is the object's.
 
-    The edge is one radius off the axis at any depth.
+    At any distance behind the Earth, the edge of the shadow is one Earth radius from its axis.
     """
     for depth in (1000e3, 42_164e3):
         assert sunlit_share(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical") == 0.0

@@ -85,7 +85,8 @@ def test_redundant_coils_share_a_dipole_with_the_least_heat_within_their_limits(
         )
         assert best.success
         assert ohms @ currents**2 <= best.fun * (1.0 + 1e-5)
-        # The largest multiple of the corner that the coils can make; the last unknown is the multiple.
+        # Find the largest multiple of `corner`, a dipole (3,), that the coils can generate. The last unknown
+        # is this multiple.
         matrix = np.column_stack([dipoles, -corner])
         found = linprog([0.0] * count + [-1.0], A_eq=matrix, b_eq=np.zeros(3), bounds=[*bounds, (0.0, None)])
         reached.append(-found.fun)

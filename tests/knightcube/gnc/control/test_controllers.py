@@ -52,7 +52,7 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
 def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: AngleController) -> None:
     """A step of 0.1 rad within the coil's limit is held to 0.15 deg.
 
-    The adaptive controller adapts by its errors.
+    The adaptive controller adapts its gains to its errors.
     """
     rows = fly(controller, replace(THREAD, stiffness=1e-5), held(0.1), 60.0)
     assert largest_error(rows, 0.1, 10.0) < 0.15
@@ -72,7 +72,10 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
 
 
 def test_the_thesis_tracker_overshoots_there() -> None:
-    """The controller needs a path, because without one it brakes only when the coil is already too weak."""
+    """The controller needs a planned path.
+
+    With a step as target it begins to brake too late: the coil's torque can then not stop the body in time.
+    """
     rows = fly(LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
     assert rows[:, 1].max() > 0.7 * 1.3
 

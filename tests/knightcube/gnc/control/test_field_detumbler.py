@@ -144,8 +144,8 @@ def test_the_coils_never_spin_up_a_body_of_another_inertia_beyond_the_multiple(
 ) -> None:
     """Initially the rate along the field is unknown, and the energy is known to the accuracy of the inertia.
 
-    The rate of an elongated body changes by itself at constant energy. In 400 s the bodies are fastest before
-    300 s.
+    The rate of an elongated body changes by itself at constant energy. The simulation lasts 300 s, because in
+    simulations of 400 s the bodies are fastest before 300 s.
     """
     body = unlike(described, limit, seed)
     off = 0.1 * speed * np.random.default_rng(seed).standard_normal(3)

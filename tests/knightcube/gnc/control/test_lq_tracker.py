@@ -67,7 +67,7 @@ def fly(
 
 @pytest.fixture(scope="module")
 def path() -> PolynomialPath:
-    """Return a path planned on the thread."""
+    """Return a path that is planned for the body on its suspension thread."""
     return plan(THREAD, 0.3, 0.01, -0.1, 0.0, 10.0).path
 
 

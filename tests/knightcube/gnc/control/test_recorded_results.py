@@ -1,4 +1,4 @@
-"""Tests that coarse pointing tables and short runs equal the record to five digits."""
+"""Tests that coarse pointing tables and short runs equal their recorded results to five digits."""
 
 from __future__ import annotations
 

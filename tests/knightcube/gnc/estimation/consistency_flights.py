@@ -167,7 +167,10 @@ def mean_rate(start: FloatArray, end: FloatArray, span: float) -> FloatArray:
 def seen_from(
     axes: FloatArray, sigmas: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a random error (3,) and its covariance; `sigmas` (3,) are those along columns of `axes`."""
+    """Return a random error (3,) and its covariance (3, 3).
+
+    `sigmas` (3,) are the standard deviations of the error along the columns of `axes` (3, 3).
+    """
     return axes @ (sigmas * rng.standard_normal(3)), (axes * sigmas**2) @ axes.T
 
 
@@ -264,7 +267,7 @@ def _result(suspended: bool, tally: Tally, bias: FloatArray, last: Estimate) -> 
 
 
 def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
-    """Return the normalised squared error of those error states that the world can have."""
+    """Return the normalised squared error of the error states that can differ from zero in the world."""
     turn = to_rotation_vector(multiply(world.attitude, conjugate(estimate.quaternion)))
     error = np.concatenate(
         [
@@ -283,7 +286,7 @@ def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
 
 
 def _free_errors(suspended: bool) -> IntArray:
-    """Return the indices of the error states that the world can have, out of the filter's 15."""
+    """Return the indices of the filter's 15 error states that can differ from zero in the world."""
     return np.array([1, 4, 7, 10, 12, 13, 14]) if suspended else np.array([*range(12), 14])
 
 

@@ -156,7 +156,10 @@ class SingleAxisFilter:
         return self._apply(later, measurement)
 
     def _index_before(self, begin_ns: int) -> int:
-        """Return the number of checkpoints up to `begin_ns`, or up to the start of a mean that spans it."""
+        """Return the number of checkpoints up to `begin_ns`, or fewer if an averaging interval spans it.
+
+        A mean measurement must be applied again from the start of its averaging interval.
+        """
         while True:
             index = bisect.bisect_right(self._history, begin_ns, key=lambda c: c.measurement.time_ns)
             spanning = [c.measurement.begin_ns for c in self._history[index:]]

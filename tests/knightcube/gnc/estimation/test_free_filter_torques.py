@@ -227,7 +227,10 @@ def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> N
 
 
 def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
-    """The bias was caused by false directions. As an initial value, it would falsify each new start."""
+    """False directions have caused a wrong gyro bias.
+
+    If the filter restarted with this bias, each restart would give a wrong estimate.
+    """
     craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
     known = settings.error_state(INERTIA).prior[SLOW, SLOW]
     taught = np.zeros(len(known))

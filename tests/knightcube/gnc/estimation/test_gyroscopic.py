@@ -34,7 +34,10 @@ def test_the_coefficients_give_eulers_acceleration_of_a_full_tensor() -> None:
 
 @pytest.mark.parametrize("believed", [CUBESAT_3U, KNIGHTCUBE])
 def test_the_modes_span_other_bodies_and_gyros_with_weights_of_about_one(believed: FloatArray) -> None:
-    """The modes explain the apparent acceleration of a wrong body and gyro to a hundredth of the error."""
+    """The modes are corrections of the gyroscopic coefficients for errors of inertia and gyro.
+
+    Such errors cause an error of the acceleration, which the modes describe to a hundredth.
+    """
     rng = np.random.default_rng(7)
     modes = coefficient_modes(believed, BodyErrors())
     for _ in range(20):

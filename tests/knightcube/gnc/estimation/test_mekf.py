@@ -62,7 +62,8 @@ def test_the_transition_is_how_errors_grow() -> None:
             down, _ = propagate(body, STILL, moved(state, -bump), np.eye(SIZE), TORQUING, 0.025)
             covariance = np.outer(bump, bump) / step**2
             _, carried = propagate(body, STILL, state, covariance, TORQUING, 0.025)
-            # The square root of a covariance of rank one is the column up to its sign.
+            # A covariance of rank one is the outer product of a column with itself, so outer products are
+            # compared.
             grown = difference(up, down) / (2.0 * step)
             np.testing.assert_allclose(carried, np.outer(grown, grown), atol=3e-5)
 

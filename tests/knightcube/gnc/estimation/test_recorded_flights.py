@@ -1,4 +1,4 @@
-"""Tests that the estimates of short runs equal the record."""
+"""Tests that the estimates of short runs equal the recorded estimates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that filter states after short artificial runs equal the record to five digits."""
+"""Tests that filter states after short artificial runs equal the recorded states to five digits."""
 
 from __future__ import annotations
 

@@ -99,7 +99,10 @@ def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) 
 
 
 def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
-    """A ripple of Chebyshev degree 40 is too fine for 24 nodes: zero at most nodes, amperes between them."""
+    """A ripple of Chebyshev degree 40 is too fine for 24 nodes.
+
+    The current of the ripple is almost zero at most of the nodes, and amperes between them.
+    """
     count = 41
     columns = np.zeros((count, 3))
     columns[-len(newer.path.series) :] = newer.path.series

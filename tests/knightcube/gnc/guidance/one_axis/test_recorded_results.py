@@ -1,4 +1,4 @@
-"""Tests that single-axis plans and short runs along them equal the record to four digits."""
+"""Tests that single-axis plans and short runs along them equal their recorded results to four digits."""
 
 from __future__ import annotations
 

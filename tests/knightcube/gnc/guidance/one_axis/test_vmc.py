@@ -180,7 +180,10 @@ def test_the_reference_point_changes_the_parameters_and_not_the_path() -> None:
 
 @pytest.mark.parametrize("horizon", [9.0, 14.0])
 def test_gradients_are_exact(horizon: float) -> None:
-    """Compare energy and limits with central differences by every parameter and by the horizon."""
+    """Compare the gradients of energy and limits with central differences.
+
+    The gradients are those with respect to every parameter and to the duration (horizon).
+    """
     family = PathFamily.around(BoundaryStates(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
     program = PathProgram(THREAD, family, 0.68, horizon, PathCost.HEAT)
     rng = np.random.default_rng(0)
@@ -292,7 +295,10 @@ def test_what_cannot_be_planned_is_refused_with_its_reason(
 
 
 def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
-    """The problems are the steps and the twenty known ones; the benchmark `plan` measures more."""
+    """The problems are those of the step demonstration, of the thesis, and twenty with a known optimum.
+
+    The benchmark `plan` measures more problems.
+    """
     problems = [*STEPS, THESIS, *(known.problem for known in known_optima())]
     assert np.median([ordinary_seconds(problem.planned, 2) for problem in problems]) < 0.003
 
@@ -314,7 +320,7 @@ def test_the_shortest_times_are_the_published_ones() -> None:
 
 
 def test_from_a_tenth_above_the_shortest_horizon_on_paths_are_optimal_and_within_the_limits() -> None:
-    """A slice of `python -m tests.studies.bench plan` with thread, disturbance and moving ends."""
+    """Part of the benchmark `plan`, with a thread, a disturbance and non-zero rates at both ends."""
     costs = []
     for problem, shortest in feasible_problems(40, seed=11):
         found = problem.planned()
@@ -376,7 +382,10 @@ def test_an_impossible_price_is_refused(price: float) -> None:
 
 
 def rest_of(problem: Problem, found: StepPlan, share: float) -> tuple[Problem, int]:
-    """Return the problem after a fraction `share` of a path, slightly off it, and the elapsed time (ns)."""
+    """Return the rest of a problem after the fraction `share` of its path, and the elapsed time (ns).
+
+    The rest begins slightly off the path, in angle and rate.
+    """
     elapsed_ns = round(share * found.horizon * 1e9)
     at = found.path.sample(elapsed_ns)
     left = Problem(

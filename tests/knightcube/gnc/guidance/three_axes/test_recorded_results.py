@@ -1,4 +1,7 @@
-"""Tests that slews on few nodes, initial guesses and attitude laws equal the record to five digits."""
+"""Tests that slews, initial guesses and attitude laws equal their recorded results to five digits.
+
+To save time, the slews have few collocation nodes.
+"""
 
 from __future__ import annotations
 
