@@ -1,4 +1,4 @@
-"""Tests of compiled functions: which form is executed, and operation without numba."""
+"""Tests of compiled functions: whether the compiled or the numpy implementation runs, also without numba."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Pat
 
 
 def test_compilation_is_announced_and_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
-    """The file of a compiled form is truncated, as after a full disk or a power failure."""
+    """The file of a compiled function is truncated, as after a full disk or a power failure."""
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     environment = {
         **os.environ,
@@ -97,7 +97,10 @@ def test_arrays_that_numba_does_not_know_are_left_to_numpy(
 
 @pytest.mark.parametrize("module", ["knightcube", "flight.__main__", "knightcube.vision.star_tracker"])
 def test_an_import_does_not_load_numba(module: str) -> None:
-    """Numba takes a third of a second and 100 MB, which commands without compiled forms must not need."""
+    """The import of numba takes a third of a second and 100 MB.
+
+    A command that calls no compiled function must not import numba.
+    """
     code = f"import sys, {module}; sys.exit('numba' in sys.modules)"
     subprocess.run(
         [sys.executable, "-c", code], env={**os.environ, "KNIGHTCUBE_COMPILED": "1"}, timeout=100, check=True

@@ -37,7 +37,7 @@ def _stars(seed: int, noise: float, half_deg: float = 10.0) -> tuple[FloatArray,
 def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limits: tuple[float, ...]) -> None:
     """A roll of 1 deg about the boresight is exact after one step.
 
-    After a tilt of 1 deg, arcseconds remain.
+    After a tilt of 1 deg, the error is up to 200 arcseconds after one step and 8 arcseconds after two.
     """
     observed, reference, true = _stars(3, 0.0)
     prior = multiply(from_rotation_vector(np.radians(1.0) * np.array(axis)), true)

@@ -1,4 +1,4 @@
-"""Tests that the reference methods equal the record on small problems to five digits."""
+"""Tests that results of the reference methods on small problems equal the recorded ones to five digits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of attitudes of cameras and magnetometer, and their fusion, with known direction errors."""
+"""Tests of attitudes from cameras and magnetometer, and of their fusion, with known direction errors."""
 
 from __future__ import annotations
 

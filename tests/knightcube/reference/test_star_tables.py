@@ -131,7 +131,10 @@ def test_the_magnitude_limit_gives_the_wanted_number_of_stars_in_a_field() -> No
 
 @pytest.mark.parametrize("degrees", [0.01, 0.1, 5.0, 90.0])
 def test_the_variance_of_a_cosine_is_that_of_drawn_pairs(degrees: float) -> None:
-    """Some pairs are as close as their errors; 20,000 draws give the deviation to 1.5 % (3 sigma)."""
+    """Some pairs of stars are as close together as their errors are large.
+
+    20,000 random draws determine the standard deviation to within 1.5 % (3 sigma).
+    """
     rng = np.random.default_rng(4)
     sigma = np.radians([0.02, 0.05])
     first, second = np.array([1.0, 0.0, 0.0]), np.array([np.cos(np.radians(degrees)), 0.0, 0.0])

@@ -111,7 +111,10 @@ def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
 def test_propagated_variances_agree_with_a_monte_carlo(
     shape: Shape, measured_shape: MeasuredShape, seed: int
 ) -> None:
-    """20,000 draws give a standard deviation to 0.5 %; the corners have unequal errors (eq. 40-48)."""
+    """The corners have unequal errors (eq. 40-48).
+
+    20,000 random draws determine a standard deviation to within 0.5 %.
+    """
     corners = _corners(seed)
     sigma = np.array([3e-5, 6e-5, 9e-5])
     rng = np.random.default_rng(seed)

@@ -182,7 +182,7 @@ def test_standard_deviations_that_are_too_small_increase_the_covariance() -> Non
 
 
 def test_the_derivatives_are_those_of_the_projection() -> None:
-    """A step of the fit from nearby has only a quadratic error if all derivatives are correct."""
+    """If all derivatives are correct, one step of the fit from near the truth has a quadratic error."""
     rng = np.random.default_rng(89)
     truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3, 0.02, -0.03, 0.04, 0.05)
     frames, attitudes = _frames(rng, truth, 2, 20, noise=1e-9)

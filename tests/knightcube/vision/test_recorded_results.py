@@ -1,4 +1,7 @@
-"""Tests that Sun, solar strings, lens calibration and frame jobs equal the record to five digits."""
+"""Tests that recorded results of Sun sensing, solar strings, lens calibration and frame jobs are repeated.
+
+The new results must equal the recorded ones to five digits.
+"""
 
 from __future__ import annotations
 

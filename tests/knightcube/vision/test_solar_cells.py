@@ -23,7 +23,10 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 
 def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray, FloatArray, int, int]:
-    """Return errors (n,) rad and normalised squares (n,) of readings, and counts of wrong darkness."""
+    """Return errors (n,) rad, normalised squared errors (n,), and the numbers of two wrong decisions.
+
+    The first number is of sunlit readings that were judged dark, the second of dark readings that were not.
+    """
     generator = np.random.default_rng(seed)
     errors, squares, false_dark, false_light = [], [], 0, 0
     for _ in range(count):

@@ -59,7 +59,7 @@ print(*found.quaternion, *found.covariance.ravel(), len(found.stars))
 
 @pytest.mark.slow
 def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_path: Path) -> None:
-    """A numpy form that silently replaces a compiled form is slow; in this test it ends the program.
+    """The test program ends if a numpy implementation, which is slow, silently replaces a compiled one.
 
     In a new clone the program first compiles for up to a minute of processor time.
     """

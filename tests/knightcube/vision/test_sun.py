@@ -67,7 +67,7 @@ def test_the_covariance_is_honest(name: str) -> None:
 def test_no_sun_is_found_in_frames_without_the_sun(name: str) -> None:
     """The frames show limb, clouds and hot pixels.
 
-    Those of the overexposed camera also large saturated clouds.
+    The frames of the overexposed camera also show large saturated clouds.
 
     The test uses three frames of seed 12.
     """

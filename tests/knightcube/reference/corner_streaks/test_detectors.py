@@ -17,7 +17,7 @@ from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, Detecto
 from knightcube.vision.objects.streak_ends import chord_outward, extend, find_corners, structure_tensor
 from tests.support.streak_frames import expose, star_camera, true_endpoints
 
-# Names of the ring around the centre c: rows are y, columns x.
+# Names of the pixels around the centre pixel c: rows are y, columns are x.
 #   f b g        b is at (x, y - 1), a at (x + 1, y)
 #   e c a
 #   h d i

@@ -1,4 +1,4 @@
-"""Tests that rates from streak corners equal the record for each detector."""
+"""Tests that rates from streak corners equal the recorded rates for each detector."""
 
 from __future__ import annotations
 

@@ -42,7 +42,10 @@ class Instant:
         return np.asarray(attitude_matrix(self.attitude) @ self.sun)
 
     def knowledge(self, sigma: float = 0.05) -> HorizonKnowledge:
-        """Return knowledge from GPS, the Sun's ephemeris, and a rough attitude."""
+        """Return the prior information of the horizon search: position, Sun direction and a rough attitude.
+
+        The rough attitude has the standard deviation `sigma`, rad.
+        """
         rough = multiply(from_rotation_vector(np.array([0.6, -0.5, 0.6]) * sigma), self.attitude)
         return HorizonKnowledge(position=self.position, sun=self.sun, attitude=RoughAttitude(rough, sigma))
 

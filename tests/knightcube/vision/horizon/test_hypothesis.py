@@ -21,7 +21,10 @@ PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hal
 
 
 def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> None:
-    """Columns count only where the circle is less oblique than 0.3, which is up to 0.954 of its radius."""
+    """A scan line counts as crossing the circle only up to 0.954 of the radius from the centre.
+
+    There the cosine of the angle between scan line and normal of the circle is 0.3.
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, 7200, endpoint=False)
     circle = 256.0 + 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inside = np.ones(len(angle), dtype=bool)

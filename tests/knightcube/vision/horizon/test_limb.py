@@ -168,7 +168,7 @@ def test_edges_all_in_one_place_give_no_limb() -> None:
 
 
 def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
-    """If points have equal errors in pairs, the duplicates must reduce neither covariance nor error."""
+    """If four successive points have the same error, they must reduce neither covariance nor error."""
     generator = np.random.default_rng(8)
     view = _view(generator)
     rays = limb_rays(view, 240)[:80]

@@ -353,7 +353,7 @@ def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three
 
 
 def test_two_cameras_that_disagree_leave_the_nadir_ambiguous(level: Instant) -> None:
-    """The images of two cameras are swapped, and neither a third camera nor an attitude decides."""
+    """One of two images is flipped vertically, and no third camera or attitude shows which image is right."""
     frames = {0: level.frames[0], 1: np.ascontiguousarray(level.frames[1][::-1])}
     found = nadir_of_cameras(frames, UW, HorizonKnowledge(position=level.position), JOINT_SETTINGS)
     assert found.nadir is None
@@ -438,7 +438,7 @@ def test_a_horizon_counts_up_to_the_limit_of_each_evidence(
     wrong: float,
     status: HorizonStatus,
 ) -> None:
-    """The tested evidence is on either side of its documented limit; all else is as in a sunlit frame."""
+    """The tested quantity is on either side of its documented limit; all others are as in a sunlit frame."""
     scene, frame = day
     for value, expected in ((sound, HorizonStatus.FOUND), (wrong, status)):
         changed = _changed(lambda one, value=value: replace(one, **{evidence: value}))  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Tests of knowledge and settings on both sides of their limits, and of the logarithmic response."""
+"""Tests of prior information and settings on both sides of their limits, and of the logarithmic response."""
 
 from __future__ import annotations
 

@@ -100,7 +100,10 @@ def test_a_star_at_the_same_position_is_the_same_star(theta_deg: float) -> None:
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 def test_exact_stars_have_no_deviations_for_any_axis(theta_deg: float) -> None:
-    """The projection changes slopes by 1.8 deg and lengths by 6 % over the field without a deviation."""
+    """The exact streaks of stars do not deviate from the expected ones.
+
+    Over the field, the projection changes the slopes of the streaks by 1.8 deg and their lengths by 6 %.
+    """
     ends, turn = _stars(theta_deg)
     found = evaluate(ends[:, ::-1], np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
     np.testing.assert_allclose(found.deviations, 0.0, atol=1e-6)
@@ -226,7 +229,8 @@ def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: floa
     report, path = _see(motion, 4.0, exposure=exposure)
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.5)
-    # The ends are in the order of the slower motion, and the rates for both orders are reported.
+    # The image does not show which end is first. The reported order is the one with the smaller rate; the
+    # rate for the other order is reported too.
     assert found.relative_rate == pytest.approx(px / _FOCAL / exposure, rel=0.02)
     assert found.other_relative_rate > found.relative_rate
     np.testing.assert_allclose(found.direction, [np.cos(towards), np.sin(towards)], atol=0.03)

@@ -34,7 +34,10 @@ _CORNER = np.array([200.0, 220.0])
 
 
 def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | None, seed: int) -> Patch:
-    """Return a patch of 90 x 40 px with stars of `flux` counts, and 40000 counts of an object on `extra`."""
+    """Return a patch of 90 x 40 px with stars of `flux` counts each.
+
+    An object adds 40,000 counts along the path `extra` (n, 2), px in the frame, if given.
+    """
     image = np.zeros((40, 90))
     for middle in middles:
         direction = _CAMERA.pinhole.unit_vectors(np.array([middle]))[0]

@@ -36,7 +36,8 @@ def test_slopes_of_light_are_those_of_small_moves() -> None:
     step = 1e-4 * share[:, None]
     for slope, axis in ((across, [1.0, 0.0]), (down, [0.0, 1.0])):
         moved = [spread_over(path + sign * step * axis, 40, 24, 1.0) for sign in (1.0, -1.0)]
-        # The tolerance is the flux beyond 5 sigma divided by the step.
+        # The tolerance is the light that the model omits (beyond 5 sigma from the path), divided by the step
+        # of the difference.
         np.testing.assert_allclose(slope, (moved[0] - moved[1]) / 2e-4, atol=1e-5)
 
 

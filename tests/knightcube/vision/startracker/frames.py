@@ -73,7 +73,10 @@ class SkyFrame:
 
 
 def _slope(camera: Pinhole, star: FloatArray) -> FloatArray:
-    """Return the derivatives (2, 3) of pixel coordinates by rotation about the camera axes, px/rad."""
+    """Return the derivatives (2, 3), px/rad, of a star's pixel coordinates.
+
+    They are with respect to rotations about the camera axes.
+    """
     direction = camera.unit_vectors(star)
     step = 1e-5 * np.cross(np.eye(3), direction)
     return np.asarray((camera.project(direction - step) - camera.project(direction + step)).T / 2e-5)

@@ -67,7 +67,10 @@ def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_the_covariance_and_the_residuals_agree_with_many_fits(free_scale: bool) -> None:
-    """In 400 fits of 12 stars, attitude and residuals have the chi-squares 3 or 4 and 24 minus 3 or 4."""
+    """The mean chi-squares of 400 fits of 12 stars agree with their degrees of freedom.
+
+    These are 3 for the attitude, or 4 with the scale. For the residuals, they are 24 minus this number.
+    """
     draw = np.random.default_rng(2)
     seen, parameters = directions(12), 4 if free_scale else 3
     sigma = np.where(np.arange(12) < 4, SIGMA, 3.0 * SIGMA)

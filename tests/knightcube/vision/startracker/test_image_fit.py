@@ -99,7 +99,8 @@ def test_excess_scatter_of_the_stars_increases_the_covariance() -> None:
     ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
     assert sound.excess == 1.0
     assert wider.excess == pytest.approx(25.0, rel=0.5)
-    # The covariance counts the three parameters of an attitude, and the excess also the scale.
+    # The degrees of freedom are 24 - 3 in the covariance, which is that of the attitude. They are 24 - 4 in
+    # `excess`, because it also counts the scale.
     assert ratio == pytest.approx(wider.excess * (24 - 4) / (24 - 3) / 25.0, rel=1e-3)
 
 
@@ -177,7 +178,11 @@ def test_an_unknown_lens_is_fitted_and_included_in_the_covariance() -> None:
 
 
 def test_an_unspecified_shutter_is_fitted_and_included_in_the_covariance() -> None:
-    """In 200 fields, 12 stars move by one standard deviation of the delay, which is 1 px per frame height."""
+    """The shutter delay is random in 200 fields of 12 moving stars.
+
+    One standard deviation of the delay shifts a star at the bottom of the frame by 1 px relative to a star at
+    the top.
+    """
     rng = np.random.default_rng(6)
     known, unknown, delays = 0.0, 0.0, 0.0
     for _ in range(_TRIALS):

@@ -96,7 +96,7 @@ def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() 
 
 
 def test_a_rotated_sky_has_the_same_triangles() -> None:
-    """The range of a star is the distance to a neighbour.
+    """A star is a corner only of triangles smaller than its range, the distance to a brighter neighbour.
 
     Rounding errors of this distance must not affect the choice of triangles.
     """

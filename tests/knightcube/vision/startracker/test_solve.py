@@ -156,7 +156,7 @@ def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
 def test_points_that_contradict_their_uncertainties_give_no_attitude_unless_most_of_them_match(
     claimed: float, false_stars: int, accepted: bool
 ) -> None:
-    """About 20 to 80 stars have position errors of 1 px, of which the covariance states a share."""
+    """The 20 to 80 stars have position errors of 1 px, but the stated standard deviation is `claimed` px."""
     kind = ListKind(field_deg=20.0, faintest=5.5, noise_px=1.0, false_stars=false_stars, known_deg=0.0)
     answered = 0
     for seed in range(8):
@@ -280,9 +280,9 @@ def _turns(*powers: float) -> FloatArray:
 def test_the_attitude_error_by_a_steady_acceleration_is_its_integral(
     weighting: Weighting, part: float
 ) -> None:
-    """For a rotation a t^2 / 2, the mean over T is a T^2 / 24.
+    """A rotation angle a t^2 / 2, with t from -T/2 to T/2, has the mean a T^2 / 24.
 
-    The mean of the two ends is a T^2 / 8, and the middle of a fitted parabola is zero.
+    The mean of its values at the two ends is a T^2 / 8, and the middle of a fitted parabola is zero.
     """
     acceleration = 0.3
     off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), np.zeros((3, 3)), _EXPOSURE)
@@ -297,7 +297,7 @@ def test_steady_and_odd_motions_do_not_change_the_attitude_at_mid_exposure(weigh
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_the_nodes_represent_the_whole_exposure(name: str) -> None:
-    """Up to the fourth power of time, the nodes agree with the fine weights."""
+    """For a rotation of second and fourth power in time, the few nodes agree with sums over 401 instants."""
     weighting, fine = _WEIGHTS[name]
     time = 0.5 * _EXPOSURE * _EVEN
     off = middle_covariance(weighting, _turns(0.0, 0.2, 0.0, 0.9), np.zeros((3, 3)), _EXPOSURE)

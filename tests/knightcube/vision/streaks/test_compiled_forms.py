@@ -1,4 +1,7 @@
-"""Tests that compiled and numpy forms of the streak fit agree for the arguments of real fits."""
+"""Tests that the compiled and the numpy implementations of the streak fit's functions agree.
+
+The functions are called with arguments that are recorded from fits of simulated frames.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ def _size(arguments: tuple[Any, ...]) -> int:
 
 
 def _calls(patch: pytest.MonkeyPatch) -> dict[str, list[tuple[Any, ...]]]:
-    """Return copies of the arguments with which the fits of some frames call the functions."""
+    """Return the arguments of the first calls of each function of `_FUNCTIONS` in fits of some frames."""
     calls: dict[str, list[tuple[Any, ...]]] = {name: [] for _, name, _ in _FUNCTIONS}
     for module, name, _ in _FUNCTIONS:
         function = getattr(module, name)

@@ -320,7 +320,10 @@ def test_the_light_of_the_whole_frame_gives_the_angle_about_an_approximate_axis(
 
 @pytest.mark.parametrize("width", [5, 485, 534])
 def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
-    """A frame whose best box is at 534 of 1,081 samples must not raise an error."""
+    """On a circle about the rotation axis, streaks are found by boxes of samples.
+
+    A frame in which the best box has 534 of the 1,081 samples of a circle must not raise an error.
+    """
     widths = sharper_widths(width, 1081 // 2)
     assert width in widths
     assert widths[-1] <= 1081 // 2

@@ -14,8 +14,8 @@ _KEPT = np.array([0, 1, 2, 6])
 def _drawn(noise: float, blind: bool = False) -> StarEquations:
     """Return normal equations of stars with very different fluxes.
 
-    Their right-hand sides scatter by `noise` times the noise. If `blind`, each star has no information in two
-    random directions.
+    The errors of the right-hand sides are `noise` times the errors that the equations state. If `blind`, each
+    star has no information in two random directions.
     """
     rng = np.random.default_rng(3)
     change = rng.normal(size=(_STARS, 4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (_STARS, 1, 1))

@@ -1,4 +1,7 @@
-"""Tests that the motion of small simulated frames equals the record to five digits, with all attributes."""
+"""Tests that all attributes of estimated motions equal the recorded ones to five digits.
+
+The motions are estimated from small simulated frames.
+"""
 
 from __future__ import annotations
 

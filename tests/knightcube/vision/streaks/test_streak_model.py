@@ -43,7 +43,10 @@ def _brute(motion: CameraMotion, star: FloatArray, sigma: float) -> FloatArray:
 def _modelled(
     motion: CameraMotion, star: FloatArray, sigma: float
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return covered pixels, modelled counts, and derivatives (9, ...) by geometry (8) and PSF width."""
+    """Return covered pixels, modelled counts, and derivatives (9, ...) of the counts.
+
+    The derivatives are with respect to the eight parameters of the geometry and to the PSF width.
+    """
     stars, width = star[None], float(np.sqrt(sigma**2 + 1.0 / 12.0))
     strips = cut_strips(_PINHOLE, motion, stars, np.array([[-0.5, 0.5]]), 5.0 * width)
     images = streak_model.images(_PINHOLE, motion, Shutter(), stars, width, strips).astype(float)

@@ -58,9 +58,9 @@ def test_an_exact_camera_has_no_errors() -> None:
 def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
     """A shift by dx is to first order a rotation by dx / f about y, which rotates the rate vector.
 
-    Only half of this rotation appears in the rate, because the second-order flow, which the shift also
-    changes, cancels the effect on one of the two components of the motion. The factor of one half holds for
-    stars on a square.
+    Only half of this rotation appears in the rate. The shift also changes the motion field in the image to
+    second order, which cancels the effect on one of the two components of the motion. The factor of one half
+    holds for stars on a square.
     """
     focal = CAMERA.pinhole.focal_length
     found = _together(*_seeming(replace(EXACT, centre=5.0)))
