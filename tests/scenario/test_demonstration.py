@@ -111,7 +111,7 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(
 
 @pytest.mark.slow
 def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any], power: dict[str, float]) -> None:
-    """Errors are those of the true attitude with all noise.
+    """The errors are those of the true attitude relative to the target, with all simulated noise.
 
     R I^2 is compared with the true plant's optimum.
     """

@@ -16,7 +16,7 @@ SECONDS = {"demo": 3, "cage": 3, "orbit": 3, "orbit-3u": 3, "object": 40}
 
 
 def commands_of(target: str) -> list[str]:
-    """Return the arguments of `python -m flight` in the recipe of a target."""
+    """Return the arguments of each `python -m flight` in the recipe of a target of the Makefile."""
     recipe = re.search(rf"^{target}:.*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
     assert recipe is not None
     return re.findall(r"\$\(RUN\) -m flight (.*)", recipe.group(1))

@@ -255,7 +255,7 @@ def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
 
 
 def keeper_of(folder: Path) -> StateKeeper:
-    """Return the state keeper of a boot that has started in `folder`."""
+    """Return a new state keeper that stores its states in `folder`, as a flight creates it at its start."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
     return StateKeeper(

@@ -44,7 +44,7 @@ def whole(packet: Packet) -> list[Field]:
 
 
 def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
-    """Make the log write each record once more per integer field, with that field beyond its range."""
+    """Make the log write an additional record for each integer field, with this field beyond its range."""
     driven: Driven = {}
     for name in ("record", "time"):
         plain = getattr(Recorder, name)

@@ -30,7 +30,10 @@ SILENT, MUTE = 20.0, 1.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Run a flight from 10 deg/s with a silent IMU during detumbling; a low limit soon starts it again."""
+    """Run a flight that begins with a tumble of 10 deg/s and whose IMU is silent during detumbling.
+
+    Detumbling ends at a rate above the configured tumble rate, so the flight soon detumbles again.
+    """
     config = orbit_config(70.0, tumble_rate=0.01)
     section = configuration.replace(config.detumble, low_rate=SLOW, low_for=3.0)
     timeline = (CommandStep(at=1.0, mode="hold"), CommandStep(at=2.0, slew=0.1))

@@ -39,7 +39,10 @@ def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current
 
 
 def test_the_uncertainty_is_uniform_within_its_bound_and_drawn_at_each_command() -> None:
-    """The standard deviation is 3.5e-3/sqrt(3), which 2000 draws give to 2.3 % (5 sigma: 8 %)."""
+    """The standard deviation is 3.5e-3/sqrt(3) A.
+
+    2,000 random draws determine the standard deviation to within 8 % (5 sigma).
+    """
     rig = Rig(uncertainty=3.5e-3)
     rig.coils.start()
     errors = []

@@ -228,7 +228,10 @@ def test_the_dark_earth_hides_the_stars_behind_it() -> None:
 
 
 def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironment]:
-    """Return a camera on +x, `limb_deg` outside the limb, as rotation from ICRS, and its environment."""
+    """Return the rotation (3, 3) from ICRS to a camera's axes, and the environment of its satellite.
+
+    The satellite is on the x axis of ICRS. The boresight is `limb_deg` outside the Earth's limb.
+    """
     around = at_first()._replace(position=(7e6, 0.0, 0.0), sun=tuple(sun.tolist()), sunlit=1.0)
     angle = math.pi - math.asin(EARTH_RADIUS / 7e6) - math.radians(limb_deg)
     boresight = np.array([math.cos(angle), math.sin(angle), 0.0])

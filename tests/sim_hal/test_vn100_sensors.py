@@ -38,7 +38,7 @@ MANUAL = {
     19: ("IMU", 54, 11),
     30: ("DTV", 80, 7),
 }
-"""UM001 register 6: header, register of the same content and number of values by the output type."""
+"""Output types of register 6 [UM001]: header, register with the same content, and number of values."""
 
 YAW, PITCH, ROLL = 0.7, -0.3, 0.2
 MAG, ACCEL, RATE = (0.21, -0.05, 0.43), (0.5, -0.25, -9.7), (0.011, -0.022, 0.033)

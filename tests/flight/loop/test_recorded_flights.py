@@ -1,4 +1,4 @@
-"""Tests that the packets of short runs with all tasks of the loop equal the record."""
+"""Tests that the packets of short runs with all tasks of the loop equal the recorded packets."""
 
 from __future__ import annotations
 

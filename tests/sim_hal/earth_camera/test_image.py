@@ -37,7 +37,7 @@ def test_counts_grow_with_the_light_over_six_decades_evenly_by_its_logarithm() -
 
 
 def test_darkness_reads_the_pedestal_with_the_stated_noise() -> None:
-    """Rounding adds 1/12 count^2 to the variance, which 262,144 pixels give to 0.3 %."""
+    """Rounding adds 1/12 count^2 to the variance, which 262,144 pixels determine to within 0.3 %."""
     for model, sigma in ((LOGARITHMIC, 0.7), (LINEAR, 20.0 / 80.0)):
         fine = EarthCameraModel.fuga15d(
             response=model.response,
@@ -254,7 +254,10 @@ def test_logarithmic_and_linear_frames_saturate_in_the_core_and_nowhere_in_the_d
 
 @pytest.mark.parametrize("aside", [1e-3, 1e-6, 1e-9])
 def test_a_sun_at_a_right_angle_to_the_boresight_leaves_no_disc(aside: float) -> None:
-    """Its image, without folding by the lens, is at coordinates beyond the range of integers."""
+    """The Sun must leave no disc in the image.
+
+    Without lens distortion, the coordinates of its image are beyond the range of integers.
+    """
     model = EarthCameraModel.fuga15d(scatter=0.0, k1=-0.05, k2=0.01)
     boresight = np.array([0.0, 1.0, 0.0])
     # The Sun's disc with a radius of 0.27 deg crosses the plane beyond which the lens images nothing.

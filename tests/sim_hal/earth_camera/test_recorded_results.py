@@ -1,4 +1,4 @@
-"""Tests that rendered images of the Earth camera equal the record."""
+"""Tests that rendered images of the Earth camera equal the recorded ones."""
 
 from __future__ import annotations
 

@@ -83,7 +83,10 @@ def test_light_above_the_limb_falls_by_e_for_each_scale_height() -> None:
 
 
 def test_the_terminator_lies_where_the_sun_is_on_the_horizon() -> None:
-    """Day is brighter than a tenth of the subsolar sea, and night is darker than a hundredth."""
+    """The brightness is relative to that of the sea below the Sun.
+
+    The day side is brighter than a tenth, and the night side is darker than a hundredth.
+    """
     scene = _nadir_scene(np.array([0.0, 1.0, 0.0]), 2000e3)
     light, cosine = expected_radiance(QUIET, scene), _solar_cosines(scene)
     noon = OCEAN * np.exp(-2.0 * AIR.optical_depth)
@@ -170,7 +173,8 @@ def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> Non
     assert angles[2:] == pytest.approx(np.arcsin(SEMI_MAJOR_AXIS / distance), abs=1e-12)
     towards_poles = np.arctan(SEMI_MINOR_AXIS / np.sqrt(distance**2 - SEMI_MAJOR_AXIS**2))
     assert angles[:2] == pytest.approx(towards_poles, abs=1e-12)
-    # The error of a sphere is three times a nadir sensor's required accuracy.
+    # The error of a spherical Earth model is more than 0.06 deg, three times a nadir sensor's required
+    # accuracy.
     assert np.degrees(angles[3] - angles[0]) > 0.06
 
 

@@ -34,7 +34,10 @@ Command = Callable[[float, ImuReading], FloatArray]
 
 
 def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) -> Command:
-    """Return a controller to an angle, rad, with noise on its command and currents in the other coils, A."""
+    """Return a controller that holds the angle `target`, rad, about y.
+
+    The command has noise (A). The coils x and z have alternating currents of the amplitude `others`, A.
+    """
     rng = np.random.default_rng(seed)
 
     def command(time: float, reading: ImuReading) -> FloatArray:

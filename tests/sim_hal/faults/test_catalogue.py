@@ -28,7 +28,7 @@ IN_ORBIT = {"gps", "strings", "wide", "battery-monitor", "bus-monitor", "battery
 
 @pytest.fixture(scope="module")
 def orbit() -> LockStep:
-    """Return the devices of an orbit; every fault leaves them as they were."""
+    """Return the emulated devices of a satellite, which tests share: every fault ends without effect."""
     config = configuration.replace(orbit_config(), power=Power(battery=Battery(capacity=2.6)))
     return build_lockstep(config, orbit_world(), None, SimClock())
 
@@ -66,7 +66,7 @@ def is_sound(lock: LockStep) -> bool:
 
 
 def orbit_is_sound(lock: LockStep) -> bool:
-    """Return whether no effect of any fault remains on the devices of an orbit."""
+    """Return whether no effect of any fault remains on the emulated devices of a satellite."""
     devices, bus = lock.hardware.orbit, lock.hardware.bus
     gps, strings = devices.gps, devices.cells
     assert gps is not None

@@ -19,7 +19,7 @@ WANTED = np.array([0.06, 0.0, -0.03])
 
 
 def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
-    """Command for six seconds under a fault.
+    """Command the coils for six seconds during a fault.
 
     Return (time, error) by cycle, and the last current error (A).
     """

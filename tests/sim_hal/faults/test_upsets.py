@@ -62,7 +62,7 @@ def test_a_bit_of_the_chips_set_up_is_measured_and_mended_within_half_a_second(
 def test_a_bit_of_an_output_changes_its_coil_until_the_next_command() -> None:
     rig = driven_rig()
     before = rig.currents()
-    rig.wire.chip.flip(LED0_ON_L + 3, 3)  # the pin that drives x changes to low half a period later
+    rig.wire.chip.flip(LED0_ON_L + 3, 3)  # the pin of x goes low half a PWM period later
     assert abs(rig.currents()[0] - before[0]) > 0.02
     drive(rig)
     drive(rig)
@@ -162,7 +162,7 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
 
 @pytest.mark.parametrize("name", UPSETS)
 def test_what_is_not_said_is_drawn(name: str) -> None:
-    """Random upsets differ in their registers."""
+    """Upsets without a stated register change random registers: 40 upsets give more than ten results."""
     lock = build_lockstep(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
     hardware = lock.hardware
     assert hardware.monitor is not None

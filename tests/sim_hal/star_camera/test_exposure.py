@@ -68,7 +68,10 @@ def test_a_streak_of_changing_rate_is_exact() -> None:
 
 @pytest.mark.parametrize("jitter", [0.003, 0.03, 0.3, 1.0])
 def test_jitter_between_samples_is_followed(jitter: float) -> None:
-    """The motion has kinks of up to about a pixel at 200 samples; the smallest count as smooth."""
+    """The motion has kinks of up to about a pixel at its 200 samples.
+
+    The renderer treats the smallest of these kinks as a smooth motion.
+    """
     rng = np.random.default_rng(8)
     times = np.linspace(0.0, 1.0, 201)
     turn = np.outer(times, [0.0, 50.0 / FOCAL, 0.0]) + rng.normal(0.0, jitter / FOCAL, (201, 3))
@@ -367,7 +370,10 @@ def test_stars_far_down_streak_later() -> None:
 
 
 def test_a_streak_that_runs_down_after_the_shutter_is_longer_and_brighter_in_all() -> None:
-    """At 400 px/s and 0.2 ms per line, the exposure of its row takes 1 / (1 - 0.08) times as long to pass."""
+    """A star that moves down with the shutter is exposed for 1 / (1 - 0.08) times the exposure time of a row.
+
+    The star moves at 400 px/s, and the readout takes 0.2 ms per line.
+    """
     star = at_pixels(ROLLING_MODEL, [60.0, 3.0])
     times, attitudes = turning([400.0 / ROLLING_FOCAL, 0.0, 0.0], 0.1 + READOUT)
     rolling = expected_electrons(ROLLING_MODEL, star, [2.0], times, attitudes).sum()

@@ -96,7 +96,7 @@ def test_the_background_has_gaussian_tails() -> None:
         beyond = np.count_nonzero(np.abs(z) > limit + 0.001)
         expected = (
             2.0 * z.size * ndtr(-limit - 0.005)
-        )  # A count is 0.01 sigma, so the bound applies from half a count on.
+        )  # a count is 0.01 sigma, so rounding moves the bound by half a count, 0.005 sigma
         assert beyond == pytest.approx(expected, abs=5.0 * np.sqrt(expected))
     assert abs(np.count_nonzero(z > 4.0) - np.count_nonzero(z < -4.0)) < 5.0 * np.sqrt(
         2.0 * z.size * ndtr(-4.0)
@@ -219,7 +219,7 @@ def test_a_source_brighter_than_any_number_of_wells_does_not_overflow() -> None:
 
 @pytest.mark.parametrize("slopes", [(2.0, 0.0), (0.0, -1.5), (0.5, 0.25)])
 def test_stray_light_grows_across_the_frame_and_brings_its_own_noise(slopes: tuple[float, float]) -> None:
-    """The level is in counts from the darkest corner; at 2 e-/count its variance is half its mean."""
+    """The stray light is zero in the darkest corner; at 2 e-/count its variance is half its mean."""
     model = replace(DEEP, background_gradient=slopes, gain=2.0)
     across, down = slopes
     stray = across * np.arange(96) + down * np.arange(96)[:, None]

@@ -1,4 +1,4 @@
-"""Tests that rendered frames of stars and objects equal the record."""
+"""Tests that rendered frames of stars and objects equal the recorded ones."""
 
 from __future__ import annotations
 
