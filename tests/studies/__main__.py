@@ -8,7 +8,7 @@ import runpy
 import sys
 from pathlib import Path
 
-# The same setting as in `python -m flight`; a study imports numpy later.
+# As in `python -m flight`, numpy uses one thread. The variable must be set before a study imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _FOLDER = Path(__file__).parent

@@ -93,7 +93,7 @@ BUSY: dict[str, Callable[[Any], Any]] = {
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,
 }
-"""Functions that are repeated, by the module of the job that they replace."""
+"""Functions that repeat a job, by the name of the module whose jobs they run."""
 
 
 def keep_busy() -> None:

@@ -1,9 +1,10 @@
 """Workers that cannot start, in real time: `python -m tests.studies.bench dead_worker [--minutes M]`.
 
 The full load of `bench executive` runs, but a module of the workers is missing, so each worker process ends
-at once. The benchmark prints the start attempts and their reports. It also prints three counts of lost
-cycles: all of them, those that a bare loop beside the flight did not lose, and those within a second of an
-attempt. Only lost cycles of the last count can be due to the workers. Run it alone on two cores.
+at once. The benchmark prints the start attempts and their reports. It also prints three numbers of lost
+control cycles: all of them, those that a bare loop beside the flight did not lose, and those within a second
+of a start attempt. Only the cycles of the third number can be lost because of the workers. Run it alone on
+two cores.
 """
 
 from __future__ import annotations

@@ -7,10 +7,10 @@ its horizon cameras run at their flight rate. With `--busy` each worker repeats 
 job arrives, so no worker is ever idle.
 
 A bare sleep loop at the same rate (`tests.studies.bench.bare_loop`) runs beside the flight and measures
-stalls of the machine. The kernel measures the time that a virtual machine's host takes. A loop with work to
-do is affected by such stalls more often than a loop that only sleeps. If SCHED_FIFO is permitted, the flight
-runs twice, with and without it. Run the benchmark alone on two cores. The slope of memory needs flights of 16
-minutes or longer.
+stalls of the machine. The kernel measures the stolen time, in which the host of a virtual machine does not
+run it. A loop with work to do is affected by such stalls more often than a loop that only sleeps. If
+SCHED_FIFO is permitted, the flight runs twice, with and without it. Run the benchmark alone on two cores. The
+slope of memory needs flights of 16 minutes or longer.
 """
 
 from __future__ import annotations
@@ -292,7 +292,7 @@ def _started(
 
     def start() -> None:
         if not fifo:
-            # The right is removed from this thread and its child processes only.
+            # Only this thread and its child processes lose the capability CAP_SYS_NICE.
             ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
         words = folder, config, notifications, load.duration, "--devices", str(facts)
         started.append(LiveFlight(*words, before=_KEPT_BUSY if load.busy else ""))

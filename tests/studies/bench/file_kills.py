@@ -71,7 +71,7 @@ class _Bench:
         self._run.mkdir(parents=True)
 
     def transfer(self, number: int) -> dict[str, int]:
-        """Transfer a file under a new name, with one kill of each end."""
+        """Transfer a file under a new name, and kill the process at each end once."""
         name = f"{number}.bin"
         files, ground = self._place / "keys" / "files", self._place / "ground"
         if number % 2:

@@ -1,9 +1,10 @@
 """Link killed between accepting, storing and forwarding commands: `python -m tests.studies.bench link_kills`.
 
-Each time a link process receives the commands of a ground station while an attacker replays every old frame.
-The link process is killed (SIGKILL) before or after one of its calls that write to the disk or to the socket
-of the flight. Some of the writes are cut in the middle first. The ground's sender is killed in the same way.
-The benchmark counts commands that the flight received twice, and frame counters that were used twice.
+In each run, a link process receives the commands of a ground station while an attacker replays all old
+frames. The link process is killed (SIGKILL) before or after one of its calls that write to the disk or to the
+socket of the flight. Some of the writes are cut in the middle first. The ground's sender is killed in the
+same way. The benchmark counts commands that the flight received twice, and frame counters that were used
+twice.
 
 With `--scheduled` the commands are in the link's schedule and fall due while the link process is killed. A
 second process, which is not killed, continues. The benchmark counts commands that the flight received twice,
@@ -59,7 +60,7 @@ class Findings:
         schedules_lost: schedules of which no intact copy remained.
         counters_twice: counter values, in either direction, with which two different frames were sent.
         seen: frames by SPI and IV.
-        obeyed: how often the flight received each command, by the number of its ping.
+        obeyed: how often the flight received each command, by the number in the command `ping`.
     """
 
     kills: int = 0
@@ -202,13 +203,13 @@ class Way:
         return self._pwrite(file, data, offset)
 
     def fsync(self, file: int) -> None:
-        """Sync the file, or end the process first."""
+        """Sync the file; if a kill is due, end the process before the sync."""
         if self.ends():
             self.die()
         self._fsync(file)
 
     def put(self, frame: bytes) -> None:
-        """Send a frame over the air, or end the process first."""
+        """Send a frame over the air; if a kill is due, end the process before the frame is sent."""
         if self.ends():
             self.die()
         self._writer.send(frame)

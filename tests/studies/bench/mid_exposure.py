@@ -79,7 +79,10 @@ def scenes(
 
 
 def _by_attitude(vectors: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return the derivatives (n, 2, 3) of the pixels of directions (n, 3) by a small camera rotation."""
+    """Return the derivatives (n, 2, 3), px/rad, of the image positions of directions (n, 3).
+
+    They are with respect to a small rotation of the camera.
+    """
     x, y, z = vectors.T
     projected = np.zeros((len(vectors), 2, 3))
     projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / z

@@ -4,9 +4,9 @@ The releases are built from the sources of this repository with pip, virtual env
 this Python environment. Only systemd and the radio are replaced by test doubles. `deploy/install.sh` installs
 the first release into a folder. The second release has a higher version. The ground signs its bundle, sends
 it by CFDP and activates it. The privileged program builds the release and is killed once during the build.
-The release is tested, flown and confirmed. Then the ground revokes it, and the first release flies again. A
-third release passes its self-test, but its flight with the board's configuration ends at once, so the
-previous release flies again.
+The release passes its self-test, is used on trial and is confirmed. Then the ground revokes it, and the board
+uses the first release again. A third release passes its self-test, but its flight with the board's
+configuration ends at once, so the board returns to the previous release.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ if "run" in sys.argv and any(word.endswith("board.yaml") for word in sys.argv):
 
 
 class RealBoard(FakeBoard):
-    """Files of a board whose releases are built, installed and flown by Python itself."""
+    """Files of a board whose releases are built, installed and run by a real Python interpreter."""
 
     def python(self, label: str) -> Path:
         """Return the Python interpreter that builds releases."""

@@ -5,11 +5,11 @@ image's centre and the horizontal field of view in degrees. Each photograph is s
 5 %, and also with an unknown field if it is 10 to 30 deg wide. The simulated frames have the simulator's
 camera with a field of 12 deg known to 0.1 deg and an exposure of 0.1 s. The axis of rotation is 30 to 90 deg
 off the boresight, or perpendicular to it. `over bound` is the rms error across the boresight divided by the
-Cramer-Rao bound of the star positions; `bound` is the same ratio of the rate's magnitude. Identified stars
-lower the bound of the rate by at most 2 %, because the rate follows from the lengths of streaks. Times are
-processor times of one core. The other star identification programs extract the stars themselves, with their
-default filters and without filters. `ratios` compares the time of each photograph with known field with that
-of each other program: the median of the ratios for each frame size.
+Cramer-Rao bound of the star positions; `bound` is the same ratio for the magnitude of the rate. Identified
+stars lower the bound of the rate by at most 2 %, because the rate follows from the lengths of streaks. Times
+are processor times of one core. The other star identification programs extract the stars themselves, with
+their default filters and without filters. `ratios` compares the time of each photograph with known field with
+that of each other program: the median of the ratios for each frame size.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
 def peer_rows(
     options: argparse.Namespace, pictures: Sequence[Photograph]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the statistics of every other program by configuration, and the time ratios by frame size."""
+    """Return the statistics of the other programs by configuration, and the time ratios by frame size."""
     rows, ratios = [], []
     with tempfile.TemporaryDirectory() as folder:
         cases = peer_cases(options, Path(folder))

@@ -5,10 +5,10 @@ without and with an attack. The attackers share one core. They send 30,000 datag
 that the link does not accept. They also open 200 TCP connections a second from an accepted address, and send
 bytes that form no frame. With `--forged N` they also send N forged frames a second from an accepted address:
 replayed, damaged and without the key. The link must examine these frames, so commands by UDP may be lost. In
-both flights the operator sends 40 commands, alternately by UDP, by a lasting TCP connection and by a new TCP
-connection. The benchmark prints the executed commands, the rates of the attackers, and the lateness of the
-control cycles. The exit status is 1 if a command was not executed, or if the 99 % quantile of the lateness is
-more than twice that of the flights without attack (medians over the rounds).
+both flights the operator sends 40 commands, alternately by UDP, by a persistent TCP connection and by a new
+TCP connection. The benchmark prints the executed commands, the rates of the attackers, and the lateness of
+the control cycles. The exit status is 1 if a command was not executed, or if the 99 % quantile of the
+lateness is more than twice that of the flights without attack (medians over the rounds).
 """
 
 from __future__ import annotations
