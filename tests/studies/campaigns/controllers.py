@@ -1,8 +1,8 @@
 """Campaign `controllers`: the 700 s step demonstration under each controller, on the same seeds.
 
 The thesis states a power of 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive control on its
-testbed (ch. 5, Hardware Results). In this campaign all controllers fly the same simulated hardware with the
-same noise. They are this project's loop, this loop with paths of minimum supply energy, the loop of the
+testbed (ch. 5, Hardware Results). In this campaign all controllers run on the same simulated hardware with
+the same noise. They are this project's loop, this loop with paths of minimum supply energy, the loop of the
 thesis, the loop of the thesis on raw readings (without filter), PID and adaptive control. PID and adaptive
 control receive the targets instead of a path. `python -m tests.studies.tune_controllers` tunes all their
 gains by one criterion: minimum power with every step settled in 9 s and overshoots of at most 1 %. An
@@ -14,8 +14,8 @@ chopped coils draw from their supply of 3.4 V; it is comparable to the powers of
 current is the cost that the paths minimise.
 
 The thesis states no stiffness of its thread. On a thread of 4.2e-5 N m/rad the thesis's loop draws the stated
-0.10 W (as R I^2). The controllers of `STIFF` are also flown on this thread, with PID and adaptive control
-tuned for it.
+0.10 W (as R I^2). The controllers of `STIFF` are also simulated with a body on this thread, for which PID and
+adaptive control are then tuned.
 
 The lower bound of the power is the clairvoyant optimum, computed by direct collocation
 (tests.support.collocation_oracle): the whole plant is known, and each target is reached at rest 10 s after
@@ -50,7 +50,7 @@ def this_loop() -> TestbedConfig:
 
 
 def thesis_loop() -> TestbedConfig:
-    """Return the thesis's guidance and tracker behind the filter."""
+    """Return the loop of the thesis: its guidance and its tracker, which use the estimates of the filter."""
     return thesis_config(DURATION)
 
 
@@ -87,7 +87,9 @@ def pid() -> TestbedConfig:
 
 
 def limit_pid() -> TestbedConfig:
-    """Return the demonstration under PID control tuned without margins to the criterion's limits.
+    """Return the demonstration under PID control that is tuned without margins.
+
+    It reaches the limits of the criterion: each step settles in 9 s and overshoots by 1 %.
 
     The gains are those of `tune_controllers --settling 9 --overshoot 0.01` [2026-11-26].
     """
@@ -140,7 +142,7 @@ STIFF: dict[str, Callable[[], TestbedConfig]] = {
     "adaptive": stiff_adaptive,
 }
 STIFF_THREAD = Thread(stiffness=4.2e-5, damping=2e-6)
-"""Thread on which the thesis's loop draws 0.10 W of R I^2."""
+"""Suspension thread with which the thesis's loop needs the stated mean power of 0.10 W, as R I^2."""
 OURS, THICK = "", "stiff "
 THREADS = {OURS: CONTROLLERS, THICK: STIFF}
 

@@ -168,7 +168,10 @@ def all_three_up_to(name: str = "vt") -> float:
 
 
 def summarise(results: Sequence[Result], out: Path) -> Summary:
-    """Return the mean shares, and the Sun's share in UW by heading and elevation of the Sun."""
+    """Return mean shares of time in which the cameras see horizon and Sun, for each suite of cameras.
+
+    For the suite UW, the share of the Sun is also given by heading and by elevation of the Sun.
+    """
     orbits = [result for result in results if result["kind"] == "orbit"]
     tables = [result for result in results if result["kind"] == "heading"]
     facts: dict[str, Any] = {"orbits": len(orbits), "suites": _mean_shares(orbits)}

@@ -2,9 +2,9 @@
 
 The files are both copies of the launcher and of the safe state, the manifest and a module of the current
 release, the records that flight and link have stored, and all keys. Each flip is followed by a start of the
-flight with the command of its systemd unit. After a flip in a record or key of the link, its associations
-must be complete and its schedule kept. After a flip in the safe state's files, its program must start. The
-flip is undone before the next one.
+flight with the command of its systemd unit. After a flipped bit in a record or key of the link, the link must
+have all security associations and its schedule. After a flipped bit in the files of the safe state, the
+program of the safe state must start. The bit is restored before the next flip.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Count the flips after which an intact release flew."""
+    """Count the flips after which an intact release ran."""
     del folder
     flips = [flip for result in results for flip in result["flips"]]
     bad = [flip for flip in flips if flip["problems"] or not flip["reported"]]

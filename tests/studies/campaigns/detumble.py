@@ -3,11 +3,11 @@
 Two craft are detumbled, each in a Sun-synchronous, an ISS-like and an equatorial orbit. The law
 `magnetometer` has only a magnetometer and the orbit. The law `attitude` also has a gyro with a bias and a
 coarse attitude. The law `inertia` has the same sensors, but the body's moments and principal axes differ from
-the described ones by up to the default accuracies. The coils are off for a twentieth of each four seconds, as
-the magnetometer needs, and before the rate is known. While the rate is uncertain, they are off for a tenth of
-each two seconds. Coils are commanded each quarter of a second, and as often as the body rotates by 0.3 rad.
-Each time is compared with a rigorous lower bound (`least_time`) for any control of these coils. The bound
-assumes that the coils are never off, and that the largest dipole can have any direction.
+the configured ones by up to the default accuracies. The coils are off for a twentieth of each four seconds,
+as the magnetometer needs, and before the rate is known. While the rate is uncertain, they are off for a tenth
+of each two seconds. Coils are commanded each quarter of a second, and as often as the body rotates by 0.3
+rad. Each time is compared with a rigorous lower bound (`least_time`) for any control of these coils. The
+bound assumes that the coils are never off, and that the largest dipole can have any direction.
 """
 
 from __future__ import annotations
@@ -104,7 +104,10 @@ def least_time(
 
 
 def _crossed(removed: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return fractional row indices (k,) where rising columns `removed` (n + 1, k) reach `wanted` (k,)."""
+    """Return the fractional row indices (k,) at which each column of `removed` reaches its value in `wanted`.
+
+    The columns of `removed` (n + 1, k) increase with the row; `wanted` has the shape (k,).
+    """
     row = np.sum(removed < wanted, axis=0)
     after = np.clip(row, 1, len(removed) - 1)
     column = np.arange(len(wanted))
@@ -159,7 +162,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def description(law: str, seed: int, inertia: FloatArray) -> DescriptionErrors:
-    """Return the errors of a described inertia tensor (3, 3) for a law, drawn by a seed."""
+    """Return random errors of a configured inertia tensor (3, 3) for a law, drawn by a seed."""
     if law != "inertia":
         return NO_ERRORS
     generator, bounds = np.random.default_rng([seed, 0x1E7]), BodyErrors()

@@ -104,7 +104,7 @@ def _state(body: FreeBodySection, utc: str) -> OrbitState:
 
 
 def _at_nadir(state: OrbitState) -> TipOff:
-    """Return the release with body +z to nadir, +x along the flight, and the rate of the orbit."""
+    """Return the initial state with body +z to nadir, +x in the direction of flight, and the orbital rate."""
     down, normal = -state.position, np.cross(state.position, state.velocity)
     z, y = down / np.linalg.norm(down), -normal / np.linalg.norm(normal)
     a, b, c, d = quaternion.from_matrix(np.stack([np.cross(y, z), y, z])).tolist()
@@ -213,7 +213,7 @@ class DarkFlight(PointingFlight):
         return self.end - self.dark >= shortest
 
     def error(self) -> tuple[FloatArray, FloatArray, float]:
-        """Return error and sigma (3,), rad, of the attitude, and the residual dipole's unknown fraction."""
+        """Return attitude error and sigma (3,), rad, and the relative error of the residual dipole."""
         found, truth = self._filter, self.flight.body.orbit_truth()
         off = to_rotation_vector(multiply(self.flight.motion.quaternion, conjugate(found.quaternion)))
         missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)

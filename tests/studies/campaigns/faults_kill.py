@@ -84,7 +84,7 @@ class Board:
                     flight.process.stderr.close()
 
     def current(self) -> float:
-        """Return the largest present true current (A) of the coils."""
+        """Return the largest of the true currents (A) that the coils carry at present."""
         return float(np.abs(self.bus.call("currents")).max())
 
     def kept(self) -> tuple[StoredState, list[str]]:

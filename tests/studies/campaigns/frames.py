@@ -90,7 +90,10 @@ def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
 
 
 def _frame(kind: str, past: list[bytes], forged: list[bytes], draw: np.random.Generator) -> bytes:
-    """Return a frame of an attacker with recorded frames `past` and authentic frames `forged`."""
+    """Return a frame of one kind that an attacker sends.
+
+    It is made from recorded frames `past`, authentic frames `forged`, or random bytes.
+    """
     known = forged if kind == "edge" else past
     some = known[draw.integers(len(known))]
     match kind:

@@ -51,7 +51,7 @@ class FreeFlight:
     ) -> None:
         """Release the craft at time 0 on `orbit`; the seed determines node and phase.
 
-        The true body differs from the described craft by `description`.
+        The true body differs from the configured craft by the errors `description`.
         """
         self.generator = np.random.default_rng([seed, _STREAM])
         altitude, inclination = ORBITS[orbit]

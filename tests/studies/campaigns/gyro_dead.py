@@ -1,9 +1,9 @@
 """Campaign `gyro-dead`: step demonstration and orbit flights in which the gyro gives no valid rate.
 
-The gyro fails at a random time in the first minute, in every third flight before the start. The coils disturb
-the magnetometer by 5e-4 T/A. With its camera the testbed has star attitudes and streak rates; without it,
-only the magnetometer and the plant model. A step counts as reached if the true angle stays within 0.5 deg of
-the target in the last 70 s of the step.
+The gyro fails at a random time in the first minute. In every third flight it fails before the start. The
+coils disturb the magnetometer by 5e-4 T/A. With its camera the testbed has star attitudes and streak rates;
+without it, only the magnetometer and the plant model. A step counts as reached if the true angle stays within
+0.5 deg of the target in the last 70 s of the step.
 
 The cells `orbit` are flights of `config/orbit.yaml` from a tumble of 3 deg/s to nadir, at a random position
 of the orbit, with a body, coils and sensors that differ from the configuration within the stated accuracies.

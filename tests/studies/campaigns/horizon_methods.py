@@ -119,7 +119,7 @@ def _draw(
 ) -> dict[str, Any]:
     """Return an instant whose first camera has the limb in the illumination of the case.
 
-    If sunlit, also the second.
+    If the case is sunlit, the second camera has the sunlit limb too.
     """
     air, widest = random_air(generator), ATTITUDES[case.parameters["attitude"]]
     for _ in range(_MOST_DRAWS):

@@ -1,9 +1,9 @@
 """Campaign `installer-kill`: kill -9 of the installer during an update, at a random time or system call.
 
-A case is a board that flies one release. Updates to other releases are killed repeatedly. Half of the kills
+A case is a board that runs one release. Updates to other releases are killed repeatedly. Half of the kills
 end the installer and its child processes at a random time. The other half end one process at a random system
-call that changes files (by strace, if it is installed). After each kill the board must fly the old or the new
-release without an error. At the end an update must complete, and its release must fly.
+call that changes files (by strace, if it is installed). After each kill the board must run the old or the new
+release without an error. At the end an update must complete, and the board must run its release.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _kill(board: FakeBoard, took: float, old: str, new: str, rng: np.random.Gene
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return which release flew after each kill."""
+    """Return which release the board ran after each kill."""
     del folder
     kills = [kill for result in results for kill in result["flown"]]
     labels = Counter(kill["which"] for kill in kills)

@@ -139,7 +139,8 @@ Orbit = tuple[datetime, float, Sequence[float], float]
 def run(case: Case) -> Result:
     """Simulate one receiver with old elements; `step` is the time (s) between two fixes."""
     rng, kind = np.random.default_rng(case.seed), case.parameters["kind"]
-    # Magnetometer and Sun can reveal a fix on another orbit only if the elements agree with them.
+    # The magnetometer or the Sun can reveal that a fix is of another orbit only if the orbital elements are
+    # accurate.
     age, wrong = rng.uniform(0.0, 2.0 if kind in ("field", "sun") else 60.0), rng.uniform(0.0, 1.0)
     other: Receiver | None = None
     while True:
@@ -290,7 +291,10 @@ LEAP = "2035-06-30T23:15:00"
 
 
 def months(runs: int, seed: int) -> list[Case]:
-    """Return `runs` months from January 2026 on for both craft, the rollover and the leap second."""
+    """Return flights of both craft in `runs` months from January 2026 on, and at two special dates.
+
+    These are a rollover of the GPS week number and a leap second.
+    """
     dates = [f"{2026 + month // 12}-{month % 12 + 1:02d}-15T12:00:00" for month in range(min(runs, 132))]
     return [
         Case(f"{craft}/{date}", (seed, number), {"craft": craft, "utc": date, "early": number % 2 == 1})
@@ -379,7 +383,10 @@ class _UnlikeBody:
 
 
 def _followed(config: OrbitConfig, receiver: Receiver, rng: np.random.Generator) -> Result:
-    """Return a craft's attitude errors; `attitude_sigmas` is the largest one in claimed sigmas."""
+    """Return a craft's attitude errors: `attitude_deg` at the end, and the largest one in claimed sigmas.
+
+    The latter is `attitude_sigmas`.
+    """
     body, unit = _UnlikeBody(config, rng), config.inertial_unit
     free = FreeFilter(config.craft.inertia_matrix(), filter_settings(config))
     known = EstimatedEnvironment(None, SimClock(receiver.begin_ns))

@@ -24,9 +24,11 @@ from tests.studies.campaigns.object_chase import FASTEST, FIELD, GAP, NEAREST, S
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
 
 _SIDES = 16
-"""Number of sides of the polygons that replace the circles of deviation and authority.
+"""Number of sides of the polygons that replace circles in the linear programme.
 
-The polygon of the authority encloses its circle.
+One circle limits the deviation, and the other limits the angular acceleration that the coils can cause.
+
+The polygon of the acceleration encloses its circle.
 """
 
 
@@ -101,7 +103,10 @@ def _carried(directions: FloatArray) -> FloatArray:
 
 
 def _turned(directions: FloatArray, axes: FloatArray, field: FloatArray) -> FloatArray:
-    """Return the accelerations (n, 3, 2) of deviation and roll due to either torque across the field."""
+    """Return the angular accelerations (n, 3, 2) of the deviation (two components) and of the roll.
+
+    The last index is that of two orthogonal unit angular accelerations across the field.
+    """
     found = np.zeros((len(directions), 3, 2))
     for n, (direction, both, strength) in enumerate(zip(directions, axes, field, strict=True)):
         along = strength / np.linalg.norm(strength)

@@ -254,7 +254,7 @@ class _Flight:
 
 
 def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tuple[FloatArray, float]:
-    """Return the attitude error (3,), rad, body axes, and the squared normalised error with bias."""
+    """Return the attitude error (3,), rad, in body axes, and the NEES of attitude and gyro bias."""
     turn = rotation_vector(multiply(attitude, conjugate(estimate.quaternion)))
     error = np.concatenate([turn, bias - estimate.bias])
     pick = np.r_[ATTITUDE, BIAS]

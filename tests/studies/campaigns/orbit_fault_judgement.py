@@ -36,12 +36,14 @@ LOOKED, FEW = 3.0, 3
 that does not count as an effect.
 """
 LAST = 12.0
-"""Duration (s) of the end of a flight, in which the body must fulfil the purpose of its mode again."""
+"""Duration (s) of the end of a flight, in which the body must meet the requirements of its mode (`works`)."""
 SET_UP = 0.53
 """Time (s) until the PWM chip is set up. Losses before this time are not counted."""
 ACTS, RATE_OFF = 2e-3, 0.0175
-"""Smallest current (A) of coils that control the body, and largest error (rad/s) of the magnetometer's
-rate."""
+"""Smallest current (A) of coils that control the body, and largest error (rad/s) of a usable rate estimate.
+
+The rate is estimated from the magnetometer.
+"""
 
 ORBIT_OWN: Mapping[str, frozenset[str]] = {
     **OWN,
@@ -184,7 +186,7 @@ def _is_string_lit(flown: Run, at: float, end: float) -> bool:
 
 
 def works(flown: Run, mode: str) -> bool:
-    """Return whether the body fulfils the purpose of its mode at the end of the flight.
+    """Return whether the body meets the requirements of its mode at the end of the flight.
 
     In detumbling the coils must act and the rate must be known, or the body must be slow. In other modes the
     attitude must be fine, and in pointing modes the coils must act.

@@ -59,8 +59,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
 EARTHLIGHT = 30.0
 """Counts of the Fuga 15d at an intensity of 0.025, that of a dark sea under a low Sun."""
 FINE = np.radians(2.0)
-"""Largest sigma (rad) of the worst axis with which the attitude selects the cameras for the limb and the
-solar cells are not used.
+"""Largest sigma (rad) of the worst axis of an attitude that is fine.
+
+A fine attitude selects the cameras that can see the limb, and replaces the solar cells.
 """
 LEAST_ROUGH = np.radians(0.2)
 """Smallest sigma (rad) of the filter's attitude that is given to the horizon search as prior."""
@@ -184,7 +185,8 @@ class _Flight:
     def _give_sun(self, now_ns: int, sun: SunOfCameras, reference: FloatArray, fine: bool) -> None:
         """Give the filter the Sun direction of a camera.
 
-        If none, that of the solar cells while the attitude is coarse.
+        If no camera shows the Sun and the attitude is coarse, the filter gets the direction from the solar
+        cells.
         """
         if sun.direction is None or sun.covariance is None:
             return

@@ -11,7 +11,7 @@ Cells `day` are the same over a day, with a quarter of the runs.
 Cells `heavy` are the same over half a day with the strong drag of a solar maximum. They count how many star
 attitudes the filter rejected, and how many in a row.
 
-Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the described ones by
+Cells `unknown` are holds of a body whose moments, principal axes and coils differ from the configured ones by
 up to the default accuracies.
 
 Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, at a rate of 0.3 deg/s, and last 100
@@ -119,7 +119,7 @@ def run(case: Case) -> Result:
 
 
 def unknown_body(craft: str, seed: int) -> DescriptionErrors:
-    """Return random errors of the described inertia, and of the gain and axis of each coil."""
+    """Return random errors of the configured inertia, and of the gain and axis of each coil."""
     generator, bounds = np.random.default_rng([seed, 0xC011]), BodyErrors()
     coils = np.eye(3) + bounds.coil_axes * generator.uniform(-1.0, 1.0, (3, 3))
     np.fill_diagonal(coils, 1.0 + bounds.coil_gain * generator.uniform(-1.0, 1.0, 3))

@@ -96,8 +96,8 @@ class PointingFlight:
         Keys of `wanted`: craft, share of the worst disturbances, target, and the initial rotation (deg), if
         any.
 
-        A `description` (DescriptionErrors) makes the body differ from its description, and `residual`
-        multiplies the worst residual dipole of 1e-3 A m^2.
+        If given, `description` (DescriptionErrors) contains the differences of the true body from the
+        configured one, and `residual` multiplies the worst residual dipole of 1e-3 A m^2.
         """
         self._wanted = wanted
         target = wanted["target"]
@@ -129,7 +129,11 @@ class PointingFlight:
         self._turn: FloatArray = np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
-        """Return the release: at the law's attitude and rate, or at a random attitude and rate."""
+        """Return the initial attitude and rate, which are those of the pointing law.
+
+        If an initial rotation is given, the attitude is rotated from the law's attitude about a random axis,
+        and the rate has a random direction.
+        """
         way = law_of(self._target, AXES, held.motion.quaternion, held.ephemeris(60.0), 2.0)
         start = references(way, held.ephemeris(60.0), np.array([2.0]))
         quaternion, rate = start.quaternion[0], start.rate[0]

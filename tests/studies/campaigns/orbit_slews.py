@@ -4,10 +4,10 @@ A 3U slews by 30 to 180 deg between inertial attitudes in 600 to 1,200 s, the Kn
 multiplies the worst cases of drag, sunlight and the rotation of the principal axes; all other disturbances
 have their full magnitude. The optimum is that of the true body for the same duration.
 
-A described body is held for 1,200 s before its slew. An unknown body has moments of inertia that are wrong by
-up to 5 %, principal axes that are wrong by up to 3 deg, and a residual dipole of 4e-3 A m^2. It flies two
-slews, each after 60 s: the `first`, and a second one with the parameters that have been estimated by then
-(`learned`).
+A body that equals its configuration is held for 1,200 s before its slew. An unknown body has moments of
+inertia that are wrong by up to 5 %, principal axes that are wrong by up to 3 deg, and a residual dipole of
+4e-3 A m^2. It flies two slews, each after 60 s: the `first`, and a second one with the parameters that have
+been estimated by then (`learned`).
 
 The flight is that of `orbit_pointing_flight`. The pointing law holds the body in an inertial attitude, and
 the filter learns torques, residual dipole and inertia. Then the body follows the slew table of the planner
@@ -57,7 +57,7 @@ WANTED = {"knightcube": 2.0, "cubesat_3u": 0.5}
 HEAT = 1.3
 """Largest ratio of the median heat to that of the true body's optimum (issue 34)."""
 LEARN, FIRST = 1_200.0, 60.0
-"""Time (s) for which a described body is held before its slew, and an unknown body before its first slew."""
+"""Times (s) for which a body is held before its first slew: a body as configured, and an unknown body."""
 HORIZON = {"knightcube": (300.0, 300.0), "cubesat_3u": (600.0, 1200.0)}
 """Shortest and longest requested duration (s) of a slew, by craft."""
 MOMENTS, AXES_DEG, RESIDUAL = 0.05, 3.0, 4.0
@@ -213,7 +213,11 @@ def _inertial(quaternion: FloatArray) -> PointingTarget:
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each craft, alternately in two orbits, with each share and an unknown body."""
+    """Return `runs` flights of each craft and kind of body, alternately in two orbits.
+
+    The kinds of bodies are a body as configured, with each of `SHARES` of the worst disturbances, and an
+    unknown body.
+    """
     bodies: list[tuple[str, dict[str, Any]]] = [(str(share), {"share": share}) for share in SHARES]
     bodies.append(("unknown", {"share": UNKNOWN_SHARE, "unknown": True, "learn": FIRST}))
     return [
@@ -229,7 +233,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly the case: one slew of a described body, two of an unknown one."""
+    """Fly the case: one slew of a body as configured, or two slews of an unknown body."""
     wanted = case.parameters
     names = ("first", "learned") if wanted.get("unknown") else (str(wanted["share"]),)
     flight = SlewFlight(wanted, case.seed[0] * 100_003 + case.seed[1])
@@ -241,7 +245,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the error (deg) at the end, the fraction within the limit, and the heat over the optimum."""
+    """Return the error (deg) at the end, the fraction within the limit, and the ratio of heat to optimum."""
     slews: dict[str, Any] = {}
     for craft in HORIZON:
         for name in (*map(str, SHARES), "first", "learned"):

@@ -3,9 +3,9 @@
 Start and target are at |q2| of 0.60 to 0.68. The torque of a known thread of 0 to 2e-5 N m/rad is up to ten
 times that of the coil. The requested duration is 5 to 60 s. Each slew is planned, and also solved by an
 independent collocation (`tests.support.collocation_oracle`). A slew counts as failed if the collocation finds
-a path within |q2| <= 0.68 in the requested duration and the planner finds none. It counts as `dear` if the
-planner's path costs more than 1.001 times the collocation's, and as late if the planner extends the duration
-although the collocation does not need to.
+a path within |q2| <= 0.68 in the requested duration and the planner finds none. It counts as `dear` (costly)
+if the planner's path costs more than 1.001 times the collocation's path. It counts as late if the planner
+extends the duration although the collocation finds a path without an extension.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def run(case: Case) -> Result:
 
 
 def verdict(result: Result) -> str:
-    """Return "failed", "late", "dear" or "solved", or "unknown" if the collocation has no path."""
+    """Return "failed", "late", "dear" (costly) or "solved", or "unknown" if the collocation finds no path."""
     if result["optimum"] is None:
         return "unknown"
     if result["horizon"] is None:

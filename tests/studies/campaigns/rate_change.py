@@ -39,7 +39,8 @@ WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 # Upper limits of the classes of rate change (% of the mean rate).
 CHANGES = (50, 100, 150, 199, 200, 300, 400, 4000)
-# Smallest change with a visible reversal, and largest change in each half of the frames with a reversal.
+# Smallest rate change, relative to the mean rate, with which the rotation visibly reverses, and the largest
+# changes in the two halves of the frames with a reversal.
 REVERSING = (2.2, 4.0, 40.0)
 
 
@@ -65,7 +66,8 @@ def _reversing(run: int, seed: int) -> Case:
     path = float(np.exp(draw.uniform(*np.log(LENGTHS))))
     parameters = {
         "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
-        # This is the length at the mean rate. The longer branch of the reversing path is a multiple of it.
+        # This is the length (px) of a streak at the mean rate. It is chosen so that the longer part of the
+        # path, before or after the reversal, is `path` px long.
         "length": path / (0.5 * change * (0.5 + 1.0 / change) ** 2),
         "exposure": float(draw.choice(EXPOSURES)),
         "change": change * float(draw.choice([-1.0, 1.0])),

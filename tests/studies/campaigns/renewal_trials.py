@@ -1,6 +1,6 @@
 """Campaign `renewal-trials`: valid, damaged and unusable updates over the link, killed at random times.
 
-A case is a board that flies a release and a configuration. The ground sends one bundle, activates it, and may
+A case is a board that runs a release with a configuration. The ground sends one bundle, activates it, and may
 confirm it. Every second run of the privileged program is killed with all its child processes at a random
 time; the link is restarted at random. After the trial period the old or the new version must be in use, and
 the old one if the bundle had a flaw. The link must still execute a command.
@@ -30,7 +30,7 @@ FLAWS = {
     "configuration": ("", "", "byte", "cut", "foreign key", "bounds", "body", "world", "keys", "reacts"),
     "release": ("", "crashes", "self-test", "cut", "packages"),
 }
-"""Flaws of the bundles of each kind; an empty text means no flaw."""
+"""Flaws of the bundles of each kind; an empty string means no flaw."""
 HOURS, STEPS, LONGEST_S = 2.0, 12, 8.0
 _REPLACED = {
     "bounds": ("duration:", "duration: -1 #"),
@@ -60,7 +60,7 @@ def _made() -> RenewedBoard:
 
 
 def run(case: Case) -> Result:
-    """Activate one bundle, with kills, and return the version that flies after the trial."""
+    """Activate one bundle, kill processes at random times, and return the version in use after the trial."""
     rng = np.random.default_rng(case.seed)
     kind, flaw = case.parameters["kind"], case.parameters["flaw"]
     with tempfile.TemporaryDirectory(prefix="renewal-") as name:
@@ -151,7 +151,7 @@ def _step(ends: RenewedEnds, rng: np.random.Generator) -> bool:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return the versions that fly after the trials, and the cases that ended wrongly."""
+    """Return the versions in use after the trials, and the cases that ended wrongly."""
     del folder
     wrong = [
         result

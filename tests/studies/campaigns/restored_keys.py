@@ -169,7 +169,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Run all steps of one order."""
+    """Run all steps of one random sequence (`Order`), and return its counts."""
     with tempfile.TemporaryDirectory() as name:
         order = Order(Path(name), case.seed)
         order.run()
@@ -177,7 +177,7 @@ def run(case: Case) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return the sums over all orders."""
+    """Return the sums of the counts over all random sequences."""
     del folder
     facts = {name: sum(int(result[name]) for result in results) for name in results[0]}
     return summary({"orders": len(results), **facts})

@@ -3,7 +3,7 @@
 Each run draws a world: inertia within 20 %, field and coil resistance within 10 %, a thread stiffness of 0 to
 3 times that of the demonstration (which the loop does not model), a gyro bias, noise of up to 3 times,
 readings that are one to three cycles late, 5 % of damaged packets, and an IMU that is silent for up to a
-second, once in a slew and once in a hold. Every controller of `COMPARED` flies the same worlds. All
+second, once in a slew and once in a hold. Every controller of `COMPARED` is simulated in the same worlds. All
 controllers are tuned by one criterion in the world that the loop models. Each flight runs the whole loop in
 lock-step on the emulated devices. A flight has two steps of the demonstration, 65 s each: the slew from the
 release, and the first change of q2 by 0.1. All results refer to the true body.
@@ -82,7 +82,7 @@ def draw(seed: tuple[int, ...]) -> dict[str, Any]:
 
 
 def world_of(drawn: dict[str, Any], config: TestbedConfig) -> Simulation:
-    """Return the simulation of a drawn world."""
+    """Return the simulation settings of a random world."""
     base = demo_world()
     ohms = config.coils.resistance
     factor = drawn["resistance"]

@@ -79,7 +79,7 @@ def _bound(scene: RowScene, camera: StarCameraModel, rate: FloatArray, exposure:
 
 
 def _judged(found: MotionResult, rate: FloatArray, bound: FloatArray) -> Result:
-    """Return status, NEES, squared error over the bound, and error relative to the rate."""
+    """Return status, NEES, ratio of the squared error to its bound, and error relative to the rate."""
     if found.rate is None or found.covariance is None:
         return {"status": found.status.value}
     error = found.rate - rate

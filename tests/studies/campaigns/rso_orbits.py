@@ -169,7 +169,7 @@ def expose(
 def star_streaks(
     scenario: Scenario, at: Opportunity, limit: float = STAR_LIMIT
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the ends (n, 2, 2) px and magnitudes (n,) of the stars near the field, to a magnitude."""
+    """Return streak ends (n, 2, 2) px and magnitudes (n,) of the stars near the field, down to `limit`."""
     stars, directions = catalogue(limit)
     attitudes = scenario.attitude(at.start + EXPOSURE * np.array([0.0, 1.0]))
     near = directions @ attitude_matrix(attitudes[0])[2] > np.cos(scenario.pinhole.half_diagonal + 0.05)

@@ -3,9 +3,10 @@
 Each run has one unknown lens and FRAMES frames of random fields, at rotations of 5 to 30 % of the field in
 0.2 s. The lens differs from its description by its stated standard deviations: 2 px along each axis, 0.5 % of
 distortion and 30 us of line time. In the row `field`, the field of view is up to 5 % wrong; in the row
-`distortion`, it is known to 2 %; in the row `shift`, another lens of the same distribution replaces the
-lens after half of the frames. The frames are drawn by `supersampled`, not by the estimator's model. The true
-rate is the prior, which gives the direction of time. The bound is that of an exactly known camera.
+`distortion`, it is known to 2 %; in the row `shift`, another lens of the same distribution replaces the lens
+after half of the frames. The frames are drawn by `supersampled`, not by the estimator's model. The prior of
+the rate is the true rate; it determines the sign of the rotation, which streaks do not show. The bound is
+that of an exactly known camera.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from tests.support.supersampled import Optics, Sky, gaussian, light, through_len
 ROWS = ("default", "field", "distortion", "shift")
 FRAMES = 14
 SHIFTED = 24
-"""Number of frames of a run in the row `shift`."""
+"""Number of frames of a run in the row `shift` of the result table."""
 LEARNED = 10
 """Number of frames after which a lens counts as estimated."""
 SIZE, EXPOSURE, BOUND_STARS, WRONG_SIGMAS = 512, 0.2, 30, 6.0

@@ -1,10 +1,10 @@
-"""Campaign `start`: each system call of a board's start fails once, and the board must still fly.
+"""Campaign `start`: each system call of a flight's start on a board fails once; the flight must still start.
 
-A point is one call of the main thread, numbered from the start of its process, with one error that strace
-injects into it. The list of points is all calls of a traced start times all errors. The number of calls
-varies slightly between starts. The seed determines the order of the list. The order alternates between calls
-after and before the opening of the configuration, as long as both remain, because nearly all calls before it
-only read modules. With as many runs as points, the campaign covers the whole list.
+A point is a combination of one call of the main thread, numbered from the start of its process, and one error
+that strace injects into the call. The list of points contains each call of a traced start with each error.
+The number of calls varies slightly between starts. The seed determines the order of the list. The order
+alternates between calls after and before the opening of the configuration, as long as both remain, because
+nearly all calls before it only read modules. With as many runs as points, the campaign covers the whole list.
 
 A case is a board whose emulated devices run in a separate process. Its flight starts repeatedly, each time
 with one point. The campaign replaces the service manager: it restarts a process that ends, without the fault,
@@ -38,7 +38,7 @@ from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
 CALLS = ("open", "openat", "read", "getdents64", "fsync", "rename", "bind", "ioctl")
 ERRORS = ("EIO", "ENOSPC", "ENOENT", "EACCES")
 FAULTS = 10
-"""Number of points of one board."""
+"""Number of points (failing calls) that one board tests."""
 
 _LONGEST_S = 120.0
 _CONFIG = "flight.yaml"
@@ -58,7 +58,11 @@ class Point:
 
 
 def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
-    """Return all points of a start, from the numbers of all calls and of those before the configuration."""
+    """Return all points (failing calls) of a start.
+
+    `counts` are the numbers of calls by name in a traced start, and `before` are the numbers of calls before
+    the configuration is opened.
+    """
     return [
         Point(number > before[call], call, number, error)
         for call in CALLS
@@ -68,7 +72,10 @@ def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
 
 
 def in_turn(listed: Sequence[Point], seed: int) -> list[Point]:
-    """Return the points in a seeded order that alternates between after and before the configuration."""
+    """Return the points (failing calls) in a random order that the seed determines.
+
+    Calls after and before the opening of the configuration alternate.
+    """
 
     def rank(point: Point) -> bytes:
         return hashlib.sha256(f"{seed} {point.call} {point.number} {point.error}".encode()).digest()
@@ -105,7 +112,7 @@ def run(case: Case) -> Result:
 
 @contextmanager
 def _board() -> Iterator[Board]:
-    """Provide a board with running devices. Raises UsageError without strace."""
+    """Provide a board with running devices. Raises UsageError if strace is not installed."""
     if shutil.which("strace") is None:
         raise UsageError("the campaign start needs strace")
     _check_injection()
@@ -232,7 +239,7 @@ class Board:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Count the outcomes of the starts; name each start that did not fly."""
+    """Count the outcomes of the starts; name each start after which no flight ran."""
     faults = [fault for result in results for fault in result["faults"]]
     flew = [fault for fault in faults if fault["flies"]]
     at_once = sum(not fault["waited"] and not fault["restarts"] for fault in flew)

@@ -278,12 +278,14 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def _ratio(errors: Sequence[float], bound: FloatArray) -> float | None:
-    """Return the rms of errors over their own bounds."""
+    """Return the rms of the ratios of errors to their bounds."""
     return _rms(np.array(errors) / bound) if len(errors) else None
 
 
 def _table_3_1(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return Table 3.1: the largest mean error within each detector's precise region, of the thesis and here.
+    """Return Table 3.1: the largest mean errors in the thesis and here, for each estimator.
+
+    Errors at a smaller theta than the thesis's limit for the estimator are not included.
 
     Rate errors are fractions here and percentages in the thesis. Attitude errors are in px.
     """

@@ -2,9 +2,10 @@
 
 A boom, panel or edge of random shape and brightness (dark, grey, or lit and textured) covers 5 to 20 % of the
 frame and at most half of the visible limb. The mask is `configured` as a polygon, `learned` from 30 earlier
-frames of the same camera at random attitudes, or `none`. The focal length has a normal error of 5 %, which is
-known as its uncertainty. Altitudes, atmosphere and cameras are those of the campaign `nadir`. The kind `real`
-is the photograph of OPS-SAT, rotated and mirrored; its truth is the limb found without structure.
+frames of the same camera at random attitudes, or `none`. The error of the focal length is normally
+distributed with a standard deviation of 5 %, which is stated as its uncertainty. Altitudes, atmosphere and
+cameras are those of the campaign `nadir`. The kind `real` is the photograph of OPS-SAT, rotated and mirrored;
+its truth is the limb found without structure.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Campaign `unknown-body`: attitude knowledge of satellites that differ from their description, in the loop.
 
 Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another position of the orbit with a
-tumble, whose rate is lower than the configured one so that all phases fit into the flight. Body, coils and
-sensors differ from the configuration within the accuracies that the configuration states
+tumble, whose rate is lower than the configured one so that all phases fit into the flight. The differences of
+body, coils and sensors from the configuration are at most the accuracies that the configuration states
 (`simulation.free_body.errors`). Cells `NAME-tumble` are only the beginnings of such flights, in which most
 bodies still tumble. They show within minutes whether the claimed uncertainty is correct.
 
@@ -143,7 +143,7 @@ def _thinned(times: FloatArray) -> BoolArray:
 def in_phases(flown: Run, times: FloatArray) -> dict[str, BoolArray]:
     """Return which of the `times` (n,) s are in each phase.
 
-    A slew lasts from the first pointing of a target until the planned path ends.
+    A slew lasts from the time at which the body starts to point at a target until the planned path ends.
     """
     modes = np.array(flown["mode"]["mode"])
     mode = modes[np.maximum(np.searchsorted(seconds(flown["mode"]), times, side="right") - 1, 0)]

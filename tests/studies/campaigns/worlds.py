@@ -1,10 +1,11 @@
 """Campaign `worlds`: runs of the same craft in the project's world and in Basilisk.
 
-`detumble/` flies the KnightCube of the campaign `detumble`, alternately by two laws. `nadir/` holds nadir as
-in `orbit-pointing`, alternately with 3U and KnightCube, at SHARE of the worst torques. Only the worlds
-differ. Basilisk has no day bulge, no ring current and no random walks of air density and dipole, so they are
-off in both worlds. Its field is WMM2025; that of this project is IGRF-14. Times, errors and coil energies
-should agree within 20 % in the median. The campaign needs the extra `worlds`.
+In the cases `detumble/`, the KnightCube is detumbled as in the campaign `detumble`, alternately by two laws.
+In the cases `nadir/`, 3U and KnightCube alternately hold nadir as in the campaign `orbit-pointing`, at SHARE
+of the worst torques. Only the worlds differ. Basilisk has no day bulge, no ring current and no random walks
+of air density and dipole, so they are off in both worlds. Its field is WMM2025; that of this project is
+IGRF-14. Times, errors and coil energies should agree within 20 % in the median. The campaign needs the extra
+`worlds`.
 """
 
 from __future__ import annotations
