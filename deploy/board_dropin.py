@@ -29,7 +29,7 @@ from hal.interfaces.guardian import CoilReach
 from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
-"""Driver classes of pluggable serial lines, of pluggable video devices, and of I2C buses (none)."""
+"""Driver classes of pluggable serial lines and video devices. I2C buses are not pluggable: no classes."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 """Driver classes by the kind of a device."""
 
@@ -92,9 +92,9 @@ def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list
     """Return the DeviceAllow lines for a device file, which may be a symbolic link made by udev.
 
     systemd resolves a file to one device number when the service starts. A USB device may reconnect under a
-    different number, such as ttyUSB1 instead of ttyUSB0, so the class of its driver is permitted. For a
-    device that does not exist yet, the driver classes `plugged` are allowed. The folder `root` contains the
-    file systems proc and sys.
+    different number, such as ttyUSB1 instead of ttyUSB0, so the class of its driver is permitted. If the
+    device does not exist yet, its driver is not known, so all driver classes in `plugged` are permitted. The
+    folder `root` contains the file systems proc and sys.
     """
     try:
         mode, number = (found := os.stat(path)).st_mode, found.st_rdev

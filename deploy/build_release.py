@@ -25,12 +25,12 @@ from releases import MANIFEST, linked, manifest_text
 SOURCE = "source"
 """File of a release with the SHA-256 digest of its sources and build options."""
 LOCK = "requirements.lock"
-"""File of a release with the lock file from which its packages were installed."""
+"""Copy, in a release, of the lock file from which the packages of the release were installed."""
 SELF_TEST_S = 10
 _PARTS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"
 _OURS = ("flight", "hal", "sim_hal", "knightcube", "knightcube*.dist-info")
-"""Names of the packages of this repository in a release, which each release installs from its own sources."""
+"""File names of this repository's own packages. Each release builds these packages from its own sources."""
 _NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info", "__pycache__")
 """Names in the source folder that are not sources, such as caches, which change while a release is used."""
 
@@ -76,7 +76,7 @@ class Build:
         found = ["--no-index", "--find-links", options.wheels] if options.wheels else []
         quiet = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
         self._run([options.python, "-m", "venv", venv])
-        # The lock file also lists the build backend, so only packages with a verified hash build a release.
+        # The lock file includes the build backend, so pip verifies the hash of each package used in a build.
         if options.reuse:
             self._copy_packages(self.releases / options.reuse, release)
         else:

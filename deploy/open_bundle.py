@@ -1,4 +1,4 @@
-"""Checks a signed bundle of a renewal, and prepares its content for installation.
+"""Checks a signed bundle with an update of the board, and prepares its content for installation.
 
 The program renewal.py runs `open_bundle.py TRUSTED ROOT BUNDLE KIND FOLDER PRESENT KEPT UTC` as root with
 the Python of a release. A bundle is a compressed tar archive of TUF metadata and of one artefact. The TUF

@@ -1,11 +1,11 @@
 #!/usr/bin/env -S python3 -I -S
-"""Renews configuration and release of a board, and supervises each renewal until the ground confirms it.
+"""Updates configuration and release of a board, and supervises each update until the ground confirms it.
 
-The timer knightcube-renewal.timer runs `renewal.py` as root every ten seconds. Each run reads the state,
-executes at most one request of the link, checks the trial in progress, advances the command-loss timer,
-stores the state and ends. The state is stored before a step is executed, and each step may be executed again,
-so that a kill at any moment leaves the old or the new version, and the next run continues
-(docs/fly/renewal.md).
+An update is called a renewal (docs/fly/renewal.md). The timer knightcube-renewal.timer runs `renewal.py` as
+root every ten seconds. Each run reads the state, executes at most one request of the link, checks the trial
+in progress, advances the command-loss timer, stores the state and ends. The state is stored before a step is
+executed, and each step may be executed again. If the program is killed at any moment, either the old or the
+new version is therefore installed, and the next run continues.
 
 The link is not trusted. The requests of the link must be regular files of limited size, and symbolic links
 are not followed. The program `open_bundle.py` checks signatures and content of an artefact before anything is
@@ -42,7 +42,7 @@ DOWN_S = 180.0
 FIRST_CONTACT_S = 60.0
 """Time (s) that a flight must last before its note about a renewal is deleted."""
 MOST_TRIES = 3
-"""Maximum number of attempts to build a release, because a kill or a power loss may end an attempt."""
+"""Maximum number of attempts to build a release; the end of the process or a power loss ends an attempt."""
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64
@@ -72,7 +72,7 @@ class Refused(Exception):
 
 @dataclasses.dataclass
 class Trial:
-    """Trial of a renewal.
+    """Trial of a renewal, an update of configuration or release.
 
     Attributes:
         what: part of the software that is renewed, `configuration` or `release`.
@@ -82,7 +82,7 @@ class Trial:
         old: name of the previous configuration (stored copy) or release.
         new: name of the new configuration or release; an empty text until a release is built.
         stage: stage of the trial: `install`, `fly` or `revert`.
-        left_s: remaining time (s) with power in which the ground must confirm the renewal.
+        left_s: remaining powered-on time (s) of the board in which the ground must confirm the renewal.
         despite_faults: whether the trial continues after the flight has reported a fault.
         before: release to which the link `previous` pointed before the trial.
         session: identifier of the link process at the installation; faults recorded by this process are
@@ -110,7 +110,7 @@ class Trial:
 
 @dataclasses.dataclass
 class State:
-    """Stored state of the renewal.
+    """Stored state of the renewal program.
 
     Attributes:
         number: number of this record; the copy with the higher number is used.
@@ -119,7 +119,7 @@ class State:
         previous: name of the configuration that flew before the present one.
         bad: names of the releases that failed a trial.
         trial: open trial.
-        returning: kind, target, replaced version and report of an unfinished return to an earlier version.
+        returning: kind, target, replaced version and report of an unfinished rollback to an earlier version.
         reports: newest reports, each a list of number, request, result, name and text.
         note: text that the flight reports as an event at its next start.
         note_s: time (s) for which the flight software has run since the note was made.
@@ -127,7 +127,7 @@ class State:
         at: time (s) of the last run, since boot.
         frames: number of authentic frames in the link's last record.
         limit_s: interval (s) of the command-loss timer; 0 disables the timer.
-        silent_s: time (s) with power since the last authentic frame.
+        silent_s: powered-on time (s) of the board since the last authentic frame.
         steps: number of executed steps of the command-loss timer.
     """
 
@@ -339,8 +339,9 @@ class Board:
     def restart_parts(self) -> None:
         """Restart the requested parts (flight, link, board); a damaged request restarts flight and link.
 
-        The request is deleted last, so that a kill does not lose it. Only a request to restart the board is
-        deleted first, because it would otherwise be repeated after each boot. Raises OSError.
+        The request is deleted after the restart, so that it is not lost if this program is killed. A request
+        to restart the board is deleted before the restart, so that it is not repeated after each boot. Raises
+        OSError.
         """
         path = self.own / RESTART
         if not path.exists():
@@ -701,7 +702,7 @@ class Renewal:
         self._continue()
 
     def _revert(self, trial: Trial) -> None:
-        """Install the version before the trial, request a restart and end the trial.
+        """Install the version that preceded the trial, request a restart and end the trial.
 
         Raises Refused or OSError if the installation fails.
         """
@@ -816,8 +817,7 @@ class Renewal:
             text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
             if self._go_back(step, "", "command-loss", text):
                 return
-            # If the version of this step does not exist, the next step of the command-loss timer follows at
-            # once.
+            # If the version to which this step returns does not exist, the timer's next step follows at once.
             state.silent_s = max(state.silent_s, state.limit_s * (state.steps + 1))
 
     def _note(self, text: str) -> None:

@@ -27,7 +27,7 @@ import time
 
 FIRST_S, LONGEST_S = 30.0, 3600.0
 FLEW_S = 600.0
-"""Flight time (s) after which a later failure starts again with the shortest waiting time."""
+"""Flight duration (s) after which the next restart has the shortest waiting time (`FIRST_S`) again."""
 
 COILS_S, RETRY_S = 30.0, 1.0
 """Intervals (s) of setting the coils to zero: after an acknowledgement by the PWM chip, and without one."""

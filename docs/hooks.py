@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
 _WEIGHTS = {"reference/": 1e-3, "decisions/": 0.1, "sources/": 0.1, "architecture": 0.1, "results/": 0.25}
-"""Search weights of pages by the beginning of their path; a guide with the same words has the weight 1.
+"""Weight of a page in the search, by the beginning of the page's path. All other pages have the weight 1.
 
 A word in a title weighs 1,000 times as much as a word in the text.
 """

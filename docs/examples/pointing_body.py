@@ -66,7 +66,7 @@ class FixedAttitude:
 
     @property
     def text(self) -> str:
-        """Text of the target law for events."""
+        """Text that describes the target attitude in events."""
         return "attitude " + " ".join(f"{part:+.3f}" for part in self.wanted)
 
     def quaternion(self, now_ns: int) -> FloatArray:
@@ -269,7 +269,7 @@ class View:
 
 # --8<-- [start:make]
 class PointingControl(BodyControl):
-    """Implements `BodyControl`: the classes above and the testbed's detumbling law."""
+    """Implements `BodyControl` with the classes above, and with the testbed's detumbling law."""
 
     def __init__(self, config: TestbedConfig) -> None:
         direct = Direct()

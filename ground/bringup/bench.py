@@ -36,9 +36,9 @@ STILL_S = 0.5
 
 
 class StepSkipped(Exception):
-    """Raised by a step that cannot be done.
+    """Raised if a step of the bring-up cannot be performed.
 
-    The text states the reason; `finding` is the fault that caused it.
+    The text states the reason. The attribute `finding` is the fault that prevents the step, or None.
     """
 
     def __init__(self, reason: str, finding: Finding | None = None) -> None:

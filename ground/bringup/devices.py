@@ -33,7 +33,7 @@ _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}
 _LISTEN_NS = 1_200_000_000
 _LOOK_NS = 20_000_000
 _REGULAR, _PAUSE = 8, 5.0
-"""Smallest number of pauses for a diagnosis, and ratio of longest to median pause for loose contact."""
+"""Limits for loose contact of a serial line: number of pauses between reads, longest over median pause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ def talker(rig: Rig, device: str, rates: tuple[int, ...]) -> tuple[str, int, flo
 
 
 def find(config: Config, rig: Rig, stack: Any) -> Iterator[Found]:
-    """Yield the answer of each configured device, or a finding with its cure."""
+    """Yield the answer of each configured device, or a finding with its remedy."""
     serial = {
         kind: one for kind in ("inertial_unit", "gps") if hasattr(one := getattr(config, kind), "device")
     }

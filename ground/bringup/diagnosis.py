@@ -41,7 +41,7 @@ ALIKE = math.radians(15.0)
 SCALE = 0.1
 """Largest relative difference between the scales of two axes or sensors that count as equal."""
 STRONGEST_BIAS = 1.5e-5
-"""Constant field (T) of a body that is always permitted, even if the field of the site is weak."""
+"""Largest constant field (T) of the body itself that is permitted even if the field of the site is weak."""
 _AXES = "xyz"
 _NEAR = 0.15
 """Relative difference up to which a measured value agrees with its expected value."""
@@ -122,9 +122,10 @@ def noise_of(values: FloatArray) -> FloatArray:
 
 
 def missing_share(change: FloatArray, noise: float) -> float:
-    """Return the fraction of samples (k, 3) in which a change of the field (T) is missing.
+    """Return the fraction of samples without a coil's field, from the changes (k, 3), T, of the field.
 
-    The fraction is 0 if the change does not exceed eight times the `noise` (T) of a sample.
+    The field of a coil is missing in a sample if the change is less than half of the usual change. The
+    fraction is 0 if the usual change does not exceed eight times the `noise` (T) of a sample.
     """
     mean = change.mean(axis=0)
     along = change @ mean / (np.linalg.norm(mean) or 1.0)
@@ -439,7 +440,7 @@ def _wrong_scales(part: str, scales: FloatArray, what: str) -> Finding:
 
 
 def _force_scales(force: FloatArray) -> list[Finding]:
-    """Return the finding about the scales of an accelerometer from specific forces (k, 3), g, if any.
+    """Return a finding if the scales of an accelerometer are wrong, given its specific forces (k, 3), g.
 
     Each axis of a healthy sensor is vertical before or after one of the rotations.
     """
@@ -574,7 +575,8 @@ class CoilsFound:
 
     Attributes:
         response, expected: measured and expected field of each command (n, 3), T/A, in body axes.
-        serves: index (n,) of the configured coil that each command drives, or -1 without a field.
+        serves: index (n,) of the configured coil that each command drives, or -1 if the command produces no
+            magnetic field.
         strength: field of each command (n,) relative to that of the coil that it drives; negative if
             reversed.
         misfit: angle (n,), rad, between the axes of measured and expected field, from 0 to pi / 2.
@@ -609,8 +611,8 @@ def diagnose_coils(
 ) -> CoilsFound:
     """Return the faults of the coils, given the expected field (n, 3), T/A, of each coil in body axes.
 
-    The matrix `magnetometer` (3, 3) maps body axes to measured axes; its sign may be wrong. If the field
-    strength per ampere is not known (`size_known`), the median of the coils is expected.
+    The matrix `magnetometer` (3, 3) maps body axes to measured axes; its sign may be wrong. If `size_known`
+    is false, the field strength per ampere is not known, and the coils' median is the expected strength.
     """
     axes = np.eye(3) if magnetometer is None else magnetometer
     plus, minus = test.plus @ axes, test.minus @ axes  # rows in body axes
@@ -638,7 +640,7 @@ def diagnose_coils(
 
 
 def _usual_size(response: FloatArray, expected: FloatArray) -> float:
-    """Return the median field (T/A) of the commands (n, 3) whose field has an expected direction."""
+    """Return the median strength (T/A) of those fields (n, 3) that are along the expected field of a coil."""
     size = np.linalg.norm(response, axis=1)
     unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     along = np.abs(response @ unit.T).max(axis=1) > math.cos(RECOGNISED) * size
@@ -762,7 +764,7 @@ def _coil_findings(
 ) -> list[Finding]:
     """Return the faults of the command to coil `j`, given its field (2,), T/A, for both current directions.
 
-    The argument `absent` is the fraction of the samples without the field.
+    The argument `absent` is the fraction of the samples in which the coil's magnetic field is missing.
     """
     part, name, k = f"coils.windings[{j}]", names[j], state.serves[j]
     if not state.live[j]:
@@ -795,7 +797,7 @@ def _coil_findings(
 
 
 def _several_coils(part: str, name: str, other: str, drawn: float) -> Finding:
-    """Return the finding about a command that drives two coils and `drawn` times the commanded current."""
+    """Return the finding about a command that drives two coils with `drawn` times the commanded current."""
     way = "in parallel, " if drawn > 1.5 else "in series, " if drawn < 0.7 else ""
     shown = "" if math.isnan(drawn) else f" with {drawn:.2f} times the commanded current"
     text = f"the command of coil {name} drives coils {name} and {other}{shown}"
@@ -804,7 +806,7 @@ def _several_coils(part: str, name: str, other: str, drawn: float) -> Finding:
 
 
 def _without_field(part: str, name: str, drawn: float) -> Finding:
-    """Return the finding about a coil without field, which draws `drawn` times the commanded current."""
+    """Return the finding about a coil that draws `drawn` times the commanded current but has no field."""
     if math.isnan(drawn):
         return Finding(
             part, "no field", f"coil {name}: its field does not change", "check wires and channels"

@@ -197,7 +197,7 @@ def _gps_stream(readings: Sequence[GpsReading], bad: float) -> list[Finding]:
 
 
 def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
-    """Return the faults that time, position and velocity of valid fixes show."""
+    """Return the faults of a GPS receiver, found from time, position and velocity of its valid fixes."""
     utc, positions = np.array([one.utc_ns for one in fixes]), np.array([one.position for one in fixes])
     if len(fixes) > 2 and (np.diff(utc) == 0).mean() > 0.5:
         text = f"its time does not advance in {len(fixes)} fixes"

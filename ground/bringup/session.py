@@ -271,8 +271,8 @@ def _voltage(monitor: PowerMonitor | None) -> float:
 def _coil_changes(config: Config, found: CoilsFound, clipped: bool, *, axes_known: bool) -> dict[str, Any]:
     """Return the changes of windings and shunt that the findings about single coils imply.
 
-    If `axes_known` is false, the field at the magnetometer is not along the coil's axis and does not change
-    it.
+    If `axes_known` is false, the axes of the coils are not changed, because a coil's field at the
+    magnetometer is not parallel to the axis of the coil.
     """
     kinds = {(one.part, one.kind): one for one in found.findings}
     windings = [

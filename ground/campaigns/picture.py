@@ -19,11 +19,12 @@ _MOST = 6
 
 
 def draw_campaign(results: Sequence[Result], file: Path) -> bool:
-    """Plot the performance measures of all flights against the randomly drawn numbers, as a PNG.
+    """Plot the performance measures of all flights against the random parameters, as a PNG.
 
-    Returns False and writes no file without performance measures or drawn numbers. At most six measures are
-    plotted against six drawn numbers. Crosses mark flights beyond the limit of a measure; infinite measures
-    are at the upper edge. Raises UsageError if matplotlib is not installed or the file cannot be written.
+    Returns False and writes no file if the results have no performance measures or no random parameters. At
+    most six measures are plotted against at most six parameters. Crosses mark flights beyond the limit of a
+    measure; infinite measures are at the upper edge. Raises UsageError if matplotlib is not installed or the
+    file cannot be written.
     """
     drawn = list(numbers_drawn(results).items())[:_MOST]
     figures = [one for one in figures_of(results).items() if np.any(np.isfinite(one[1][2]))][:_MOST]

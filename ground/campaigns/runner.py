@@ -143,7 +143,7 @@ def show(facts: dict[str, Any], as_json: bool = False) -> None:
 
 
 def _table(rows: Sequence[Result]) -> list[str]:
-    """Return the lines of a table whose head contains the keys of the rows."""
+    """Return the text lines of a table with a header, which contains the keys of all rows."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     cells = [keys, *([_cell(row.get(key)) for key in keys] for row in rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(keys))]
@@ -384,7 +384,7 @@ def _stop(crew: Sequence[_Worker]) -> None:
 
 
 def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) -> None:
-    """Run the cases that arrive through a pipe, and send result or exception of each, in a worker process."""
+    """Run the cases that a worker process receives through a pipe, and send back result or exception."""
     _end_with_the_campaign(parent)
     tempfile.tempdir = scratch
     with suppress(EOFError, OSError, KeyboardInterrupt):

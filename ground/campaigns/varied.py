@@ -104,16 +104,16 @@ def configuration_value(text: str) -> Any:
 
 
 def varied_campaign(path: Path, variations: Sequence[Variation], duration: float | None) -> Campaign:
-    """Return the campaign that flies a simulated configuration with drawn values.
+    """Return the campaign that flies a simulated configuration with random parameters.
 
-    The result of a flight contains the drawn values, and the performance measures with a limit. The limits
-    are those of the section `requirements` for a satellite, and those of the thesis for a testbed. Case k
-    does not depend on the number of runs. Raises UsageError for a key or a distribution that the
+    The result of a flight contains its random parameters and those performance measures that have a limit.
+    The limits are those of the section `requirements` for a satellite, and those of the thesis for a testbed.
+    Case k does not depend on the number of runs. Raises UsageError for a key or a distribution that the
     configuration does not allow.
 
     Args:
         path: file of the configuration.
-        variations: values to draw.
+        variations: parameters that are drawn at random for each flight.
         duration: duration of each flight, s, or None for the configured duration.
     """
     text = read_text(path)
@@ -136,7 +136,7 @@ def varied_campaign(path: Path, variations: Sequence[Variation], duration: float
 def _case(
     base: dict[str, Any], variations: Sequence[Variation], duration: float | None, seed: tuple[int, int]
 ) -> Case:
-    """Return the case of a seed, with the complete configuration as text and the drawn values by key."""
+    """Return the case of a seed, with the complete configuration as text and its random values by key."""
     chance = np.random.default_rng(seed)
     refusal = ""
     for _ in range(_DRAWS):
@@ -172,7 +172,7 @@ def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, 
         holder = _below(holder, step, one, steps[: depth + 1])
     last = steps[-1]
     if isinstance(holder, dict) and last not in holder and not one.relative:
-        # The drawn number replaces a default value that the configuration does not state.
+        # The random value replaces a default value that the configuration does not state.
         return [(holder, last, one.key)]
     found = _below(holder, last, one, steps)
     if not one.relative and not isinstance(found, list):
@@ -210,7 +210,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) -> dict[str, Any]:
-    """Replace the configured numbers of a variation by drawn numbers, and return the latter by full key."""
+    """Replace the configured numbers of a variation by random values, and return these values by full key."""
     drawn = {}
     for holder, at, key in _numbers_at(values, one):
         held = holder[at] if isinstance(holder, list) or at in holder else math.nan
@@ -219,7 +219,7 @@ def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) 
 
 
 def fly_case(case: Case) -> Result:
-    """Fly a case in lock-step, and return its drawn values and the performance measures with a limit."""
+    """Fly a case in lock-step, and return its random parameters and its limited performance measures."""
     given = case.parameters
     found: Result = {
         "key": case.key,
@@ -269,7 +269,7 @@ def figures_of(results: Sequence[Result]) -> dict[str, tuple[float, str, list[fl
 
 
 def numbers_drawn(results: Sequence[Result]) -> dict[str, list[float]]:
-    """Return the drawn numbers of all flights by key; drawn texts are omitted."""
+    """Return the random numbers of all flights by key; parameters whose values are texts are omitted."""
     keys = [key for key, value in results[0]["drawn"].items() if _is_number(value)]
     return {key: [float(result["drawn"][key]) for result in results] for key in keys}
 
@@ -311,7 +311,7 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
-    """Return median, 95 % quantile and maximum of the finite values, or None for all three without any."""
+    """Return median, 95 % quantile and maximum of the finite values; each is None if no value is finite."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return dict.fromkeys(("median", "95 %", "maximum"))
@@ -323,7 +323,7 @@ def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
 
 
 def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
-    """Return the key of the drawn number that correlates most with a measure, and the rank correlation."""
+    """Return the key of the random parameter that correlates most with `values`, and the rank correlation."""
     known = np.isfinite(values)
     ranks = np.argsort(np.argsort(np.array(values)[known]))
     best = ("", 0.0)

@@ -1,4 +1,4 @@
-"""Table of the ground commands, which `knightcube` finds by an entry point."""
+"""Table of the ground commands. The program `knightcube` finds this table by an entry point."""
 
 COMMANDS = {
     "command": ("operate", "send a command to a flight", "satellite:configure_command"),

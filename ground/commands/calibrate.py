@@ -185,7 +185,7 @@ def _field_of_view(lens: DeterminedLens) -> float:
 
 
 def _camera_section(terms: DeterminedLens) -> str:
-    """Return the section `camera`, which `--camera` and configurations read."""
+    """Return the text of the section `camera` for a configuration or for a file of the option `--camera`."""
     lens, omitted = terms.calibration.lens, terms.omitted
     assumed = "      # the image centre: the stars do not determine it" if "centre" in omitted else ""
     lines = [

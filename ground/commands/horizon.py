@@ -342,7 +342,7 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
 def _graphic(
     turned: float, camera: CameraModel, first: ScannedHorizon, second: ScannedHorizon, altitude: float
 ) -> FloatArray:
-    """Return nadir (3,) in the axes of the first camera by the graphic method."""
+    """Return nadir (3,) in axes of the first of two cameras (Graphic Method, `graphic_nadir`)."""
     angle, axis = math.radians(turned), camera.ideal.centre
     cameras = (
         LevelCamera(np.array([0.0, 1.0]), axis),

@@ -208,7 +208,8 @@ class Replay:
     """Replay of recorded packets as files, which the Yamcs data link `recorded` reads.
 
     Yamcs reads and deletes a file as soon as it appears. A file is therefore written under another name and
-    then renamed, and the next file follows after its deletion, so that Yamcs reads the packets in order.
+    then renamed. The next file is written after Yamcs has deleted the previous file, so that Yamcs reads the
+    packets in order.
     """
 
     def __init__(self, packets: Sequence[bytes], folder: Path, speed: float | None, begun: float) -> None:

@@ -179,8 +179,8 @@ class Answers:
     def ask(self) -> None:
         """Ask for the values that the user has not given as options.
 
-        If the questions end early, the command with the answers so far is shown. Raises KeyboardInterrupt
-        after Ctrl-C, and UsageError at the end of the input.
+        Raises KeyboardInterrupt after Ctrl-C, and UsageError at the end of the input. In both cases, a
+        command with the answers so far is shown.
         """
         try:
             for question in self._open():
@@ -213,7 +213,7 @@ class Answers:
                 sys.stderr.write(f"  {error}\n")
 
     def _take(self, question: Question, texts: list[str]) -> None:
-        """Read a value from its texts, and store it. Raises UsageError for an impossible value."""
+        """Read the value of a question from the answer's words, and store it. Raises UsageError."""
         name = question.name
         if name == "eccentricity" and name in self.values:
             raise UsageError(f"--{name} {texts[-1]}: --altitude has perigee and apogee: omit this option")
@@ -245,7 +245,7 @@ def _interruptible() -> Iterator[None]:
 
 
 def satellite_of(values: Values) -> Satellite:
-    """Return the satellite that complete values describe. Raises UsageError."""
+    """Return the satellite that the values describe; no value may be missing. Raises UsageError."""
     altitude, eccentricity = 1e3 * values["altitude"], values["eccentricity"]
     inclination = values["inclination"]
     if inclination is None:

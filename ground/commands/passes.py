@@ -27,7 +27,7 @@ _LONGEST_DAYS = 30.0
 _UNCERTAIN_S = 10.0
 """Standard deviation of the predicted times (s) above which a warning is printed."""
 _LEAD_S = 120.0
-"""Default time (s) for the slew, from the command to point to the station until the rise."""
+"""Default time (s) before the satellite's rise at which it is commanded to slew to the station."""
 
 
 def configure_passes(parser: argparse.ArgumentParser) -> None:

@@ -166,7 +166,7 @@ def _text(made: StepPlan, plant: SingleAxisPlant, solved_s: float) -> str:
 
 
 def _q2(option: str, text: str) -> float:
-    """Return the quaternion component q2 in a text. Raises UsageError for a value out of range."""
+    """Read a value of the quaternion component q2 from a text. Raises UsageError for a value out of range."""
     try:
         value = finite(text)
     except argparse.ArgumentTypeError as error:

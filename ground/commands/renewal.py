@@ -1,4 +1,4 @@
-"""Command `knightcube renewal`: keys, signatures and commands of a renewal in orbit (docs/fly/renewal.md)."""
+"""Command `knightcube renewal`: keys, signatures and commands for updates in orbit (docs/fly/renewal.md)."""
 
 from __future__ import annotations
 
@@ -196,7 +196,7 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
 
 
 def _command(options: argparse.Namespace) -> int:
-    """Send a directive about a renewal, and print each stage of its execution."""
+    """Send a command to activate, confirm or withdraw an update, and print each stage of its execution."""
     kind = KINDS.index(options.kind)
     directive: Directive
     if options.what == "activate":

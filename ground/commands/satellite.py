@@ -177,11 +177,12 @@ def _add_commands(words: _Words, packets: Sequence[Packet] = COMMANDS) -> None:
 
 
 def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
-    """Return the options, including those after the scheduled command, which becomes one line of text.
+    """Return the options of a command to schedule another command, with the latter as one line of text.
 
-    A table of parameters cannot be scheduled, because it is too long for a scheduled command.
+    Options that the user entered after the scheduled command are included. A table of parameters cannot be
+    scheduled, because it is too long for a scheduled command.
 
-    Raises UsageError for values that the command forbids; wrong words end the program with status 2.
+    Raises UsageError for values that the command forbids. A syntax error ends the program with status 2.
     """
     parser = argparse.ArgumentParser(prog=f"{PROGRAM} command schedule UTC")
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")

@@ -14,7 +14,7 @@ from sim_hal.worlds.orbit import julian_date
 
 Vector = tuple[float, float, float]
 Values = Mapping[str, Any]
-"""Values of the answered questions by the name of the option."""
+"""Answers to the questions about a satellite, by the name of the option that gives the same value."""
 
 COIL_EXAMPLE = "axis=xyz,dipole=0.2,current=0.1,resistance=40"
 _FORMS = {
@@ -89,7 +89,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
 
 
 def _coil_number(key: str, text: str) -> float:
-    """Return a number that describes a coil from its text. Raises ValueError with the permitted range."""
+    """Convert the text of a coil property to a number. Raises ValueError with the permitted range."""
     try:
         return number(*_COIL_RANGES[key])(text)
     except ValueError as error:
@@ -99,7 +99,7 @@ def _coil_number(key: str, text: str) -> float:
 def read_coils(text: str) -> list[Coil]:
     """Return the equal coils that a text such as `axis=xy,dipole=0.2,current=0.1,resistance=40` describes.
 
-    Raises ValueError with the problem and the cure.
+    Raises ValueError with the problem and the remedy.
     """
     given: dict[str, str] = {}
     for part in text.split(","):
@@ -259,7 +259,7 @@ QUESTIONS = (
 
 
 def read_value(name: str, text: str) -> Any:
-    """Return the value of a text for the question `name`. Raises UsageError with the permitted values."""
+    """Convert an answer to the question `name` to its value. Raises UsageError with the permitted values."""
     (question,) = (one for one in QUESTIONS if one.name == name)
     try:
         return question.read(text)
@@ -297,7 +297,7 @@ def _density_problem(mass: float, size: Vector) -> str:
 
 
 def _perigee_problem(altitude: float, eccentricity: float) -> str:
-    """Return a text that states why an orbit is too low, with the cure, or an empty text."""
+    """Return a text that states why an orbit is too low and how to correct it, or an empty text."""
     axis = 1e-3 * EARTH_RADIUS + altitude
     perigee = axis * (1.0 - eccentricity) - 1e-3 * EARTH_RADIUS
     if perigee >= _LOWEST_PERIGEE:

@@ -408,7 +408,7 @@ def _stations(options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _listening(port: int) -> socket.socket:
-    """Return a socket that listens on loopback. Raises UsageError for an invalid or used port."""
+    """Return a socket that listens on loopback. Raises UsageError if the port is invalid or in use."""
     if not 0 <= port < 65536:
         raise UsageError(f"--port {port}: must be 0 to 65535")
     line = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
