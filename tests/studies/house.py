@@ -2,8 +2,8 @@
 
 Command: `python -m tests.studies.house [--touched]`. Import-linter checks layers and cycles (pyproject.toml).
 
-With `--touched` the program flies and solves an image. It counts the product files that one control cycle,
-the opening of a flight and a star fix enter. A file counts if one of its functions is called; the execution
+With `--touched` the program runs a flight and computes the attitude of an image. It counts the product files
+whose functions are called in one control cycle, at the opening of a flight, and in a star fix. The execution
 of a module or of a class body does not count. The flight is the step demonstration in lock-step. Files of
 `sim_hal` and files that `sim_hal` calls do not count, because they emulate the hardware. A job that the
 lock-step runner runs in the calling thread belongs to a worker and does not count either.
@@ -45,7 +45,7 @@ MOST_LINES = {"file": 900, "class": 350, "function": 50}
 MOST_LONG_FUNCTIONS = 20
 _REASON = re.compile(r"\blines\b", re.IGNORECASE)
 LIMITS = {"control cycle": 30, "opening of a flight": 45, "star fix": 20}
-"""Largest number of files that each activity may enter."""
+"""Largest number of files whose functions each activity may call."""
 _FIRST, _LAST = 400, 440
 """First and last control cycle of the measurement: one second of steady flight, after the first plan."""
 
@@ -97,7 +97,7 @@ def _definitions(node: ast.AST, place: str) -> Iterator[Piece]:
 
 
 class Touched:
-    """Recorder of the product's files that a measured block enters, relative to `ROOT`."""
+    """Recorder of the product's files whose functions a measured block calls, relative to `ROOT`."""
 
     def __init__(self) -> None:
         self.files: set[str] = set()
@@ -119,7 +119,7 @@ class Touched:
 
     @contextmanager
     def measured(self) -> Iterator[None]:
-        """Record the files that the block enters."""
+        """Record the files whose functions the block calls."""
         self._outside = 0
         sys.setprofile(self._profile)
         try:
@@ -129,9 +129,10 @@ class Touched:
 
 
 def of_flight() -> dict[str, set[str]]:
-    """Return the files entered by opening a flight, from request to first cycle, and by a control cycle.
+    """Return the files whose functions are called at the opening of a flight and in a control cycle.
 
-    The control cycle is the one that enters the most files in a second of flight.
+    The opening lasts from the request to the first cycle. The control cycle is the one with the most files in
+    a second of flight.
     """
     opening, cycles = Touched(), [Touched()]
     fly, run = FlightLoop.run, ControlCycle.run
@@ -160,7 +161,7 @@ def of_flight() -> dict[str, set[str]]:
 
 
 def of_star_fix() -> dict[str, set[str]]:
-    """Return the files entered from an image of stars at rest to its attitude."""
+    """Return the files whose functions are called to compute the attitude of an image of stars at rest."""
     camera = StarCameraModel(field_of_view=np.radians(12.0))
     scene = exposed(camera, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), 0.2, np.random.default_rng(1))
     touched, tracker = Touched(), StarTracker(fov_deg=12.0)
@@ -171,7 +172,7 @@ def of_star_fix() -> dict[str, set[str]]:
 
 
 def measure() -> dict[str, set[str]]:
-    """Return the files that each activity of `LIMITS` enters."""
+    """Return the files whose functions each activity of `LIMITS` calls."""
     return of_flight() | of_star_fix()
 
 

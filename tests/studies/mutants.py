@@ -310,7 +310,8 @@ def mirrored_tests(root: Path, path: str) -> list[str]:
     """Return the test files that may find a fault of a module.
 
     The mirrored file comes first, then the other files of the mirrored folder, beginning with those that
-    import the module. A folder without a mirror is represented by its nearest parent that has one.
+    import the module. If `tests` has no folder with the same path, the mirrored folder is that of the nearest
+    parent.
     """
     module = Path(path)
     mirror = root / "tests" / module.parent

@@ -268,7 +268,8 @@ def indicators(ends: FloatArray, rate: FloatArray, pinhole: Pinhole) -> list[tup
     """Return the thesis's three indicators (n,) of streaks (n, 2, 2), as plotted in its Fig. 4.2 to 4.4.
 
     `rate` is the rate of the stars (rad/s) over `EXPOSURE`. The end points of each streak are ordered in the
-    direction of a star's motion. Slopes are those of the chords, with the curvature of the projection.
+    direction of a star's motion. A slope is that of the straight line between the two ends in the image, not
+    corrected for the projection.
     """
     vectors = pinhole.unit_vectors(ends)
     expected = star_ends(vectors, rate * EXPOSURE)

@@ -5,8 +5,8 @@ overshoot by at most 1 %, on a thread of 1e-5 N m/rad, which the controllers do 
 has four free gains (angle, integral, rate, target weight). The adaptive controller has three (bandwidth,
 adaptation, reference bandwidth). The search uses the method of Nelder and Mead from several starts. It
 simulates body and controller only, without noise, with the loop's delay of one cycle.
-`tests.studies.campaigns controllers` flies the resulting gains in the whole loop. The limits leave a margin
-for noise. `--settling`, `--overshoot` and `--stiffness` change limits and thread.
+`tests.studies.campaigns controllers` tests the resulting gains in simulated flights of the whole loop. The
+limits leave a margin for noise. `--settling`, `--overshoot` and `--stiffness` change limits and thread.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests that no text contains a refused phrase (`REFUSED`), which readers cannot understand easily."""
+"""Tests that no text contains a forbidden phrase (`REFUSED`), which readers cannot understand easily."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ REFUSED = {
     r"\bto be had\b": "available",
     r"\bthe ones that\b": "the noun, repeated",
 }
-"""Patterns of inversions, hearsay words and idioms, each with what plain English says."""
+"""Patterns of inversions, idioms and homely words, each with a plain English replacement."""
 
 ANY = re.compile("|".join(REFUSED))
 BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"\b") for pattern in REFUSED))
@@ -68,7 +68,7 @@ def texts_of_python(source: str) -> str:
 
 
 def refused_phrases(text: str) -> list[tuple[int, str, str]]:
-    """Return the refused phrases, also across lines: line number, phrase and plain English."""
+    """Return the forbidden phrases, also across lines: line number, phrase and plain English."""
     words = [
         (number, word)
         for number, line in enumerate(text.splitlines(), 1)
@@ -83,7 +83,10 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
 
 
 def may_have_any(text: str) -> bool:
-    """Return whether a text may have a refused phrase, with code counted as text; most files have none."""
+    """Return whether a text possibly contains a forbidden phrase; most files do not.
+
+    Code is searched too, so a true result needs a second, exact search.
+    """
     flat = " ".join(text.lower().translate(GAPS).split())
     return bool(BEGINS.search(flat) and ANY.search(flat))
 

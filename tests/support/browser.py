@@ -90,7 +90,7 @@ class Page:
 
 
 def missing() -> str:
-    """Return the names of missing packages that the browser tests need, or an empty text."""
+    """Return which package the browser tests need and is missing, or an empty string."""
     try:
         import playwright.sync_api  # noqa: F401, PLC0415 - an extra of the tests
     except ModuleNotFoundError:

@@ -1,4 +1,4 @@
-"""Comparison of the numpy, loop and compiled forms of a function."""
+"""Comparison of the implementations of a function with numpy, with loops, and compiled by numba."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _square(value: float) -> float:
 
 @compiled_form_of(sum_of_squares_numpy)
 def sum_of_squares(values: FloatArray) -> float:
-    """Return the sum of the squares of values, as a minimal function with a numpy and a compiled form."""
+    """Return the sum of the squares of values; the function is a minimal example of a compiled function."""
     total = 0.0
     for value in values:
         total += _square(value)
@@ -34,11 +34,13 @@ def sum_of_squares(values: FloatArray) -> float:
 def assert_forms_agree(
     hot: HotFunction[Any, Any], *args: Any, relative: float = 1e-9, interpreted: bool = True
 ) -> None:
-    """Call all forms of a function with copies of the arguments; compare results and changed arguments.
+    """Call all implementations of a function with copies of the arguments, and compare the results.
+
+    Arguments that the function changes are compared too.
 
     Array values must agree within `relative` times the value or the array's largest value. With `interpreted`
-    the loop form is also called without compilation, because Python checks every index and the compiled form
-    does not.
+    the implementation with loops is also called without compilation, because Python checks every index and
+    compiled code does not.
     """
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     forms = [hot.numpy_form, hot.compiled_form(), *([hot.loop_form] if interpreted else [])]
@@ -53,7 +55,7 @@ def assert_forms_agree(
 
 
 def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:
-    """Return the results of a form, followed by its array arguments after the call."""
+    """Return the results of one implementation, followed by its array arguments after the call."""
     own = copy.deepcopy(args)
     result = form(*own)
     results = list(result) if isinstance(result, tuple) else [] if result is None else [result]

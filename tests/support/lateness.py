@@ -55,9 +55,9 @@ def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
 def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
     """Return the slots that are late because the host took the processor (stolen time).
 
-    In these slots twice the stolen time is at least the period and at least the lateness. A slot lasts from
-    the due time of its predecessor to the first sample after the slot was served. `stolen_ns` is the stolen
-    time of all cores since boot, sampled at `noted_ns`.
+    The stolen time of such a slot is at least half the period and at least half the lateness. A slot lasts
+    from the due time of its predecessor to the first sample after the slot was served. `stolen_ns` is the
+    stolen time of all cores since boot, sampled at `noted_ns`.
     """
     due_ns = (loop.first + np.arange(len(loop.lateness))) * loop.period_ns
     late_ns = 1e9 * np.minimum(loop.lateness, 60.0)

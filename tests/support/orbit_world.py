@@ -56,7 +56,7 @@ OPTICAL_SIGMA = np.radians(0.02)
 LEAST_LIMB = 30
 """Smallest number of lit limb points in one camera's field for a nadir reading: 30 of 720, or 15 deg."""
 _COARSE = 20
-"""Number of time steps between checks of the fields of view, which are 10 s apart."""
+"""Number of time steps (together 10 s) between two checks of the fields of view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

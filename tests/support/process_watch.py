@@ -1,8 +1,9 @@
 """Samples of the processor time and memory of running processes, read from /proc.
 
 The proportional set (PSS) divides each page among the processes that map it, so a sum over processes counts
-no page twice (proc_pid_smaps(5)). Unwatched processes that map a page also count in its division. `unshared`
-computes the memory that the watched processes would hold if no other process shared it.
+no page twice (proc_pid_smaps(5)). A page that unwatched processes map too is divided among all of them, so
+the sum is smaller. `unshared` computes the memory that the watched processes would hold if no other process
+shared it.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def below(parent: int) -> list[int]:
 
 
 def command(process: int) -> str:
-    """Return a process's command line, or an empty text for a process that has just ended."""
+    """Return a process's command line, or an empty string for a process that has just ended."""
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
     except (FileNotFoundError, ProcessLookupError):
@@ -160,6 +161,6 @@ def _turns(process: int) -> tuple[float, float]:
 
 
 def _proportional(process: int) -> dict[str, float]:
-    """Return the proportional set and the sizes of its parts, in bytes."""
+    """Return the proportional set size (PSS) of a process and of its parts, in bytes."""
     lines = [line.split() for line in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()]
     return {words[0]: float(words[1]) * 1024.0 for words in lines if words[0].startswith("Pss")}

@@ -226,7 +226,10 @@ FLIGHTS: dict[str, Callable[[], tuple[Config, Simulation | None]]] = {
         ),
     ),
 }
-"""Flights by name, with their world; None is that of the demonstration."""
+"""Functions that return the configuration and the world of a flight, by the name of the flight.
+
+The world None means that of the demonstration.
+"""
 
 
 def flown(name: str, folder: Path) -> Run:

@@ -26,15 +26,15 @@ from knightcube.compiled import in_use
 TOLERANCE = 1e-5
 """Largest relative difference from the record, which rounding in another order may cause."""
 COMPILED_TOLERANCE = 1e-2
-"""Largest relative difference from the record with compiled forms.
+"""Largest relative difference from the record if compiled functions are used.
 
-Their rounding may change when an iteration stops.
+The rounding of compiled functions differs, which may change the step at which an iteration stops.
 
 The largest difference found, of a covariance or a faint star, is 0.7 % (5 of 68 cases of
 `tests/knightcube/vision`, 2026-11-27).
 """
 ANSWERS = ("rate", "quaternion")
-"""Names of the values for which `TOLERANCE` also applies with compiled forms."""
+"""Names of the values for which `TOLERANCE` also applies if compiled functions are used."""
 COMPILED = in_use()
 ZERO = 1e-15
 CURE = "if the change is intended, set KNIGHTCUBE_RECORD=1 and run the test to write the record again"
@@ -122,8 +122,8 @@ def differences(record: Any, found: Any, tolerance: float, place: str = "", zero
 def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zero: float = ZERO) -> None:
     """Fail unless a result agrees with its record, a file beside the test module.
 
-    Numbers agree if they differ by at most the fraction `tolerance`, or by `zero`. With compiled forms, all
-    except the `ANSWERS` have the tolerance `COMPILED_TOLERANCE`.
+    Numbers agree if they differ by at most the fraction `tolerance`, or by `zero`. If compiled functions are
+    used, the fraction is `COMPILED_TOLERANCE` for all values except the `ANSWERS`.
     """
     path = Path(module).with_name("recorded_results.json")
     records: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -137,7 +137,10 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
 
 
 def unlike(record: Any, found: Any, tolerance: float, zero: float, compiled: bool) -> list[str]:
-    """Return the key paths at which the results of the numpy or compiled forms differ from their record."""
+    """Return the key paths at which results differ from their record.
+
+    If `compiled` is true, compiled functions were used, which have a larger tolerance.
+    """
     lines = differences(record, found, tolerance, zero=zero)
     if not compiled:
         return lines

@@ -101,7 +101,7 @@ class RandomSlew:
 
     @classmethod
     def drawn(cls, seed: int, run: int) -> RandomSlew:
-        """Return motion number `run` of a campaign, which is the same for any number of motions."""
+        """Return motion number `run` of a campaign, which does not depend on the number of motions."""
         draw = np.random.default_rng((seed, run, 0))
         theta = float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi)))
         percent = float(100.0 * draw.uniform(0.0, MOST_TURN))

@@ -144,10 +144,13 @@ def _images(
     electrons: float,
     shape: tuple[int, int] | None,
 ) -> FloatArray:
-    """Return derivatives (k + 3, pixels) of the signal by k path parameters, sigma, electrons and background.
+    """Return derivatives (k + 3, pixels) of the signal with respect to k path parameters and three others.
+
+    The others are sigma, electrons and background.
 
     The row of `electrons`, multiplied by `electrons`, is the signal itself. Each of the `points` (m, 2) has a
-    fraction `weight` (m,) of the signal; `change` (m, 2, k) are the points' derivatives by the parameters.
+    fraction `weight` (m,) of the signal; `change` (m, 2, k) are the derivatives of the points with respect to
+    the path parameters.
     """
     reach = math.ceil(_REACH_SIGMAS * sigma) + 1
     low, high = np.floor(points.min(axis=0)).astype(int), np.ceil(points.max(axis=0)).astype(int)

@@ -72,7 +72,7 @@ def test_worlds_differ_and_stay_within_their_bounds() -> None:
 
 @pytest.mark.slow
 def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
-    """Fly world 1 of seed 1 under this project's loop."""
+    """The loop of this project is simulated in world 1 of seed 1."""
     result = robust_controllers.run(Case("this loop/1", (1, 1), {"controller": "this loop"}))
     assert not result["lost"]
     assert result["settling_s"] < 12.0

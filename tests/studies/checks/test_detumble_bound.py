@@ -28,7 +28,11 @@ def test_along_a_field_that_stands_no_time_suffices() -> None:
 
 
 def test_what_lies_along_a_field_that_turns_waits_for_the_turn() -> None:
-    """Torques across the field cancel, so a direction half of the rotation ahead has the larger bound."""
+    """The field rotates in a plane, and the momentum is along the initial field.
+
+    Of all directions, the one that is ahead of the momentum by half of the field's rotation gives the largest
+    bound.
+    """
     speed = 2.2e-3
     turning = STRENGTH * np.stack([np.sin(speed * MIDDLES), 0.0 * MIDDLES, np.cos(speed * MIDDLES)], axis=1)
     own = np.arccos(1.0 - 1e-4 * speed / (REACH * STRENGTH)) / speed

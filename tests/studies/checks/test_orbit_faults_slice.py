@@ -28,7 +28,7 @@ from tests.support.flights import fly
 from tests.support.packed_run import WritablePackets
 
 BRIEF, LAST = 34.0, 6.0
-"""Durations (s) of a flight, and of its end in which the body must fulfil the purpose of its mode again."""
+"""Durations (s) of a flight, and of its end in which the body must meet the requirements of its mode."""
 AT, SPAN = 12.0, 10.0
 
 

@@ -54,7 +54,7 @@ def test_the_shares_are_the_paper_s(seen: list[Result]) -> None:
 def test_uw_sees_the_sun_for_74_percent_of_sunlight_in_the_right_heading(seen: list[Result]) -> None:
     """Section 4.2 of the paper states neither heading nor date.
 
-    Two cameras on the Sun's side and a low Sun give its value.
+    The paper's value of 74 % results with two cameras on the Sun's side and a low Sun.
     """
     tables = {result["beta"]: result["shares"] for result in seen if result["kind"] == "heading"}
     assert tables[15.0][coverage.BEST]["cone"] == pytest.approx(0.74, abs=0.03)
@@ -83,7 +83,7 @@ def test_the_limb_by_day_is_the_half_that_the_sun_shines_on() -> None:
 
 
 def test_the_true_body_sways_as_it_is_said_to() -> None:
-    """Over five hours the motion is 3 deg rms per axis to a third, and the rates agree with the attitudes."""
+    """Over five hours, the rms of the attitude motion about each axis is 3 deg to within a third."""
     rng = np.random.default_rng(SEED)
     frame = np.broadcast_to(np.eye(3), (36_000, 3, 3))
     attitudes = orbit_world._sway(frame, rng)

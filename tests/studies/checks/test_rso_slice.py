@@ -52,7 +52,7 @@ def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -
 def test_fewer_stars_are_the_brightest_and_table_4_4_counts_them_apart() -> None:
     """In the first frame with only the 7,000 brightest stars, every rule selects the object alone."""
     stars = catalogue(faintest(BRIGHTEST))[0]
-    # Magnitudes have two decimals, so several stars share the last magnitude.
+    # Magnitudes have two decimals, so several stars have the magnitude of the faintest star.
     assert BRIGHTEST <= len(stars.magnitude) < 1.02 * BRIGHTEST
     assert stars.magnitude.max() < 6.5
     tables = [case for case in RSO_ORBITS.cases(1, SEED) if case.parameters["stars"] == BRIGHTEST]

@@ -1,4 +1,4 @@
-"""`python -m tests.studies.console`: opens the console's page in Chromium and measures its requirements.
+"""`python -m tests.studies.console`: checks in Chromium that the console's page meets its requirements.
 
 The study measures by how much the page lags behind the log, and the memory and processor time of the server
 beside a 40 Hz flight. It checks that a replayed instant shows the same as live, that the browser reports no
@@ -120,7 +120,7 @@ def measure(
 
 
 def _filed(page: Page, place: Path) -> str:
-    """Upload, list and download a file through the page; return the error, or an empty text."""
+    """Upload, list and download a file through the page; return the error, or an empty string."""
     sent, got = place / "tle.txt", place / "got.txt"
     sent.write_bytes(bytes(range(256)) * 40)
     page.page.evaluate("document.getElementById('files').open = true")

@@ -239,7 +239,7 @@ def _columns(layout: Layout, rows: PacketArray) -> dict[str, list[Any]]:
 
 
 def raw_of(value: dict[str, Any]) -> Any:
-    """Return the number or text of a value in Yamcs's JSON, which has large numbers and NaN as texts."""
+    """Return the number or string of a value in Yamcs's JSON, where large numbers and NaN are strings."""
     kind = str(value["type"])
     if kind == "STRING":
         return value.get("stringValue", "")

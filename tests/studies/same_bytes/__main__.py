@@ -55,7 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: bool) -> list[Verdict]:
-    """Perform the runs that the cache lacks, two at a time, and compare; store this side's results in `keep`.
+    """Perform the runs that the cache lacks, two at a time, and compare.
+
+    The results of this checkout are stored in `keep`.
 
     Raises CheckoutError if REV's side fails, and ValueError for a wrong table of renamed texts.
     """

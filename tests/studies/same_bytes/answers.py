@@ -48,7 +48,7 @@ class Answers:
 
     @property
     def key(self) -> object:
-        """Text of everything on which the results depend, besides revision and machine."""
+        """List of all values on which the results depend, apart from revision and machine."""
         return [_ASK, self.commands]
 
 
@@ -126,7 +126,8 @@ GROUPS: tuple[Answers, ...] = (
             "horizon pictures/stars.png --fov 15 --altitude 515",
         ),
     ),
-    # One-axis planner: extended duration, with rates, minimum supply energy, time cost, out of range.
+    # One-axis planner: a duration that is extended, non-zero rates at the ends, minimum supply energy, a cost
+    # of time, the thesis's configuration, and an angle out of range.
     Answers(
         "plan",
         (

@@ -233,9 +233,9 @@ def _kinds(fields: Iterable[Field]) -> list[tuple[str, str, int]]:
 
 
 def _core(packet: bytes, layout: Layout, longer: bool) -> bytes:
-    """Return a packet without checksum and labels.
+    """Return a packet without checksum and with zeros as labels.
 
-    If `longer`, also without length, version and new fields.
+    If `longer`, the packet has new fields at its end. They are omitted, and length and version are zeros too.
     """
     raw = bytearray(packet[: layout.length - CRC_BYTES])
     for label in LABELS.get(layout.packet.name, ()):

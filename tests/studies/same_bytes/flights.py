@@ -56,7 +56,7 @@ class Flight:
 
     @property
     def key(self) -> object:
-        """Text of everything on which the flight depends, besides revision and machine."""
+        """List of all values on which the flight depends, apart from revision and machine."""
         return [_DUMP_TABLE, self.config, self.options, self.changes, Answers(self.name, self.questions).key]
 
 
