@@ -14,7 +14,7 @@ flipped bit on the disk can turn 1.05e-3 into 1.05e-7, which validation would no
 checksum is used unchecked, unless an accepted configuration is stored, which shows that a checksum has
 existed. A service stores the three newest accepted and flown configurations in its state folder. Each stored
 configuration is one file, created by a single rename, whose name contains a number and the SHA-256 checksum,
-so that there is never a configuration without its checksum.
+so that no configuration can be stored without its checksum.
 
 The signals that end a flight are SIGINT (Ctrl-C), SIGTERM, and SIGHUP when a terminal closes.
 
@@ -30,7 +30,7 @@ the coil driver runs. With the first heartbeat, READY is reported to the service
 are open and the loop runs.
 
 When large memory blocks are freed, glibc raises its threshold for mapping blocks separately (mallopt(3)).
-Frames are then allocated on the heap, where small blocks cause fragmentation, so that the heap grows. Fixed
+Frames are then allocated on the heap, where small blocks cause fragmentation, and the heap grows. Fixed
 thresholds prevent the growth of the heap; a C library other than glibc ignores them.
 """
 

@@ -586,7 +586,7 @@ class DatagramChannel:
             name: name of the channel.
             bound: bound datagram socket, which the channel closes.
             path: file of a UNIX socket, removed when the channel closes, or None for a UDP socket.
-            peers: networks of the accepted senders, None to accept all senders.
+            peers: networks of the accepted senders, or None to accept all senders.
         """
         self.name = name
         self._socket = bound
@@ -705,7 +705,7 @@ def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> Datagr
 
 
 def _identity(path: Path | None) -> tuple[int, int] | None:
-    """Return the device and inode of a file, None if it does not exist."""
+    """Return the device and inode of a file, or None if it does not exist."""
     try:
         found = os.lstat(path) if path is not None else None
     except OSError:

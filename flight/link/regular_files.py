@@ -19,7 +19,7 @@ from knightcube.errors import UsageError
 
 
 def read_regular(path: Path, most: int) -> bytes | None:
-    """Return the content of a file of at most `most` bytes, None if the file does not exist.
+    """Return the content of a file of at most `most` bytes, or None if the file does not exist.
 
     The file's type and size are checked before reading. Raises OSError for a file longer than `most` bytes
     and for a path that is not a regular file.

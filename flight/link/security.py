@@ -94,7 +94,7 @@ def counter_of(protected: bytes) -> int:
 def unprotect(
     cipher: AESGCM, header: bytes, mask: bytes, protected: bytes, encrypted: bool = True
 ) -> bytes | None:
-    """Return the data of a protected frame, None if the MAC is wrong."""
+    """Return the data of a protected frame, or None if the MAC is wrong."""
     index, iv = protected[:SPI_BYTES], protected[SPI_BYTES:SECURITY_HEADER_BYTES]
     authenticated = _authenticated(header, mask, index)
     try:
@@ -157,7 +157,7 @@ def encode(association: Association) -> bytes:
 
 
 def decode(data: bytes) -> Association | None:
-    """Return the association in a stored record, None if the record is damaged or invalid.
+    """Return the association in a stored record, or None if the record is damaged or invalid.
 
     A record with a counter above `HIGHEST_COUNTER` is invalid, because no such counter is ever used.
     """
@@ -227,7 +227,7 @@ class Vault:
             yield
 
     def read(self, name: int | str) -> Association | None:
-        """Return the newest valid copy of an association, None if both copies are missing or damaged.
+        """Return the newest valid copy of an association, or None if both copies are missing or damaged.
 
         If both copies are older than the association in the reference folder, the latter is returned. For an
         outdated primary command SPI, the result is None, because its counters could be repeated.
@@ -432,7 +432,7 @@ class Gate:
         self.admitted = 0
 
     def association(self, spi: int) -> Association | None:
-        """Return the current association of an SPI, None if both stored copies are lost."""
+        """Return the current association of an SPI, or None if both stored copies are lost."""
         return self._open[spi]
 
     def admit(self, frame: bytes) -> Admitted:

@@ -133,7 +133,7 @@ class ReadingAgreement:
     """Agreement of an inertial unit's reading with the estimate.
 
     Attributes:
-        holds: whether at least one quantity of the reading agrees, so that the estimate counts as measured.
+        holds: whether at least one quantity of the reading agrees; if so, the estimate counts as measured.
         objection: name of a quantity of the reading that contradicts the estimate; empty if all quantities
             agree.
     """
@@ -168,7 +168,7 @@ class Filter(Protocol):
 
     @property
     def doubts_commands(self) -> bool:
-        """Whether the motion of the body contradicts the commands, so that the coil currents are unknown."""
+        """Whether the motion of the body contradicts the commands, which makes the coil currents unknown."""
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
         """Record the coil currents (3,), A, in force from `time_ns` on, and whether they are known."""
@@ -464,7 +464,7 @@ class BodyControl(Protocol):
     sun_acquisition: WindowedLaw | None = None
 
     def follows_objects(self) -> bool:
-        """Return whether the body searches for an object or follows one, so that every frame is needed."""
+        """Return whether the body searches for an object or follows one, which requires every frame."""
         return False
 
     def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:

@@ -432,7 +432,7 @@ class CoilMonitor:
         if self._slow is not None and settings.slow is not None and settings.self_test is not None:
             self._self_test = SelfTest(self._slow, settings.slow.rate_noise, settings.self_test)
         self._weak = ""  # text about a coil without the expected torque
-        self._weak_ns = -_AGAIN_NS  # time (ns) of the last probes for missing torque
+        self._weak_ns = -_AGAIN_NS  # time (ns) of the last search for an axis without torque
         self._prime: int | None = None  # axis to probe first
         # Suspected fault that the motion contradicts, while another coil is probed for comparison.
         self._compared: tuple[int, CoilFault] | None = None
@@ -668,7 +668,7 @@ class CoilMonitor:
 
     @property
     def probe(self) -> FloatArray | None:
-        """Actual coil currents (n,), A, that replace all commands during a probe, or None without a probe."""
+        """Actual coil currents (n,), A, that replace all commands while an axis is probed, or None."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else None
 
     def test_wave(self, wanted: FloatArray) -> FloatArray | None:

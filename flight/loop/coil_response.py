@@ -7,10 +7,10 @@ the last bins estimates the gain of each coil, together with a constant disturba
 about each free axis. The fit accounts for the correlated noise of neighbouring differences. The gain is 1 for
 a healthy coil, 0 for a coil without torque, and -1 for a reversed coil. If the commands vary too little, the
 standard deviation of the gain is large, and no finding about the axis is made. A gain larger than
-`LARGEST_GAIN` is physically impossible and shows that the model is wrong, so that no finding about any axis
-is made.
+`LARGEST_GAIN` is physically impossible and shows that the model is wrong. In this case, no finding about any
+axis is made.
 
-The torques of the coils are normal to the field, so that their gains can hardly be separated from each other
+The torques of the coils are normal to the field, and their gains can hardly be separated from each other
 within a short time. The gain of each coil is therefore estimated under the assumption that the other coils
 are healthy. The gains of healthy coils may differ from 1 by the relative errors of the configured coil
 dipoles. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of another
@@ -20,10 +20,10 @@ While a free body tumbles, its gyroscopic acceleration is a hundred times the ac
 that an inertia error of 2 % can make healthy coils appear reversed. The fit therefore subtracts the
 gyroscopic acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
 (`knightcube.gnc.estimation.rigid_body`). The aerodynamic torque and the torque of the residual dipole change
-while the body rotates, and the commands of pointing counteract them, so that healthy coils can appear weak or
-reversed. The fit therefore admits a random walk of the disturbance, whose magnitude follows from the largest
-expected disturbance. If the coils' own field at the magnetometer is comparable with the Earth's field, the
-fit uses the field measured in the last pause of the coils, rotated with the body.
+while the body rotates, and the commands of pointing counteract them, which can make healthy coils appear weak
+or reversed. The fit therefore admits a random walk of the disturbance, whose magnitude follows from the
+largest expected disturbance. If the coils' own field at the magnetometer is comparable with the Earth's
+field, the fit uses the field measured in the last pause of the coils, rotated with the body.
 
 The residual accelerations, computed for healthy coils, are stored for a longer time. If the residual
 accelerations change together with the supply current, a coil is broken; otherwise the current monitor is
@@ -782,7 +782,7 @@ class MotionWitness:
         self.doubt, self._doubted_ns = why, now_ns
 
     def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
-        """Return whether the coil's torque has not changed, so that the current monitor must be faulty.
+        """Return whether the coil's torque has not changed, which means that the current monitor is faulty.
 
         The coil last drew the expected current at `begun_ns`, and the fault began after this time. The fault
         was suspected at `suspected_ns`, and the newest reading was made at `now_ns`.

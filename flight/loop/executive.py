@@ -63,7 +63,7 @@ class JobResult:
 
 
 class WorkerChange(Enum):
-    """State change of a worker: its process died, was restarted, or died so often that restarts pause."""
+    """State change of a worker: its process ended, was restarted, or ended so often that restarts pause."""
 
     DIED = "died"
     READY = "ready"

@@ -54,7 +54,7 @@ class NavigationSettings:
         coast_ns: longest propagation (ns) of the estimate without measurements; such an estimate is used for
             telemetry only.
         period_ns: period (ns) of the control cycle, during which a commanded current flows.
-        has_gyro: whether the unit measures the rate, so that a reading without a rate is a fault.
+        has_gyro: whether the unit measures the rate; if so, a reading without a rate is a fault.
     """
 
     max_age_ns: int
@@ -100,7 +100,7 @@ class CoilKnowledge:
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
         """Return which currents are known, from the driver's state and the time since the last call.
 
-        `suspected` states whether the supply current contradicts a healthy circuit, so that a coil may carry
+        `suspected` states whether the supply current contradicts a healthy circuit; if so, a coil may carry
         any current.
         """
         obeyed, self._obeys = self._obeys, not in_force.error

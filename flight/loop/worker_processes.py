@@ -1,16 +1,16 @@
 """Job runner for real time: a thread that starts, supervises, restarts and reaps the worker processes.
 
 The control thread and the supervising thread exchange values through queues that never wait, so that starts
-and deaths of workers do not delay the control thread. Each worker process has a socket for messages, and a
-memory file for arrays that both processes map, so that frames of several megabytes are not sent through a
-pipe. Each death of a worker is reported as `WorkerNews`.
+and unexpected exits of workers do not delay the control thread. Each worker process has a socket for
+messages, and a memory file for arrays that both processes map, so that frames of several megabytes are not
+sent through a pipe. Each unexpected exit of a worker is reported as `WorkerNews`.
 
-A worker that dies or exceeds its time limit is restarted, unless its budget of restarts is used up. The first
-restart is immediate, the second is delayed by half a second, and each later delay is twice as long as the
-previous one. The budget of restarts is reset when a worker has run for a minute. After `BUDGET` deaths in a
-row, the worker is not restarted for ten minutes. Then the worker's budget of restarts is reset, so that it
-recovers on a long flight once the cause has disappeared. A worker is therefore started at most `BUDGET` times
-in 12 minutes.
+A worker that exits or exceeds its time limit is restarted, unless its budget of restarts is used up. The
+first restart is immediate, the second is delayed by half a second, and each later delay is twice as long as
+the previous one. The budget of restarts is reset when a worker has run for a minute. After `BUDGET`
+consecutive exits, the worker is not restarted for ten minutes. Then the worker's budget of restarts is reset,
+so that it recovers on a long flight once the cause has disappeared. A worker is therefore started at most
+`BUDGET` times in 12 minutes.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Attempts:
 
     @property
     def is_spent(self) -> bool:
-        """Whether the budget of restarts is used up, so that restarts pause."""
+        """Whether the budget of restarts is used up; if so, restarts pause."""
         return self.deaths >= BUDGET
 
 
@@ -139,7 +139,7 @@ class WorkerProcess:
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
-        """Submit a job. Raises FlightError for a job that cannot be sent, and EOFError for a dead process."""
+        """Submit a job. Raises FlightError if it cannot be sent, and EOFError if the process has ended."""
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
@@ -153,7 +153,7 @@ class WorkerProcess:
     def receive(self) -> JobAnswer | None:
         """Return an answer that has arrived, or None.
 
-        Raises EOFError if the process has died, and FlightError for a damaged message.
+        Raises EOFError if the process has ended, and FlightError for a damaged message.
         """
         try:
             while chunk := self._socket.recv(1 << 16):
@@ -229,7 +229,7 @@ class _Kept:
         try:
             if self.process is None:
                 if now_ns < self._due_ns:
-                    # The job was accepted while the process was dying.
+                    # The job was accepted while the process was ending.
                     return self._lose("died", "the worker is not running", now_ns), []
                 self._begun_ns = now_ns
                 self.process = WorkerProcess(self.worker, self._cores)
@@ -335,7 +335,7 @@ class ProcessRunner:
         return results
 
     def news(self) -> list[WorkerNews]:
-        """Return the deaths and restarts of workers since the last call. Never waits."""
+        """Return the unexpected exits and restarts of workers since the last call. Never waits."""
         return [self._news.popleft() for _ in range(len(self._news))]
 
     def close(self) -> None:

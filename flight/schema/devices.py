@@ -208,8 +208,8 @@ class Coils(Section, frozen=True, kw_only=True):
 
     The list `windings` has one entry per coil. A satellite has two to six coils. If the coils lie in a plane,
     the flight application treats the axis normal to the plane like the axis of a broken coil (`slots`). A
-    dipole moment along the magnetic field, which makes no torque, is added so that the missing coil needs no
-    current. More than three coils share a dipole moment so that their total heat is minimal.
+    dipole moment along the magnetic field, which produces no torque, is added so that the missing coil needs
+    no current. More than three coils share a dipole moment so that their total heat is minimal.
     """
 
     driver: DriverName = "pca9685"

@@ -1,4 +1,4 @@
-"""The configuration sections that every body has, with the bounds of each value.
+"""The configuration sections that all bodies share, with the bounds of each value.
 
 A configuration contains the assumptions of the flight application and the wiring of its devices. The
 simulated world is described by the section `simulation`, whose type is defined in `sim_hal.settings`. Values
@@ -245,7 +245,7 @@ class Separation(Section, frozen=True, kw_only=True):
 
 
 class Config(Section, frozen=True, kw_only=True):
-    """The configuration sections of every body; the configuration of a body adds more sections.
+    """The configuration sections that all bodies share; the configuration of a body adds more sections.
 
     The value `body` names the body; a body outside this repository is named as `module:object`. Without an
     `inertial_unit`, the `magnetometer` becomes an inertial unit without a gyro.

@@ -1,4 +1,4 @@
-"""The configuration of the testbed, whose sections supplement those of every body."""
+"""The configuration of the testbed: sections in addition to those that all bodies share."""
 
 from __future__ import annotations
 

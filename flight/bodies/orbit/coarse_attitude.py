@@ -93,7 +93,7 @@ class CoarseSunFeed:
         self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
-        """Accept a reading, and return its fault: empty for a valid, None for an unchecked reading."""
+        """Accept a reading, and return its fault: "" for a valid reading, None for an unchecked reading."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)

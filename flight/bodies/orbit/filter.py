@@ -583,7 +583,7 @@ class OrbitFilter:
         """Start from an attitude, and return whether the attitude was used.
 
         The attitude must be finite, and its time must be within the history. The flag `doubted` states
-        whether the previous estimate was contradicted, so that its learned states are less accurate.
+        whether the previous estimate was contradicted, which makes its learned states less accurate.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)

@@ -157,7 +157,7 @@ class UnitFeed:
 
 
 class ThreadView:
-    """The telemetry packets and texts of the testbed; implements `flight.loop.body.BodyView`."""
+    """The telemetry packets and status texts of the testbed; implements `flight.loop.body.BodyView`."""
 
     def __init__(self, reader: ThreadReader, planning: Planning, services: Services) -> None:
         self._read = reader.read

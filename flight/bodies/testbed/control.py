@@ -5,8 +5,8 @@ every few seconds plans the remaining part again from the newest estimate: each 
 continuation of the step. Near the goal time, the last path is followed to its end. After the end of this
 path, each plan holds the target for one replanning period. If the body is displaced from its path, a new path
 is planned. The strategy RECEDING is that of the thesis: each plan reaches the target one whole planning
-horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan, so that the
-controller tracks the target itself.
+horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP makes no plan: the controller
+tracks the target itself.
 
 The control laws are B-dot detumbling and a controller of the rotation about the thread. In a Helmholtz cage,
 the magnetic field is that of an orbit, which the flight software predicts. The cage produces the field that a
@@ -202,7 +202,7 @@ class PlanningSettings:
         time_price: cost (W) of the duration of a slew, or None for a fixed horizon.
         current_share: fraction of the current limit that a plan may use; the controller may use the rest.
         cost: the power whose integral over time a path minimises.
-        least_horizon: time (s) before the goal time from which on no new plan is made.
+        least_horizon: remaining time (s) to the goal time below which no new plan is made.
         displaced: deviation (rad) from the path above which a new plan is made.
     """
 

@@ -219,7 +219,7 @@ def _write(path: Path, values: msgspec.Struct) -> None:
 
 
 def _read(path: Path, shape: type[T]) -> T | None:
-    """Return the record stored in a file, None if the file is missing or damaged."""
+    """Return the record stored in a file, or None if the file is missing or damaged."""
     try:
         line = line_of(read_regular(path, _LONGEST_RECORD) or b"")
         return None if line is None else msgspec.json.decode(line, type=shape)

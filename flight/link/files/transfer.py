@@ -210,7 +210,7 @@ class Sender:
 
     Attributes:
         record: stored state of the transfer.
-        condition: condition code with which the transfer ended, None while it is open.
+        condition: condition code with which the transfer ended, or None while it is open.
         said: text about the end of the transfer.
     """
 
@@ -289,7 +289,7 @@ class Sender:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return the content of the next PDU to send, None if no PDU is due."""
+        """Return the content of the next PDU to send, or None if no PDU is due."""
         self._go_on_summing()
         if self.record.suspended and self._stopped is None:
             return None
@@ -432,7 +432,7 @@ class Receiver:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return the content of the next PDU to send, None if no PDU is due."""
+        """Return the content of the next PDU to send, or None if no PDU is due."""
         if self.record.finished is not None:
             return self._say_finished(now_ns)
         if self._whole():
@@ -739,7 +739,7 @@ class Entity:
         self._clear()
 
     def unit(self, now_ns: int) -> bytes | None:
-        """Return the next PDU to send, None if no PDU is due."""
+        """Return the next PDU to send, or None if no PDU is due."""
         if self._replies:
             return self._replies.popleft()
         for _ in range(len(self._out) + len(self._in)):

@@ -366,7 +366,7 @@ class Timetable:
 
 
 def _decode(data: bytes) -> _Copy | None:
-    """Return the schedule in the bytes of a stored copy, None if the copy is damaged."""
+    """Return the schedule in the bytes of a stored copy, or None if the copy is damaged."""
     line = line_of(data)
     try:
         return None if line is None else msgspec.json.decode(line, type=_Copy)

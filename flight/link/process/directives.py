@@ -433,7 +433,7 @@ def portions(packet: bytes, utc_ns: int) -> Iterator[bytes]:
 
 
 def unpack(data: bytes) -> Directive | None:
-    """Return the directive in a packet, None for a packet that is not a directive.
+    """Return the directive in a packet, or None for a packet that is not a directive.
 
     Raises CommandError for a damaged packet and for invalid values.
     """

@@ -233,7 +233,7 @@ class LiveQueue:
             self._newest[kind] = packet
 
     def take(self) -> bytes | None:
-        """Return the next packet, None if the queue is empty."""
+        """Return the next packet, or None if the queue is empty."""
         if self._waiting:
             packet = self._waiting.popleft()
             self._bytes -= len(packet)

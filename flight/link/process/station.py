@@ -135,9 +135,9 @@ class UdpLine:
 
         Args:
             address: own address, HOST:PORT.
-            to: fixed address HOST:PORT that receives telemetry, None for no fixed address.
-            peers: networks of the accepted senders, None to accept all senders.
-            codes: codes of the frames in the datagrams, None for plain frames.
+            to: fixed address HOST:PORT that receives telemetry, or None for no fixed address.
+            peers: networks of the accepted senders, or None to accept all senders.
+            codes: encoders and decoders of the frames in the datagrams, or None for uncoded frames.
 
         Raises UsageError if the address cannot be bound.
         """
@@ -248,7 +248,7 @@ class TcpLine:
 
         Args:
             address: own address, HOST:PORT.
-            peers: networks from which connections are accepted, None to accept all connections.
+            peers: networks from which connections are accepted, or None to accept all connections.
             framing: form of the frames in the stream; None for uncoded frames, each after a sync marker.
 
         Raises UsageError if the address cannot be bound.
