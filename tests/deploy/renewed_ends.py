@@ -60,7 +60,7 @@ class RenewedEnds(FiledEnds):
         self.turn(0.5)
 
     def answers(self) -> bool:
-        """Return whether the link obeys a command."""
+        """Return whether the link executes a command."""
         return self.up[LINK] and self.command(Listing()) == "completed"
 
     def services(self) -> None:

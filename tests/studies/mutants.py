@@ -424,7 +424,7 @@ def _kill_group(process: subprocess.Popen[str]) -> None:
 def judge(
     root: Path, mutants: Sequence[Mutant], known: dict[tuple[str, str], str], workers: int = 1
 ) -> Iterator[Verdict]:
-    """Yield the verdict of each mutant when it is ready.
+    """Yield the result of each mutant when it is ready.
 
     `known` maps the line before and after the change to the reason why the mutant is equivalent. These
     mutants are not run. Raises MutantsError if git cannot copy the repository.

@@ -15,7 +15,7 @@ from flight.link.telemetry.packets import Packer
 
 
 def answer(obeyed: bool) -> bytes:
-    """Return the reply packet of the flight software to a command, which it obeyed or refused."""
+    """Return the reply packet of the flight software to a command, which it executed or refused."""
     fields = dict.fromkeys((field.name for field in COMMAND.fields), 0)
     texts = {field.name: "as commanded" for field in COMMAND.fields if field.kind.startswith("S")}
     return Packer().pack(COMMAND, 5, {**fields, **texts, "obeyed": int(obeyed), "mode": int(Mode.HOLD)})

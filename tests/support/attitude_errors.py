@@ -48,7 +48,7 @@ def star_errors(run: Run) -> tuple[FloatArray, FloatArray]:
     """Return the error (n, 3) of each star attitude against the truth, and its covariance (n, 3, 3)."""
     stars, truth = run["stars"], run["truth"]
     at = np.searchsorted(truth["time_ns"], stars["middle_ns"])
-    # The truth is logged every 25 ms, on which the middle of the exposure falls.
+    # The truth is logged every 25 ms, and one of these times is the middle of the exposure.
     np.testing.assert_array_equal(truth["time_ns"][at], stars["middle_ns"])
     error = to_rotation_vector(multiply(stars["quaternion"], conjugate(truth["quaternion"][at])))
     xx, yy, zz, xy, xz, yz = stars["covariance"].T

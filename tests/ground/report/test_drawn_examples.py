@@ -1,4 +1,4 @@
-"""Tests that plots of artificial runs match the record: curves, areas, colours, scales and labels."""
+"""Tests that plots of artificial runs match recorded ones: curves, areas, colours, scales and labels."""
 
 from __future__ import annotations
 

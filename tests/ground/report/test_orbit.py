@@ -1,4 +1,4 @@
-"""Tests of an orbit run's results: pointing errors, verdicts on requirements, and residual dipole."""
+"""Tests of an orbit run's results: pointing errors, fulfilled requirements, and residual dipole."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilMon
 
 @dataclass
 class Watched:
-    """A coil monitor's verdicts and corrections with times (s), and the coil currents (k, 3), A."""
+    """Faults and corrections that a coil monitor reports, with times (s), and the coil currents (k, 3), A."""
 
     watch: CoilMonitor
     found: list[tuple[float, str, str]]

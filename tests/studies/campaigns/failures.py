@@ -87,7 +87,7 @@ def _path_lengths(scene: Scene) -> FloatArray:
 
 
 def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
-    """Return the verdict, the errors of a result, and the reasons for a refusal or a wrong result."""
+    """Return whether a result is right, wrong or refused, its errors, and reasons if it is not right."""
     size = float(np.linalg.norm(scene.rate))
     if found.status is not StreakStatus.RATE or found.rate is None or found.covariance is None:
         verdict = AT_REST if still else found.status.value

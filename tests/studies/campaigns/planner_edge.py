@@ -76,7 +76,7 @@ def verdict(result: Result) -> str:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Count the verdicts and list the slews that were not solved."""
+    """Count the results of the slews, and list the slews that were not solved."""
     del folder
     verdicts = [verdict(result) for result in results]
     counts = {name: verdicts.count(name) for name in ("solved", "dear", "late", "failed", "unknown")}

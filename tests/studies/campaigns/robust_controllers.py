@@ -126,7 +126,7 @@ def run(case: Case) -> Result:
 
 
 def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
-    """Run the two steps in a drawn world with the loop of `config`; return the results."""
+    """Run the two steps in a random world with the loop of `config`; return the results."""
     config = configuration.replace(config, steps=STEPS, duration=DURATION)
     with tempfile.TemporaryDirectory() as place:
         flown = fly(

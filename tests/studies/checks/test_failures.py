@@ -1,4 +1,4 @@
-"""Tests of the campaign `failures`: frames, verdicts, and a small slice."""
+"""Tests of the campaign `failures`: its frames, its evaluation of results, and a small part of its runs."""
 
 from __future__ import annotations
 

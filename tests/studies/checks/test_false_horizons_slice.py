@@ -27,7 +27,7 @@ def test_pictures_that_once_gave_a_horizon_give_none_and_a_crescent_is_found(tmp
     results = [run(cases[key]) for key in (*FALSE_ONCE, "limb-crescent-0")]
     verdicts = [[answer["verdict"] for answer in result["answers"]] for result in results]
     assert not any({"right", "wrong"} & set(each) for each in verdicts[:-1])
-    # The last verdict is the one with the prior knowledge of a flight.
+    # The last result is the one with the prior information of a flight.
     assert verdicts[-1][-1] == "right"
     summary = FALSE_HORIZONS.summarise(results, tmp_path)
     json.dumps(summary.facts, allow_nan=False)

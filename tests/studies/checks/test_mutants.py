@@ -117,7 +117,7 @@ def test_a_change_without_an_effect_is_not_a_mutant(source: str) -> None:
 def test_killed_survived_and_equivalent(
     repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Check each verdict and the file of results, and that the checkout is unchanged.
+    """Check the result of each mutant and the file of results, and that the checkout is unchanged.
 
     A test that always fails kills no mutant.
     """

@@ -105,7 +105,7 @@ def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
 
 
 def _verdict(run: Run, old: Path, new: Path, job: Future[None], texts: Texts) -> Verdict:
-    """Return the verdict of a run when its job is done.
+    """Return the result of the comparison of a run when its job is done.
 
     A run that failed in this checkout counts as different.
     """
@@ -117,7 +117,7 @@ def _verdict(run: Run, old: Path, new: Path, job: Future[None], texts: Texts) ->
 
 
 def table(commit: str, verdicts: Sequence[Verdict]) -> str:
-    """Return the verdicts as a table."""
+    """Return the results of the comparisons as a table."""
     lines = [f"against {commit[:12]}", f"{'run':12} {'compared':>9} {'added':>7} {'extended':>9}  result"]
     for verdict in verdicts:
         total = sum(verdict.added.values())

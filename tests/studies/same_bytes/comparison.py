@@ -81,7 +81,7 @@ class Verdict:
     difference: Difference | None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the verdict as plain values."""
+        """Return the result of the comparison as plain values."""
         return {**asdict(self), "equal": self.difference is None}
 
 

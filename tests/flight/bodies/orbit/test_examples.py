@@ -44,7 +44,7 @@ def test_an_example_detumbles_with_currents_within_the_limit_of_each_coil(name: 
     removed = (momentum[0] - momentum[-1]) / (SECONDS * FIELD * float(config.coils.map().limits.mean()))
     assert removed > 0.2, "a fifth of what the mean dipole limit across a typical field would remove"
     assert not {row["name"] for row in run["event"]} & {b"coil-broken", b"coil-suspect", b"coil-corrected"}
-    # The true coils differ from the described ones by their gains and directions only.
+    # The true coils differ from the configured ones by their gains and directions only.
     true = run["true_description"]["coils"][0].reshape(3, 3)
     assert np.abs(true - np.eye(3)).max() < 0.45
 

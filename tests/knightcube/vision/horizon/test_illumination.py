@@ -29,7 +29,7 @@ PINHOLE = Pinhole.from_field_of_view(128, 128, math.radians(80.0))
 CAMERA = MountedCamera(PINHOLE, np.array([0.0, 0.0, 0.0, 1.0]))
 AWAY = 1.496e11
 ERROR = math.radians(0.3)
-"""Error (rad per axis) of the attitude by which images are tested."""
+"""Error (rad per axis) of the attitude with which images are tested."""
 
 
 def _samples(rays: FloatArray, bright: bool) -> Samples:
