@@ -87,7 +87,7 @@ def markdown() -> str:
 
 
 def markdown_of_telecommands() -> str:
-    """Return the table of telecommands, to the flight and to the link, as Markdown."""
+    """Return the table of the telecommands to the flight process and to the link process, as Markdown."""
     sections = (_section(layout) for layout in (*COMMAND_LAYOUTS.values(), *DIRECTIVE_LAYOUTS.values()))
     return _FOREWORD_OF_TELECOMMANDS + _TYPES + "".join(sections)
 

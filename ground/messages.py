@@ -97,7 +97,7 @@ def write_attitudes(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
     """
     packets = run["attitude"]
     packets = packets[np.isfinite(packets["quaternion"]).all(axis=1)]
-    # Readers of the message refuse two attitudes of the same time.
+    # Readers of the message refuse two attitudes with the same time.
     packets = packets[np.unique(packets["time_ns"], return_index=True)[1]]
     if not len(packets) or not len(run["navigation"]) or not len(run["run"]):
         raise UsageError(f"{run.folder}: it has no attitudes of a satellite with respect to the stars")
@@ -211,7 +211,7 @@ def _add_state(place: ET.Element, kind: str, date: str, *numbers: str) -> None:
 
 
 def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
-    """Return the lines of the segment of one object."""
+    """Return the text lines of the message segment that contains the track of one object."""
     dates = [ccsds_date(start_ns + int(time)) for time in track["middle_ns"]]
     sigma = track["measured_sigma"] * _ARCSECONDS
     lines = [

@@ -1,7 +1,7 @@
 """Passes of a satellite over ground stations, and its eclipses, predicted from two-line elements.
 
 Skyfield propagates the elements (SGP4) and finds rise, culmination and set. The package
-`knightcube.astro.earth` provides the Sun, the Earth's shadow and the uncertainty of the elements.
+`knightcube.astro.earth` computes the Sun's position, the Earth's shadow and the uncertainty of the elements.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Pass:
         elevation_deg: highest elevation, degrees.
         range: distance of the satellite at the highest elevation, m.
         sunlit: visible fraction of the Sun's disc at the satellite at the highest elevation.
-        sun_elevation_deg: elevation of the Sun at the station at the satellite's highest elevation, degrees.
+        sun_elevation_deg: elevation of the Sun above the station's horizon, at the time `top`, degrees.
     """
 
     station: Station

@@ -1,4 +1,4 @@
-"""Sample pictures for other commands, which the simulator renders together with their true parameters.
+"""Sample pictures as inputs of other commands. The simulator renders each picture from known parameters.
 
 The pictures are rendered on demand, because 12-bit noise cannot be compressed, and stored pictures would not
 follow changes of the simulator. Pictures rendered with the same seed are identical.

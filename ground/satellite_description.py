@@ -2,8 +2,8 @@
 
 The file extends the configuration `orbit` (a 1U CubeSat) and contains only differing values. Values that are
 not described are computed: the inertia is that of a homogeneous cuboid, and limits are scaled between those
-of the configurations `orbit` and `orbit_3u`. Weights and noises that the flight application computes from
-craft and coils are omitted.
+of the configurations `orbit` and `orbit_3u`. The file omits weights and noise levels that the flight
+application computes from craft and coils.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
 
 
 def _coil_lines(satellite: Satellite) -> list[Line]:
-    """Return the lines of the coils."""
+    """Return the lines of the configuration file that describe the coils."""
     largest = max(coil.current_limit for coil in satellite.coils)
     windings: list[Line] = []
     for coil in satellite.coils:
@@ -319,7 +319,7 @@ def _current_lines(satellite: Satellite) -> list[Line]:
 
 
 def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:
-    """Return the lines of the star camera."""
+    """Return the lines of the configuration file that describe the star camera."""
     if satellite.field_of_view_deg is None:
         return [("camera: none", "no star camera"), ""]
     half = math.radians(0.5 * (90.0 + TILT_DEG))

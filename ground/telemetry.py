@@ -23,7 +23,7 @@ from knightcube.errors import UsageError, shown
 
 
 def text_of(value: bytes) -> str:
-    """Return the text of a string field with control characters replaced, which could affect a terminal."""
+    """Return the text of a string field. Control characters, which could affect a terminal, are replaced."""
     return shown(to_text(value))
 
 
@@ -123,7 +123,7 @@ class Run:
         return {"flight": self.flight, "truth": self.truth, "performance": self.performance}
 
     def dropped_segments(self, stem: str) -> int:
-        """Return the number of a log's oldest segments that were deleted to keep its size budget."""
+        """Return the number of oldest segments that were deleted because the log exceeded its size budget."""
         names = [path.stem for path in find_segments(self.folder, stem)]
         return int(names[0].rpartition("-")[2]) - 1 if names else 0
 

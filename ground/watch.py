@@ -86,7 +86,7 @@ class LogTail:
             with self._path.open("rb") as file:
                 file.seek(self._offset)
                 data = file.read()
-        except FileNotFoundError:  # the segment was deleted to keep the log's size budget
+        except FileNotFoundError:  # the segment was deleted because the log was too large
             data = b""
         except OSError as error:
             raise UsageError(f"{self._path}: cannot be read: {error.strerror or error}") from error

@@ -263,7 +263,7 @@ def _two_lines(data: bytes, path: Path) -> bytes:
 
 
 def _release_version(kind: str, source: Path) -> int:
-    """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError without a version."""
+    """Return the version of a release as one number, 10203 for 1.2.3. Raises UsageError if it has none."""
     if kind != "release":
         raise UsageError(f"{kind}: give its version with --version N")
     text = read_text(source / "pyproject.toml")

@@ -105,7 +105,7 @@ class CommandForms:
         return self._send is not None
 
     def table(self) -> list[Object]:
-        """Return the commands that the body can obey, each with the inputs of its form."""
+        """Return the commands that the controlled body accepts, each with the inputs of its web form."""
         return commands_for(self.body, self._layouts)
 
     def text(self, name: str, given: Object) -> str:

@@ -37,7 +37,7 @@ _OWN_FORM = frozenset({LOAD_PARAMETERS.name, DUMP_PARAMETERS.name})
 
 
 def layouts_for(body: Body | None, layouts: Mapping[str, Layout]) -> dict[str, Layout]:
-    """Return the commands that a kind of body can obey; all commands if the body is not known."""
+    """Return the commands that a kind of body accepts; all commands if the kind of body is not known."""
     foreign = _FOREIGN[body][0] if body is not None else ""
     return {name: layout for name, layout in layouts.items() if name != foreign}
 
@@ -48,7 +48,7 @@ def foreign_modes(body: Body | None) -> frozenset[Mode]:
 
 
 def commands_for(body: Body | None, layouts: Mapping[str, Layout]) -> list[Object]:
-    """Return the commands that a kind of body can obey, each with the inputs of its form."""
+    """Return the commands that a kind of body accepts, each with the inputs of its web form."""
     chosen = layouts_for(body, layouts)
     table = {entry["name"]: entry for entry in command_table(chosen)}
     for name, layout in chosen.items():
@@ -76,7 +76,7 @@ def _inputs(packet: Packet, body: Body | None) -> list[Object]:
 
 
 def _target_inputs(field: str) -> list[Object]:
-    """Return the inputs of the numbers of all pointing goals."""
+    """Return the inputs of a web form for the numbers of each pointing goal, such as latitude."""
     return [
         {
             "name": name,
@@ -134,7 +134,7 @@ def components(packet: str, field: Field) -> list[str]:
 
 
 def add_components(packets: list[Object]) -> list[Object]:
-    """Add to the fields of the packet table the names of their components and the limiting parameters."""
+    """Extend each field of the packet table by its components' names and by the parameters of its limits."""
     for packet in packets:
         fields = LAYOUTS[packet["name"]].packet.fields
         for entry, field in zip(packet["fields"], fields, strict=True):

@@ -177,7 +177,7 @@ class PageCursor:
 
 
 class PageState:
-    """State of a flight at a time, as the changes since the last state that a reader received."""
+    """State of a flight for one reader, who receives only the changes since the previous state."""
 
     def __init__(self, history: History) -> None:
         self._history = history

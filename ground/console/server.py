@@ -51,7 +51,7 @@ _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
 """Packet types that the link process sends, even if the flight process is silent."""
 _BODY_OF: dict[str, Body] = {CONTROL.name: "testbed", NAVIGATION.name: "orbit", SPIN.name: "orbit"}
-"""Kind of body by the packet types that only this kind sends."""
+"""Kind of body (testbed or orbit) by the name of a packet type that only this kind of body sends."""
 _MOST_UPLOAD = 1 << 24
 """Largest size (bytes) of a file that the page uploads to the satellite."""
 _MOST_STATIONS = 20
@@ -88,8 +88,8 @@ class Console:
         name: name of the flight on the page.
         feed: source of the flight's packets.
         history: packets received so far.
-        surroundings: orbit and devices of the flight.
-        forms: sender of commands from the page.
+        surroundings: orbit, body and devices in the configuration of the flight.
+        forms: sender of the commands that the operator enters in forms of the page.
         utc_ns: UTC at mission time zero, ns, or None while unknown.
         flight_received: monotonic time of the last packet of the flight itself, s.
         frames: camera frames that the flight has kept.
@@ -339,7 +339,7 @@ class _Pages:
         return web.json_response(facts)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Answer the query ?sequence= with the picture of this kept frame."""
+        """Answer the query ?sequence= with the image of the kept frame that has this number."""
         found = await self._drawn(self._console.frames.picture, _whole(request, "sequence", 0))
         if found is None:
             raise web.HTTPNotFound(text="this frame was not kept")
@@ -378,7 +378,7 @@ class _Pages:
         return web.FileResponse(path, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
     async def put(self, request: web.Request) -> web.StreamResponse:
-        """Upload the body of the request to the satellite, as the file ?kind=&name=."""
+        """Upload the body of the request to the satellite, as a file with the queried kind and name."""
         kind, name = request.query.get("kind", ""), request.query.get("name", "")
         data = await request.read()
         return web.json_response(await asyncio.to_thread(self._files.put, kind, name, data))

@@ -56,7 +56,7 @@ class FlightSurroundings:
 
     @classmethod
     def of(cls, path: Path) -> FlightSurroundings:
-        """Return the surroundings of a configuration, or `UNKNOWN` if it cannot be read."""
+        """Return orbit and devices from a configuration file, or `UNKNOWN` if the file cannot be read."""
         try:
             config: Any = load(path)
         except FlightError:
@@ -112,7 +112,7 @@ class FlightSurroundings:
 
 
 UNKNOWN = FlightSurroundings(None, None)
-"""Surroundings without orbit and camera mounting, for a flight whose configuration cannot be read."""
+"""Value without orbit and camera mounting, for a flight whose configuration cannot be read."""
 
 
 def _julian_date(utc_ns: int) -> float:

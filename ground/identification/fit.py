@@ -9,16 +9,16 @@ output-error fit would treat the accumulated process noise as signal. Between ev
 by a Taylor series whose error is a ten-thousandth of the noise. The derivatives with respect to the constants
 treat the filter gains as fixed, so that the expected gradient at the true constants is zero.
 
-Constants and noise levels are estimated alternately, because the information matrix has no terms between
-them. The constants are estimated from the whitened innovations, and the noise levels by Fisher scoring. The
-priors are wide and affect only values that the record does not determine. The prior of the delay is about 20
-ms, and the prior noise levels are uncertain by a factor of 3. Events that noise cannot explain, such as the
-release, a jolt or an outlier, restart the filter.
+Constants and noise levels are estimated alternately, because the information matrix has no cross terms
+between constants and noise levels. The constants are estimated from the whitened innovations, and the noise
+levels by Fisher scoring. The priors are wide and affect only values that the record does not determine. The
+prior of the delay is about 20 ms, and the prior noise levels are uncertain by a factor of 3. Events that
+noise cannot explain, such as the release, a jolt or an outlier, restart the filter.
 
-The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978). If
-the innovations are not white, each standard deviation is at least the sandwich estimate (Huber 1967) over
-segments of the record. Innovations are not white because of the inertial unit's attitude filter or air
-currents.
+The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
+The inertial unit's attitude filter or air currents can correlate the innovations, which are then not white.
+In that case, each standard deviation is at least the sandwich estimate (Huber 1967) over segments of the
+record.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class MotionConstants:
 
     Attributes:
         gain: torque per current and inertia, g = n A B / J, rad/s^2/A.
-        torsion: thread stiffness per inertia, kappa = k / J, 1/s^2.
-        damping: damping coefficient per inertia, delta = c / J, 1/s.
+        torsion: thread stiffness divided by the inertia, kappa = k / J, 1/s^2.
+        damping: damping coefficient divided by the inertia, delta = c / J, 1/s.
         disturbance: constant angular acceleration d, rad/s^2, including kappa theta_0 for the thread's rest
             angle theta_0.
         bias: gyro bias b, rad/s.
@@ -80,7 +80,7 @@ _MAX_ROUNDS = 25
 _NOISE_STEP = 0.02
 _NOISE_CONVERGED = 0.01
 _GATES = (30.0, 8.0)
-"""Outlier gates of the innovations: first in assumed, then in estimated standard deviations."""
+"""Outlier gates in standard deviations of the innovations: the first with assumed noise, then estimated."""
 _MAX_RESTARTS = 0.02
 """Largest fraction of samples at which the filter may restart."""
 _LAGS = 20
@@ -88,7 +88,7 @@ _LAGS = 20
 _SEGMENTS = 40
 """Number of segments of the record for the sandwich estimate."""
 _MIN_PROBABILITY = 1e-3
-"""Probability below which the whiteness test rejects white innovations."""
+"""Probability below which the whiteness test rejects the hypothesis that the innovations are white."""
 _MAX_GAIN_ERROR = 0.25
 """Largest accepted relative standard deviation of the gain."""
 
@@ -183,7 +183,7 @@ def innovations(
 
 
 class _Predictor:
-    """Extended Kalman filter of angle and rate, with the state's derivatives by the fitted constants."""
+    """Extended Kalman filter of angle and rate, and derivatives of both with respect to the constants."""
 
     def __init__(
         self, constants: MotionConstants, noise: MotionNoise, period: float, with_gradient: bool
@@ -258,7 +258,10 @@ class _Predictor:
         return error, (saa, pab, pab, sbb)
 
     def note_switch(self, jump: float) -> None:
-        """Update the derivative with respect to the delay, which extends the effect of the old current."""
+        """Update the derivative with respect to the delay at a jump (A) of the current.
+
+        A longer delay extends the effect of the previous current.
+        """
         self._by_rate = self._by_rate.copy()
         self._by_rate[_DELAY] -= self._constants.gain * math.cos(self._angle) * jump
 

@@ -55,7 +55,7 @@ class LearnedQuantity:
         unit: unit of all values.
         described: values (n,) in the configuration of the run.
         value: estimated values (n,) at the end of the run.
-        claim: standard deviations (n,) of `value`.
+        claim: standard deviations (n,) of `value` according to the attitude filter.
         prior: standard deviations (n,) of `described`, from the configured accuracies.
     """
 

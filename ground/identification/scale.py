@@ -1,11 +1,12 @@
-"""Computes inertia, torque constant, stiffness and damping from the fitted constants per inertia.
+"""Computes inertia, torque constant, stiffness and damping from the fitted ratios to the inertia.
 
 Motion under a known current determines g = n A B / J, k / J and c / J, but not the inertia J itself. For
 example, a body with twice the inertia in twice the field on a thread of twice the stiffness has the same
-motion. The scale follows from prior values of the inertia, the dipole per ampere n A, and the field B, which
-the magnetometer also measures. The priors are Gaussian in the logarithms of the values. The measured gain g
-relates inertia, dipole and field by the constraint ln n A + ln B - ln J - ln g = 0, which is applied as an
-error-free measurement, and corrects inertia, dipole and field.
+motion. The absolute values follow from prior values of the inertia J, the dipole per ampere n A, and the
+field B. The field B is also measured by the magnetometer. The priors are Gaussian in the logarithms of the
+values. The measured gain g relates inertia, dipole and field by the constraint
+ln n A + ln B - ln J - ln g = 0, which is applied as an error-free measurement, and corrects inertia, dipole
+and field.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ FIELD_ERROR = 0.1
 MAGNETOMETER_ERROR = 0.02
 """Prior relative errors of inertia, dipole per ampere, field, and the magnetometer's scale factor."""
 DURATION = 200.0
-"""Default duration (s) of the flight: each manoeuvre once in either direction, and pauses."""
+"""Default duration (s) of the flight: pauses, and each manoeuvre once in each of its two directions."""
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
 _TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])
 """Coefficients of ln J, ln n A, ln B, ln g, kappa and delta in the constraint."""
@@ -191,7 +192,7 @@ def prior_of(config: TestbedConfig) -> PlantPrior:
 
 
 def configured_constants(config: TestbedConfig) -> MotionConstants:
-    """Return the constants per inertia from the values of a configuration."""
+    """Return the configured constants of the motion, each divided by the configured inertia."""
     plant = config.plant
     gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
     stiffness, damping = plant.thread_stiffness / plant.inertia, plant.thread_damping / plant.inertia

@@ -61,9 +61,10 @@ _TRANSFER = LAYOUTS[TRANSFER.name]
 
 
 def exchange(to: str, data: bytes, timeout: float) -> bytes:
-    """Send a packet to a flight's UNIX socket or UDP address HOST:PORT and return the answer.
+    """Send a packet to a flight process at a UNIX socket or UDP address HOST:PORT, and return the answer.
 
-    Raises FlightError without an answer within `timeout` s, UsageError for an invalid address or timeout.
+    Raises FlightError if no answer arrives within `timeout` s, and UsageError for an invalid address or
+    timeout.
     """
     if not 0.0 < timeout < float("inf"):
         raise UsageError(f"--timeout {timeout}: must be a positive number of seconds")
@@ -71,7 +72,8 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
     if host and port.isdigit() and not Path(to).exists():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, (host, int(port)), data, timeout, to)
-    # A flight service cannot access /tmp, so the socket for the answer is made beside the flight's socket.
+    # A flight process that runs as a service cannot access /tmp, so the socket for the answer is created in
+    # the folder that contains the socket of the flight process.
     beside = Path(to).absolute().parent
     place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
     with (
@@ -156,7 +158,7 @@ def terminal_of(options: argparse.Namespace) -> Terminal:
 
 
 def obeyed(reports: list[Report]) -> bool:
-    """Return whether the reports on a command show that the flight obeyed it."""
+    """Return whether the last report on a command shows that its execution has started or is complete."""
     return bool(reports) and reports[-1].stage in {Stage.STARTED, Stage.COMPLETED}
 
 
@@ -167,7 +169,7 @@ def failed(reports: list[Report]) -> str:
 
 
 def explained(report: Report) -> str:
-    """Return the text of a report and, if the counter of the frame was used before, the cure."""
+    """Return the text of a report, with a remedy if the counter of the command's frame was used before."""
     if report.stage is not Stage.REPEATED:
         return report.text
     return (
@@ -192,7 +194,7 @@ def command(
     show: Show,
     ended: Callable[[list[Report]], bool] = lambda _: False,
 ) -> list[Report]:
-    """Send a command, pass its reports to `show` and return them. Raises FlightError without a report.
+    """Send a command, pass its reports to `show` and return them. Raises FlightError if none arrives.
 
     The call ends with the final report, if `ended` is true for the list of received reports, or after
     `seconds` s. A ping is sent after each silence, because the satellite's link forgets the UDP address of
@@ -355,7 +357,7 @@ class FileSession:
         return found
 
     def reason_of(self, progress: Progress) -> str:
-        """Return the reason why a transfer ended, which is the satellite's reason after a refusal."""
+        """Return why a transfer ended. If the satellite refused it, the text is that of the satellite."""
         return self._texts.get((progress.source, progress.number), "") or progress.said
 
     def close(self, now_ns: int) -> None:

@@ -53,7 +53,7 @@ DEFAULTS = Link(keys="-")
 """Link settings that are used without a configuration."""
 
 ADDRESSES = "HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, kiss:HOST:PORT or kiss:/dev/FILE@BAUD"
-"""Forms of the address of a line to the satellite."""
+"""Permitted notations of the address at which the ground sends frames to the satellite."""
 
 _STORE_EVERY = 256
 """Number of telemetry frames between two writes of the anti-replay counters."""
@@ -150,7 +150,7 @@ class Terminal:
     def __init__(
         self, line: GroundLine, vault: Vault, settings: TerminalSettings, codes: LinkCodes | None = None
     ) -> None:
-        """Create a terminal with an open line, the codes of this line and the ground's keys."""
+        """Create a terminal from an open line, the keys of the ground, and the coding of the frames."""
         self._line = line
         self._vault = vault
         self._settings = settings
@@ -181,7 +181,7 @@ class Terminal:
         return self.send_by(sealer, packet)
 
     def sealer(self, spi: int, block: int) -> Sealer:
-        """Return a frame sealer for `send_by`, which reserves `block` counters at once."""
+        """Return the sender of authenticated frames for `send_by`; it reserves `block` counters at once."""
         return Sealer(self._vault, spi, TELECOMMAND_MASK, block, shared=True)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
@@ -231,8 +231,8 @@ class Terminal:
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until the final report, for at most `seconds` s.
 
-        A report that a frame was repeated is final if it is the first report. After other reports it is
-        skipped, because in that case a third party has replayed the command's frame.
+        The report that a frame was repeated is final if it is the first report on the command. If another
+        report has arrived before, a third party has replayed the frame, and the report is skipped.
         """
         reported = False
         for _, packet in self.packets(seconds):
@@ -388,8 +388,8 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
 def _turn_to_send(keys: Path) -> Iterator[None]:
     """Make the programs that share a folder of keys send one after the other.
 
-    The satellite refuses a frame that arrives after a frame with a higher counter. The wait for a program
-    that blocks while it sends is limited to `_TURN_S` s.
+    The satellite refuses a frame that arrives after a frame with a higher counter. A program waits for at
+    most `_TURN_S` s, because another program may block while it sends.
     """
     with _reaching(str(keys)):
         file = os.open(keys / "uplink", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

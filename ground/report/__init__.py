@@ -92,7 +92,7 @@ def draw_fit(record: Record, found: PlantFit, file: Path) -> None:
 
 @contextmanager
 def drawing(place: Path) -> Iterator[None]:
-    """Raise UsageError with one line if matplotlib is missing or a file cannot be written."""
+    """Raise UsageError with a message of one line if matplotlib is missing or a file cannot be written."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -29,9 +29,9 @@ WIDE = (11.0, 5.2)
 TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 PATH_WINDOW_S = 20.0
-"""Length (s) of the time axis, from the command of a step, in the picture of the planned paths."""
+"""Length (s) of the time axis, from the command of a step, in the figure of the planned paths."""
 _MIN_FIELD_ROTATION = np.radians(20.0)
-"""Smallest rotation (rad) of the field in a run for which the picture of the cage is drawn."""
+"""Smallest rotation (rad) of the field in a run for which the figure of the coil cage is drawn."""
 _FIELD_STRIDE = 40
 """Number of magnetometer readings (one second) of which only the first is drawn."""
 
@@ -171,7 +171,7 @@ def _overview(signals: RunSignals) -> Figure | None:
 
 
 def cage_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of a testbed in a coil cage: attitude, field and coil currents over time.
+    """Return the figure of a testbed in a coil cage: attitude, field and coil currents over time.
 
     Returns None for a run in a fixed field, or without magnetometer readings.
     """
@@ -206,7 +206,7 @@ def cage_figure(signals: RunSignals) -> Figure | None:
 
 
 def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
-    """Return the picture of a planned path with q2, rate, current and nodes (Sease 2013, Fig. 5.4 to 5.6)."""
+    """Return the figure of a planned path with q2, rate, current and nodes (Sease 2013, Fig. 5.4 to 5.6)."""
     last = plan.horizon * (1.0 - 1e-12)  # just before the end of the path, after which the target is held
     time, nodes = np.linspace(0.0, last, 401), np.minimum(plan.node_times, last)
     figure = Figure(figsize=(OVERVIEW[0], 0.75 * OVERVIEW[1]), layout="constrained")
@@ -230,7 +230,7 @@ def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
 
 
 def fit_figure(record: Record, found: PlantFit) -> Figure:
-    """Return the picture of an identification with angle, current and normalised innovations."""
+    """Return the figure of an identification with plots of angle, current and normalised innovations."""
     figure = Figure(figsize=(OVERVIEW[0], 0.85 * OVERVIEW[1]), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     passed = found.innovations

@@ -35,7 +35,7 @@ SETTLED_AFTER_S = 600.0
 
 
 def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
-    """Return start, s, and end, s, of each period in mode detumble, and whether it ended with a slow body."""
+    """Return start, s, and end, s, of each period in mode detumble, and whether acquire or hold followed."""
     times = np.append(seconds(run["mode"]), end)
     modes = [Mode(int(mode)) for mode in run["mode"]["mode"]]
     return [
@@ -344,7 +344,7 @@ def requirements(
     pointed: Object | None,
     seen: Object | None,
 ) -> list[Object]:
-    """Return each value that the configuration's section `requirements` limits, with a verdict.
+    """Compare each value that the configuration's section `requirements` limits with its limit.
 
     The arguments `detumbled`, `known`, `pointed` and `seen` are the report's results on detumbling, attitude
     knowledge, pointing and the star camera.

@@ -52,7 +52,7 @@ _OBJECT_COLOURS = (panels.BLUE, panels.ORANGE, panels.GREEN, panels.PURPLE)
 
 
 def spin_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of detumbling with rate, field and dipole.
+    """Return the figure of detumbling with rate, field and dipole.
 
     Returns None for a run without spin packets.
     """
@@ -98,7 +98,7 @@ def _detumbling_rate(ax: Axes, run: Run) -> None:
 
 
 def knowledge_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of the attitude errors with their uncertainty, and the level of knowledge.
+    """Return the figure of the attitude errors with their uncertainty, and the level of knowledge.
 
     Returns None for a run without navigation packets or without a truth log.
     """
@@ -123,10 +123,10 @@ def knowledge_figure(signals: RunSignals) -> Figure | None:
 
 
 def pointing_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of a flight in orbit, or None for a run without pointing.
+    """Return the figure of a flight in orbit, or None for a run without pointing.
 
     The panels show the pointing error, rate, dipole, power and magnetic field, and modes with targets. The
-    panel of the power is omitted if the power is not known.
+    power panel is omitted for a run without power data.
     """
     run = signals.run
     found = pointing_errors(run)
@@ -228,7 +228,7 @@ def _shade(ax: Axes, packets: PacketArray) -> None:
 
 
 def track_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of the ground track in sunlight and shadow.
+    """Return the figure of the ground track in sunlight and shadow.
 
     Returns None if the true position is unknown.
     """
@@ -263,7 +263,7 @@ def track_figure(signals: RunSignals) -> Figure | None:
 
 
 def battery_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of charge, powers and shed loads, or None without a power system."""
+    """Return the figure of charge, powers and shed loads, or None without a power system."""
     packets, true = signals.run["power"], signals.run["true_power"]
     if not len(packets):
         return None
@@ -296,7 +296,7 @@ def battery_figure(signals: RunSignals) -> Figure | None:
 
 
 def objects_figure(signals: RunSignals) -> Figure | None:
-    """Return the picture of the tracked objects' paths, rates and brightness, or None without objects."""
+    """Return the figure of the tracked objects' paths, rates and brightness, or None without objects."""
     tracks = object_tracks(signals.run)
     if not tracks:
         return None
@@ -330,7 +330,7 @@ def objects_figure(signals: RunSignals) -> Figure | None:
 
 
 def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
-    """Return the picture of a planned slew: boresights on the sky, dipole, torque and energy."""
+    """Return the figure of a planned slew: boresights on the sky, dipole, torque and energy."""
     figure = Figure(figsize=(10.9, 12.6), layout="constrained")
     grid = figure.add_gridspec(4, 1, height_ratios=(2.3, 1.0, 1.0, 1.0))
     sky = figure.add_subplot(grid[0], projection="mollweide")
@@ -430,12 +430,12 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
 def day_figure(
     prediction: OrbitPrediction, stations: Sequence[Station], targets: Sequence[tuple[float, str]]
 ) -> Figure:
-    """Return the picture of a day: elevations above the stations, their passes, eclipses and targets.
+    """Return the figure of a day: elevations above the stations, their passes, eclipses and targets.
 
     Args:
         prediction: orbit of the satellite over the span that is drawn.
         stations: ground stations.
-        targets: start (s after the begin of the span) and name of each target.
+        targets: start (s after the start of the span) and name of each target.
     """
     rows = len(stations) + bool(targets)
     figure = Figure(figsize=(13.0, 3.6 + 0.45 * rows), layout="constrained")

@@ -96,10 +96,10 @@ def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray,
 
 
 def _streak_rates(run: Run) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the mid-exposure times (n,), s, and the rates (n,) about the thread from streaks, rad/s.
+    """Return mid-exposure times (n,), s, and the rates (n,), rad/s, about the suspension thread.
 
-    The third array holds the standard deviations (0 if unknown), and the fourth array the differences from
-    the true mean rates (NaN if unknown).
+    The rates are measured from streaks of stars in frames. The third array holds the standard deviations (0
+    if unknown), and the fourth array the differences from the true mean rates (NaN if unknown).
     """
     rated = with_rate(run["streak"])
     start = rated["exposure_start_ns"] / 1e9
@@ -256,7 +256,7 @@ def paths(ax: Axes, signals: RunSignals, start: float, stop: float, target: floa
 
 
 def rate(ax: Axes, signals: RunSignals) -> None:
-    """Draw the estimated and true rates about the thread, and those from streaks with error bars."""
+    """Draw the rate about the suspension thread: estimated, true, and from star streaks with error bars."""
     if len(signals.estimate.time):
         estimate = 1e3 * signals.estimate.rate
         ax.plot(signals.estimate.time, estimate, color=SKY, linewidth=2.6, label="estimated")

@@ -55,7 +55,7 @@ class PowerHistory:
         time: start times (n,) of the intervals, s.
         end: end of the last interval, s.
         supply: mean of V |I| (n,), W, which the coils draw from their supply.
-        heat: mean of R I^2 (n,), W, the ohmic heat of constant currents, which the planner minimises.
+        heat: mean of R I^2 (n,), W, the ohmic heat of constant currents. The planner minimises this heat.
         source: "truth" if computed from the simulated coils, "written" if computed from the commanded
             currents.
     """

@@ -23,7 +23,7 @@ FINE = 2
 
 
 def star_camera(run: Run, config: OrbitConfig) -> Object | None:
-    """Return the numbers of the star camera's instants: scheduled, unobstructed, and with a measurement.
+    """Count the instants of the star camera: scheduled, unobstructed, and with a measurement.
 
     The instants are those of the camera's schedule: every `camera.period` s, and every `camera.fine_period` s
     while the attitude is fine and the body rotates slowly. An instant is unobstructed if the true body rate
@@ -53,10 +53,10 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
 
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the start and end times (n,), s, of the camera's intervals, and whether the body is slow (n,).
+    """Return start and end times (n,), s, of the camera's intervals, and whether the body is slow (n,).
 
-    The body is slow if its rate is below `camera.max_rate`. As in flight, an instant at which the body is too
-    fast for a frame does not delay the next instant.
+    The body is called slow if its rate is below `camera.max_rate`. As in flight, an instant at which the body
+    rotates too fast for a frame does not delay the next instant.
     """
     last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))
     ticks = np.arange(0.0, last + camera.period, camera.period)

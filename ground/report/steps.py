@@ -64,7 +64,7 @@ class StepCommand:
 
     @property
     def rise_is_judged(self) -> bool:
-        """Whether the thesis limits the rise time, as it does only for steps between targets."""
+        """Whether the limit of the rise time in the thesis applies, which holds only between two targets."""
         return self.index > 0 and self.from_target
 
 
@@ -107,7 +107,7 @@ def flown_steps(
     """Return the executed steps, which start at the body's attitude and may end early by a mode change.
 
     Args:
-        commanded: steps between targets.
+        commanded: commanded attitude steps, each from one target to the next.
         time: times of the samples (n,), s.
         q2: attitude (n,).
         stops: ascending times, s, at which a mode ended the step in progress.
@@ -141,7 +141,7 @@ def response(time: FloatArray, q2: FloatArray, command: StepCommand) -> StepResp
     t = np.concatenate([[0.0], time[inside] - command.time])
     y = np.concatenate([[np.interp(command.time, time, q2)], q2[inside]])
     steady = math.nan
-    if command.duration >= 2.0 * STEADY_STATE_S:  # a shorter step may still be slewing
+    if command.duration >= 2.0 * STEADY_STATE_S:  # in a shorter step, the body may still slew
         last = y[t >= command.duration - STEADY_STATE_S]
         error = _angle(last) - _angle(np.array([command.target]))
         steady = float(np.degrees(np.max(np.abs(error)))) if len(last) else math.nan
@@ -261,7 +261,7 @@ def step_row(command: StepCommand, found: StepResponse | None) -> Object:
 
 
 def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Object:
-    """Return the largest of `values` with its verdict: "pass", "miss", or "unknown" if all are NaN."""
+    """Compare the largest of `values` with the limit: "pass", "miss", or "unknown" if all are NaN."""
     known = [value for value in values if not math.isnan(value)]
     worst = max(known, default=math.nan)
     within = worst <= limit * (1.0 + 1e-9)

@@ -216,7 +216,7 @@ def _jobs(packets: PacketArray) -> list[Object]:
 
 
 def _planner(packets: PacketArray) -> Object:
-    """Return the numbers of accepted, stretched and refused plans, and the reasons for the refusals."""
+    """Return the numbers of plans: accepted, with an extended horizon, and refused for each reason."""
     accepted = packets["accepted"] == 1
     status = np.array([text_of(value) for value in packets["status"]], dtype=object)
     flown = packets[accepted]

@@ -265,7 +265,7 @@ def _battery(found: Object | None) -> list[str]:
 
 
 def _power(power: Object, thesis: bool) -> list[str]:
-    """Return the lines of the coil power and, if `thesis` is true, the power consumption in the thesis."""
+    """Return the report's lines on the coil power and, if `thesis` is true, on the power in the thesis."""
     if power["source"] is None:
         return []
     currents = (
@@ -397,7 +397,7 @@ def _failed_frames(frames: list[Object]) -> list[str]:
 
 
 def _star_camera(found: Object | None) -> list[str]:
-    """Return the lines of the star camera's availability, or nothing without a star camera or a truth log."""
+    """Return the report's lines on the star camera's availability; none without star camera or truth log."""
     if found is None:
         return []
     share = f" ({number(found['share'], 1, 100.0)} %)" if found["share"] is not None else ""
@@ -410,7 +410,7 @@ def _star_camera(found: Object | None) -> list[str]:
 
 
 def _lens(found: Object | None) -> list[str]:
-    """Return the lines of the learned lens, or nothing if no lens was learned."""
+    """Return the report's lines on the learned lens, or nothing if no lens was learned."""
     if found is None:
         return []
     (focal, focal_sigma), (x, y), (x_sigma, y_sigma) = (
