@@ -498,11 +498,7 @@ class CoilResponse:
         )
 
     def _inputs_and_outputs(self, rows: FloatArray, span: float) -> tuple[FloatArray, FloatArray]:
-        """Return the whitened linear system of the fit: its matrix (m f, p) and its right side (m f,).
-
-        The matrix multiplies the p fit parameters. The right side holds the observed accelerations of m bins
-        about f free axes.
-        """
+        """Return the whitened equations of the fit: matrix (m f, p), and right side (m f,), accelerations."""
         count, coils = len(self._free), self._count_of_coils
         white = self._whitened(rows, span)
         inputs = np.zeros((len(white), count, len(self._prior)))
@@ -546,9 +542,7 @@ class CoilResponse:
     def _whitened(self, rows: FloatArray, span: float) -> FloatArray:
         """Return the rows (m, f, n + 3 + k) of m bins, whitened and without the effect of a constant.
 
-        The attribute `_rows` describes a row. Whitened rows have independent noise of variance 1. Whitening
-        is needed because the noise of the mean rate of a bin enters two differences of neighbouring bins with
-        opposite signs.
+        Whitening is needed, because the noise of a bin enters two differences of bins with opposite signs.
         """
         settings = self._settings
         # The span is rounded to ns, so that equal spans use the stored matrix.
