@@ -3,9 +3,9 @@
 The guardian has its own connection to the I2C bus. The guardian sets the coils to zero from its start until
 the first heartbeat, and 0.3 s after the last heartbeat. While heartbeats are missing, zero is written again
 every 0.1 s, to override a late write by the flight process or the effect of a brown-out. When heartbeats
-return, the guardian stops writing. The guardian ignores SIGTERM and SIGINT, and ends only when the flight
-process sends the goodbye message or dies. Neither this module nor its imports use numpy, so that the guardian
-starts within a few hundredths of a second and needs little memory.
+arrive again, the guardian stops writing zero. The guardian ignores SIGTERM and SIGINT, and ends only when the
+flight process sends the goodbye message or dies. Neither this module nor its imports use numpy, so that the
+guardian starts within a few hundredths of a second and needs little memory.
 
 `GuardianLine` runs in the flight process. `GuardianLine` starts the guardian before the coils can be
 energised, sends the heartbeats, and replaces a guardian that dies or stops reading. Sending a heartbeat never
@@ -45,10 +45,10 @@ REPEAT_NS = 100_000_000
 """Interval (ns) between writes of zero while heartbeats are missing."""
 
 FINAL_ZEROS = 3
-"""Number of acknowledged writes of zero after which an orphaned guardian ends."""
+"""Number of acknowledged zero writes after which the guardian ends, if the flight process has died."""
 
 PATIENCE_NS = 5_000_000_000
-"""Longest time (ns) for which an orphaned guardian tries to zero the coils."""
+"""Longest time (ns) for which the guardian tries to zero the coils after the flight process has died."""
 
 
 class Watch:
@@ -265,8 +265,8 @@ class GuardianLine:
     def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
         """Wait until the guardian has set the coils to zero.
 
-        Raises NotResponding after `patience` seconds. If `patient` is true, no error is raised, and the
-        guardian reports later when the coils are at zero.
+        Raises NotResponding after `patience` seconds. If `patient` is true, no error is raised. In that case,
+        the guardian sends a report as soon as the coils are at zero, which `tend` returns.
         """
         received = b""
         if select.select([self._line], [], [], patience)[0]:

@@ -1,4 +1,4 @@
-"""Errors of the satellite description in a flight configuration, drawn from a seed.
+"""Errors of the described (configured) properties of a satellite, drawn from a seed.
 
 The flight software knows moments of inertia, coils and sensors to the accuracies that its configuration
 states. The simulated satellite therefore differs from the description: each error is drawn uniformly and
@@ -24,20 +24,20 @@ _STREAM = 0xD1FF
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DescriptionErrors:
-    """True properties of a satellite relative to its description.
+    """True properties of a satellite relative to the properties in its configuration.
 
     Attributes:
-        moments: ratios (3,) of the true to the described principal moments of inertia.
-        axes: rotation vector (3,) from the described to the true principal axes, rad, body axes.
-        coils: true dipole of each coil divided by the magnitude of its described dipole, as columns of a
+        moments: ratios (3,) of the true to the configured principal moments of inertia.
+        axes: rotation vector (3,) from the configured to the true principal axes, rad, body axes.
+        coils: true dipole of each coil divided by the magnitude of its configured dipole, as columns of a
             matrix (3, 3 g) for g groups of three coils. The columns are in axes of
             `sim_hal.worlds.free_body.coil_frames`.
         gyro: matrix (3, 3) from the true rate to the rate that the gyro measures, without the gyro's bias.
         field: matrix (3, 3) from the true to the measured magnetic field, without the magnetometer's bias.
         field_bias: bias (3,) of the magnetometer, T.
-        camera: rotation vector (3,) from the described to the true mounting of the star camera, rad, body
+        camera: rotation vector (3,) from the configured to the true mounting of the star camera, rad, body
             axes.
-        horizon: rotation vectors (n, 3) from the described to the true mountings of n horizon cameras, rad,
+        horizon: rotation vectors (n, 3) from the configured to the true mountings of n horizon cameras, rad,
             body axes.
     """
 
@@ -57,9 +57,9 @@ NO_ERRORS = DescriptionErrors(
 
 
 def description_errors(config: Config, section: Simulation) -> DescriptionErrors:
-    """Return the errors that are drawn from the seed of `section`.
+    """Return the errors of a satellite's configured properties, drawn from the seed of `section`.
 
-    A body that is not in orbit has no errors.
+    The errors are zero for a testbed, because only the configuration of a satellite in orbit has accuracies.
     """
     body = section.free_body
     if body is None or body.errors == 0.0 or not isinstance(config, OrbitConfig):

@@ -104,7 +104,7 @@ def gps_errors(emulation: Emulation) -> GpsErrors:
 
 
 def emulate_ublox(emulation: Emulation, gps: Gps) -> EmulatedGps:
-    """Connect an emulated u-blox receiver to its serial line. Raises ConfigError without an orbit."""
+    """Connect an emulated u-blox receiver to its serial line. Raises ConfigError if no orbit is simulated."""
     from sim_hal.emulators.gps import EmulatedGps  # noqa: PLC0415 - see `sim_hal.assembly`
 
     world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)
@@ -112,7 +112,7 @@ def emulate_ublox(emulation: Emulation, gps: Gps) -> EmulatedGps:
 
 
 def emulate_ads1115(emulation: Emulation, section: SolarStringsSection) -> EmulatedSolarCells:
-    """Connect the emulated converters of the solar cells. Raises ConfigError without an orbit."""
+    """Connect the emulated converters of the solar cells. Raises ConfigError if no orbit is simulated."""
     from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel  # noqa: PLC0415 - see `sim_hal.assembly`
 
     strings, truth = section.strings, emulation.section.orbit_devices
@@ -133,7 +133,7 @@ def emulate_ads1115(emulation: Emulation, section: SolarStringsSection) -> Emula
 
 
 def emulate_nmea(emulation: Emulation, gps: Gps) -> EmulatedGps:
-    """Connect an emulated receiver to its serial line. Raises ConfigError without an orbit."""
+    """Connect an emulated NMEA receiver to its serial line. Raises ConfigError if no orbit is simulated."""
     from sim_hal.emulators.nmea import EmulatedNmeaGps  # noqa: PLC0415 - see `sim_hal.assembly`
 
     world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)

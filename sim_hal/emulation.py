@@ -107,7 +107,7 @@ class Emulation:
         world: simulated world; the emulator of the coils, which is built before the world, must not use it.
         sense: function from a time (ns) to the motion and magnetic field at the inertial unit, with the
             unit's calibration errors and the field of the coils.
-        supply: function from the begin and end of a time window (ns) to the mean supply voltage (V) and
+        supply: function from the start and end of a time window (ns) to the mean supply voltage (V) and
             current (A) of the coils.
     """
 

@@ -80,7 +80,8 @@ class SimulationRequest:
         out: folder of the run, in which the log of the true state is written.
         realtime: whether the devices run in a server process.
         seed: random seed that replaces the seed of the configuration, or None.
-        devices: facts file of a running device server, or None to start a server.
+        devices: file with the connection data of a running device server, which `python -m sim_hal serve
+            --facts` wrote, or None to start a server.
         faults: faults that are injected in addition to the faults of the configuration.
     """
 
@@ -517,7 +518,7 @@ def running_server(facts_path: Path) -> Iterator[Served]:
 
 @contextmanager
 def _connected(facts: dict[str, Any]) -> Iterator[Served]:
-    """Connect to the device server that a facts file describes."""
+    """Connect to a device server with the connection data `facts`."""
     offset_ns = facts["utc_offset_ns"]
     clock = SystemClock() if offset_ns is None else SimulatedUtcClock(offset_ns)
     path = Path(facts["socket"])

@@ -72,10 +72,11 @@ class TipOff(Section, frozen=True, kw_only=True):
 class Disturbances(Section, frozen=True, kw_only=True):
     """Disturbances as multiples of their worst cases, and the errors of the coils.
 
-    The worst case of `drag` and `solar_pressure` is the torque on a box whose true centre of mass is
-    displaced from the described one in a random direction, by the distance `craft.accuracy.centre_of_mass`.
-    The worst case of `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and
-    a random walk of 5e-5 A m^2. The worst case of `ring_current` is a field of 20 nT that varies over hours.
+    The worst case of `drag` and `solar_pressure` is the torque on a box with a displaced centre of mass. The
+    displacement from the configured centre of mass has a random direction and the length
+    `craft.accuracy.centre_of_mass`. The worst case of `residual_dipole` is a constant part of 1e-3 A m^2, a
+    part of 3e-4 A m^2 in sunlight and a random walk of 5e-5 A m^2. The worst case of `ring_current` is a
+    field of 20 nT that varies over hours.
     `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
     of air density and residual dipole. The angle between body axes and principal axes is at least a third of
     `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
@@ -97,8 +98,8 @@ class Disturbances(Section, frozen=True, kw_only=True):
 class FreeBodySection(Section, frozen=True, kw_only=True):
     """The section `free_body`.
 
-    The craft is that of the flight configuration, with the differences in `craft`, or one of the two crafts
-    in `sim_hal.worlds.free_body.CRAFTS` if `craft` is a name.
+    If `craft` is a name, the body is one of the two satellites in `sim_hal.worlds.free_body.CRAFTS`.
+    Otherwise the body is the satellite of the flight configuration, with the differences in `craft`.
 
     `errors` is the largest error of the configured description of body, coils and sensors, as a multiple of
     the configured accuracies (`sim_hal.description_errors`).

@@ -53,9 +53,9 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
 
 
 def _schedule(run: Run, camera: Camera) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return start and end times (n,), s, of the camera's intervals, and whether the body is slow (n,).
+    """Return start and end times (n,), s, of the camera's intervals, and whether the body rotates slowly.
 
-    The body is called slow if its rate is below `camera.max_rate`. As in flight, an instant at which the body
+    The body rotates slowly if its rate is below `camera.max_rate`. As in flight, an instant at which the body
     rotates too fast for a frame does not delay the next instant.
     """
     last = min(float(seconds(run[name])[-1]) for name in ("truth", "orbit_truth"))

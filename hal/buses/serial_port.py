@@ -48,9 +48,9 @@ class PySerialPort:
     ) -> None:
         """Open the port.
 
-        Raises NotResponding if the port cannot be opened. If `patient` is true, the port counts as lost
-        instead and is opened later. A call of `send` takes at most `write_timeout`, s; the default is short
-        enough for the thread that drives the coils.
+        Raises NotResponding if the port cannot be opened. If `patient` is true, no error is raised: the port
+        counts as lost, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is
+        short enough for the thread that drives the coils.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0

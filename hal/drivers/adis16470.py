@@ -31,7 +31,7 @@ class Adis16470:
     def __init__(self, device: SpiDevice) -> None:
         """Check the product number.
 
-        Raises NotResponding without an answer, and Refused if a different chip answers.
+        Raises NotResponding if no chip answers, and Refused if a different chip answers.
         """
         self._device = device
         (product,) = self._read([PROD_ID])

@@ -1,4 +1,4 @@
-"""Camera service that operates a slow camera in parallel to the control loop.
+"""Camera service that operates a slow camera in parallel with the control loop.
 
 Triggering, reading, configuring and reopening a camera can each take milliseconds to seconds. An unanswered
 USB control transfer takes five seconds. A periodic job executes all slow camera operations. The methods
@@ -86,8 +86,8 @@ class ServedCamera:
     def __init__(self, device: CameraDevice, clock: Clock, patient: bool = False) -> None:
         """Open the camera and start the periodic job.
 
-        Raises DeviceError if the camera cannot be opened. If `patient` is true, the camera counts as lost
-        instead and is opened later.
+        Raises DeviceError if the camera cannot be opened. If `patient` is true, no error is raised: the
+        camera counts as lost, and is opened later.
 
         The camera is reopened if no frame arrives within `PATIENCE_NS` plus six exposure times after the
         first unanswered trigger. A free-running camera may need several exposures until a new exposure time

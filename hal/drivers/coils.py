@@ -159,7 +159,7 @@ def largest_counts(step: float, current_limit: float) -> int:
         step: mean current of one count, A.
         current_limit: current limit, A.
     """
-    # The factor prevents that rounding reduces a limit that is an exact multiple of the step.
+    # The factor prevents rounding from reducing a limit that is an exact multiple of the step.
     return min(COUNTS, math.floor(current_limit / step * (1.0 + 1e-12)))
 
 
@@ -305,7 +305,7 @@ class PwmOutputs(Protocol):
 
 
 class CoilOutputs:
-    """Writer of signed counts to the PWM chip, with a record of the last acknowledged outputs.
+    """Writes the coils' signed counts to the PWM chip, and records the last acknowledged outputs.
 
     Attributes:
         written: signed PWM counts of the coils that the chip acknowledged last.
@@ -428,7 +428,7 @@ class CoilOutputs:
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _record(self, counts: Counts, braked: Axes) -> None:
-        """Record acknowledged counts and brakes. Writing the same values again keeps the recorded time."""
+        """Record acknowledged PWM counts and braked bridges; equal values do not change the recorded time."""
         with self._lock:
             if self.written_ns < 0 or (counts, braked) != (self.written, self.braked):
                 self.written, self.braked = counts, braked

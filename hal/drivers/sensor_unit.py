@@ -80,7 +80,8 @@ class SensorPart:
     Attributes:
         name: name of the sensor in messages.
         make: function that starts the sensor and returns its driver.
-        measures: matrix (3, 3) from sensor axes to unit axes for each quantity that is read.
+        measures: matrix (3, 3) from the axes of the sensor to the axes of the inertial unit, for each
+            quantity that the sensor measures.
     """
 
     name: str

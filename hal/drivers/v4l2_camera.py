@@ -354,7 +354,7 @@ class VideoDevice:
         return int(request.count)
 
     def dequeue(self) -> Filled | None:
-        """Return the oldest filled buffer, or None without a filled buffer.
+        """Return the oldest filled buffer, or None if no buffer is filled.
 
         The caller must return the buffer by `queue`.
         """
@@ -701,7 +701,7 @@ class V4l2Camera:
             device.close()
 
     def _dequeue(self, device: VideoDevice) -> Filled | None:
-        """Return the oldest filled buffer, or None without one or during a short read failure."""
+        """Return the oldest filled buffer, or None if no buffer is filled or read errors have just begun."""
         try:
             filled = device.dequeue()
         except OSError as error:

@@ -29,7 +29,7 @@ FAILED = b"x"
 
 
 NOTE = "coils"
-"""Name of the file with the I2C bus of the coils' chips and the writes that switch the coils off."""
+"""Name of the file that states the I2C bus of the coils' chips and the writes that switch the coils off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class CoilReach:
 
     Attributes:
         opener: function that opens the bus, written as `module:function`.
-        where: argument of this function, such as a device file.
+        where: argument of the function `opener`, such as a device file.
         writes: I2C writes (address, register, value) that switch all coils off in any state of the chips.
     """
 
@@ -52,9 +52,10 @@ class CoilReach:
         return [f"0x{number:02x}" for write in self.writes for number in write]
 
     def note(self, folder: Path) -> None:
-        """Write the bus and the writes to a synced file in `folder`, for the script `deploy/coils-off`.
+        """Store the attributes `where` and `writes` in `folder` for the script `deploy/coils-off`.
 
-        The file also contains the SHA-256 of its text, as a checksum. Never raises.
+        The file is synced to the disk, and also contains the SHA-256 of its text, as a checksum. Never
+        raises.
         """
         import hashlib  # noqa: PLC0415 - the guardian, which imports this module, needs no checksum
 

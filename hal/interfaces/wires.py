@@ -21,7 +21,7 @@ LATE_NS = 25_000_000
 
 
 class Ticker(Protocol):
-    """Short job that a clock runs periodically, in parallel to the control loop."""
+    """Short job that a clock runs periodically, in parallel with the control loop."""
 
     @property
     def name(self) -> str:

@@ -253,7 +253,7 @@ def _between(
 
 @lru_cache(maxsize=4)
 def _noise(seed: int) -> npt.NDArray[np.complex64]:
-    """Return two periodic volumes of independent noise of unit variance, as one flat array.
+    """Return two periodic cubic grids of independent noise of unit variance, as one flat array.
 
     The real part is the noise for land, and the imaginary part is the noise for clouds.
     """

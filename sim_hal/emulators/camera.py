@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SAMPLE_NS = 10_000_000
 
 Expose = Callable[[int, FloatArray, FloatArray, "Sequence[SourceTrack]"], "Future[Image]"]
-"""Function that renders a frame from number, times (k,), s, camera attitudes (k, 4) and object tracks."""
+"""Function that renders a frame, given its number, times (k,), s, attitudes (k, 4) and object tracks."""
 Moving = Callable[[int, FloatArray], "Sequence[SourceTrack]"]
 """Function that returns object tracks, given an exposure's start (ns) and times (k,), s, since the start."""
 
@@ -58,7 +58,8 @@ class EmulatedCamera:
         fault: present fault, "off", "frozen", "torn" or a key of `SPOILT`; empty for a camera without a
             fault.
         late_ns: additional delay of the frames, ns.
-        one_of: number n; because of a fault the camera reacts only to every n-th trigger if n exceeds 1.
+        one_of: number n of triggers per frame. A fault can set n to more than 1; the camera then reacts only
+            to every n-th trigger.
     """
 
     def __init__(
@@ -193,4 +194,4 @@ SPOILT: dict[str, Callable[[Image, int], Image]] = {
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }
-"""Functions that change the pixels (rows, columns) of a frame with a given number, by fault."""
+"""Functions that return changed pixels (rows, columns) of a frame, given its number, by name of the fault."""

@@ -167,7 +167,7 @@ class EmulatedGps:
         self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
 
     def _set_values(self, pairs: bytes) -> None:
-        """Execute the keys and values of a CFG-VALSET message."""
+        """Apply the settings, pairs of key and value, of a CFG-VALSET message."""
         while len(pairs) > 4:
             key = int.from_bytes(pairs[:4], "little")
             size = VALUE_SIZES[key >> 28]

@@ -258,7 +258,7 @@ class EmulatedI2cBus:
 def _flipped(data: bytes, fault: _Fault | None, first: int) -> bytes:
     """Return the data with the bits flipped by a fault.
 
-    The byte index of the fault counts from byte `first`.
+    The fault flips bits of the byte at `first + fault.index`.
     """
     if fault is None or first + fault.index >= len(data):
         return data

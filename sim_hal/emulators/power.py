@@ -23,9 +23,9 @@ from sim_hal.worlds.world import OrbitingWorld
 PERIOD_NS = 250_000_000
 """Period (ns) of the steps, shorter than the time over which the coils' supply current is recorded."""
 FRAME_POWER = 1.0
-"""Power (W) that the star camera and its processing draw until the energy of each frame is used."""
+"""Power (W) of the star camera and its processing after a frame, until the frame's energy is used up."""
 Supply = Callable[[int, int], tuple[float, float]]
-"""Function from begin and end of a time window (ns) to the coils' mean supply voltage (V) and current (A)."""
+"""Function from start and end of a time window (ns) to the coils' mean supply voltage (V) and current (A)."""
 
 
 class Rail:
@@ -81,7 +81,7 @@ class EmulatedPower:
         normals = np.array([panel.normal for panel in truth.panels]).reshape(-1, 3)
         self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         self._peaks = np.array([panel.peak for panel in truth.panels])
-        # Number of exposures, and energy (J) of frames that has not been drawn yet.
+        # Number of exposures so far, and part of the frames' energy (J) that has not been drawn yet.
         self._frames, self._unused = 0, 0.0
         self._due_ns = start_ns + PERIOD_NS
         self._powers = dict.fromkeys(("solar_power", "load_power", "coil_power"), 0.0)

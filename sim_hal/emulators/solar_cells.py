@@ -106,8 +106,8 @@ class SolarCellsModel:
 def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Return directions (m, 3) to ground points, unit verticals (m, 3) at these points, and a solid angle.
 
-    The directions sample the visible disc in rings of equal solid
-    angle. The solid angle (sr) is that of each direction.
+    The directions sample the visible disc of the Earth in rings of equal solid angle. The returned solid
+    angle (sr) is the part of the disc that each direction represents.
     """
     distance = float(np.linalg.norm(position))
     down = -position / distance

@@ -56,7 +56,7 @@ SUPPORTED_FIELDS: Mapping[int, int] = {0: 0x3F3D, 1: 0x0191, 2: 0x0FFF, 4: 0x01F
 
 
 class UnitError(Exception):
-    """Error that the unit answers by `$VNERR` with an error code."""
+    """Error that the unit reports by the answer `$VNERR` with an error code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"{code:02X}")
@@ -70,7 +70,7 @@ RECEIVE_OVERFLOW = 0x02
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """A register of the unit, with a rule and a default value for each field.
+    """A register of the unit; each field has a default value and a function that checks written values.
 
     If `port_option` is set, a write may have the serial port as an additional field.
     """
@@ -421,8 +421,8 @@ class OutputStreams:
 
     Attributes:
         muted: registers whose output is silent until the register is written again.
-        foreign: packet and rate divisor of an output that only other firmware has, stored in the flash copy
-            of register 75, or None; the output ends when register 75 is written.
+        foreign: packet and rate divisor of an output of a different firmware version, stored in the flash
+            copy of register 75, or None; the output ends when register 75 is written.
     """
 
     def __init__(self, registers: RegisterFile) -> None:
@@ -433,7 +433,7 @@ class OutputStreams:
         self._sends_foreign = False
 
     def reset(self) -> None:
-        """Remove all output streams, and begin the output `foreign` unless it is None."""
+        """Remove all output streams, and start the output in the attribute `foreign` unless it is None."""
         self._streams = {}
         self.muted.clear()
         self._sends_foreign = self.foreign is not None
@@ -613,7 +613,7 @@ class Vn100Emulator:
         self._build_streams(now_ns)
 
     def save_foreign_output(self, packet: bytes, divisor: int, now_ns: int) -> None:
-        """Store in flash an output that only other firmware has, and restart the unit from flash.
+        """Store an output of a different firmware version in flash, and restart the unit from flash.
 
         The unit sends `packet` every `divisor` ticks of 1/800 s, also after later restarts.
         """

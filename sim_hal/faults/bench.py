@@ -48,7 +48,7 @@ def all_of(removals: Sequence[Removal]) -> Removal:
 
 @dataclass(slots=True)
 class Bench:
-    """Devices that faults affect from outside the flight process.
+    """Emulated devices and lines to which faults are applied; the flight software itself is not changed.
 
     Attributes:
         line: serial line of the inertial unit.
@@ -195,7 +195,8 @@ class FaultKind:
         begin: function that applies the fault to the bench and returns a function that removes it, or None
             for faults in the flight process.
         parameters: parameters of the fault by name.
-        momentary: whether the fault has no duration and its effect lasts until repaired.
+        momentary: whether the fault is an event without duration, such as a reset. Its effect lasts until
+            the flight software repairs it.
         where: kind of simulation in which the fault can occur.
         adds: whether the fault may be present together with other faults of the same device.
     """

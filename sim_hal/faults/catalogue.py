@@ -161,7 +161,7 @@ def _baud(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
 
 
 def _stuck_samples(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
-    """Repeat the first sample after the fault's begin, or only its magnetic field."""
+    """Repeat the first sample after the start of the fault, or only the magnetic field of this sample."""
     first: list[Vn100Sample] = []
 
     def alter(sample: Vn100Sample) -> Vn100Sample:
@@ -223,7 +223,7 @@ class AlteredPart:
         self.answers = part.answers
 
     def write(self, address: int, data: bytes) -> None:
-        """Process a write; a write of only a register pointer is not altered."""
+        """Process a write. Data of one byte are only a register pointer and are not altered."""
         (self._part.write if len(data) == 1 else self._write)(address, data)
 
     def read(self, count: int) -> bytes:
@@ -425,7 +425,7 @@ def _coil_faults(axis: str) -> tuple[FaultKind, ...]:
 
 
 def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[FaultKind, ...]:
-    """Return the faults of the star camera or of the horizon cameras; each fault has the `parameters`."""
+    """Return the faults of the star camera or of the horizon cameras; each fault accepts the `parameters`."""
     rows: tuple[tuple[str, str, Begin, dict[str, Parameter]], ...] = (
         ("off", "the camera ignores triggers and delivers no frame", _shown, {}),
         ("black", "frames without light", _shown, {}),

@@ -131,7 +131,7 @@ def host_faults(section: Simulation, clock: Clock, realtime: bool) -> ProcessFau
 
 
 def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
-    """Return the text of a configuration, corrupted by the faults `config: corrupted` among `faults`."""
+    """Return the text of a configuration after applying each fault `config: corrupted` in `faults`."""
     for fault in map(parse, faults):
         if fault.kind.name == "config: corrupted":
             text = corrupted(text, round(fault.parameters["bytes"]), seed or 1)

@@ -25,7 +25,7 @@ from sim_hal.settings import FaultEntry
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
 
 LONGEST = 1e9
-"""Latest begin and longest duration (s) of a fault: thirty years, so that times in ns fit into 64 bits."""
+"""Latest start and longest duration (s) of a fault: thirty years, so that times in ns fit into 64 bits."""
 
 _FAULT = re.compile(
     r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
@@ -179,7 +179,7 @@ _EMULATED = {
     "strings": ("solar_strings", "ads1115"),
     **dict.fromkeys(("coil", "bridge", "pwm"), ("coils", "pca9685")),
 }
-"""Section and driver with which the faults of a device are possible, by the first word of its name."""
+"""Section and driver that a configuration must have for faults of a device, by the device's first word."""
 
 
 def other_driver(device: str, config: Config) -> str:

@@ -88,7 +88,7 @@ class DeviceLink:
 
 
 class RemoteI2cBus:
-    """An I2cBus whose chips are in the server process. The bus is safe for several threads."""
+    """An I2cBus whose chips are in the server process. The bus is thread-safe."""
 
     def __init__(self, path: str | os.PathLike[str], name: str = "") -> None:
         """Connect to the bus `name` of the server, or to the bus of the coils if `name` is empty."""

@@ -365,7 +365,7 @@ def _deposit_rows(
     corner = low[seen] - reach
     size = int(np.max(high[seen] - low[seen])) + 2 * reach + 1
     place = points[:, seen] - corner
-    # `later` (m, k, size) is the delay, in line times, of each patch row after the source's row.
+    # `later` (m, k, size): line times by which each row of a patch is exposed after the row of the source.
     later = np.arange(size) - place[..., 1:]
     across = spread.shares(np.clip(place[..., :1] + later * shift[..., :1], 0.0, size), size)
     down = spread.own_shares(np.clip(place[..., 1:] + later * shift[..., 1:], 0.0, size))

@@ -136,7 +136,7 @@ class StarCameraModel:
         """Return the exposure (s) of each row if all rows together take `span` s.
 
         With a rolling shutter, `span` consists of the exposure and one line time per row. Raises OutOfRange
-        if the line times take the whole `span`.
+        if `span` is not longer than the line times of all rows.
         """
         readout = self.rows * self.line_time
         if not span > readout:

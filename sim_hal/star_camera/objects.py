@@ -1,8 +1,8 @@
 """Effects of the star camera's orbit: moving objects, aberration, stray light, and the Earth in view.
 
-An object with a line of sight moves along a great circle among the stars. An object in orbit is lit by the
-Sun and can be hidden by the Earth. The magnitude of an object in orbit changes only when the Earth covers
-part of the Sun as seen from the object.
+An object without an orbit, which is configured by a line of sight, moves along a great circle among the
+stars. An object in orbit is lit by the Sun and can be hidden by the Earth. The magnitude of an object in
+orbit changes only when the Earth covers part of the Sun as seen from the object.
 
     camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
     orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
@@ -13,8 +13,9 @@ part of the Sun as seen from the object.
 Stellar aberration by the camera's motion is modelled as a rotation of the whole frame by the aberration at
 the boresight (26" at most). The variation of the aberration across 20 deg, 4", is not modelled. An object in
 orbit shares the Earth's motion, so the aberration that the Earth's motion causes is subtracted from its
-track. The frame saturates if the Sun or sunlit ground is closer to the boresight than the exclusion angles of
-the camera's baffle (`SkySection`) or in the field of view. The dark Earth hides the stars behind it.
+track. The frame saturates if the Sun or sunlit ground is in the field of view, or if its angle to the
+boresight is less than the exclusion angle of the camera's baffle (`SkySection`). The dark Earth hides the
+stars behind it.
 """
 
 from __future__ import annotations
@@ -216,7 +217,7 @@ class _FreeFall:
     velocity: FloatArray
 
     def states_at(self, times: FloatArray) -> FloatArray:
-        """Return the states (m, 6), whose position error after one second is 0.03 mm."""
+        """Return the extrapolated states (m, 6); after one second, the error of the position is 0.03 mm."""
         since = (np.asarray(times) - self.at)[:, None]
         pull = -GRAVITATIONAL_PARAMETER * self.position / np.linalg.norm(self.position) ** 3
         places = self.position + since * self.velocity + 0.5 * since**2 * pull

@@ -48,7 +48,7 @@ class HeldBody:
         self._axis, self._angle, self._begin_ns, self._span = axis, angle, begin_ns, seconds
 
     def release_at(self, time_ns: int) -> None:
-        """Do nothing, because the hand never releases the body."""
+        """Do nothing, because the body is held by hand and is never released."""
 
     def advance_to(self, time_ns: int) -> None:
         """Do nothing, because the motion is a function of time."""

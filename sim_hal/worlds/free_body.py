@@ -175,7 +175,7 @@ PRESSURE_ARM = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class CraftModel:
-    """Described properties of a craft.
+    """Properties of a craft as described by a configuration, without the errors of the true craft.
 
     Attributes:
         inertia: inertia tensor (3, 3) in body axes, kg m^2.
@@ -671,10 +671,11 @@ def built_craft(
     description: DescriptionErrors,
     craft: CraftModel | None = None,
 ) -> TrueCraft:
-    """Return the true craft; its description is `craft` or, if that is None, in `section`.
+    """Return the true craft, which differs from the described craft by errors.
 
-    The disturbances are drawn from the generator `errors`. The argument `description` holds the differences
-    of the true craft from its description. Raises ConfigError like `craft_model`.
+    The described craft is `craft` or, if `craft` is None, the craft of `section`. The argument `description`
+    holds the differences of the true craft from the described craft. The disturbances are drawn from the
+    generator `errors`. Raises ConfigError like `craft_model`.
     """
     built = build(craft or craft_model(section), section.disturbances, errors)
     return built if description is NO_ERRORS else _differing(built, description)

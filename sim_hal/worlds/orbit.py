@@ -228,11 +228,11 @@ in 2026. J2 varies the inclination by 0.03 deg in a revolution.
 def misfit(lines: tuple[str, str], orbit: OrbitSection, utc: str) -> str:
     """Return how two-line elements differ from a configured orbit, or an empty text if they fit.
 
-    Mean elements over the first revolution after `utc` are compared, and the largest distance. The tolerances
-    also hold for an orbit that is
-    described by mean elements instead of osculating ones: J2 varies the semi-major axis by the fraction
-    k = 3/2 J2 (R/p)^2 and the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid
-    elements, and OrbitError if SGP4 cannot propagate them to the first revolution.
+    The mean elements of both orbits over the first revolution after `utc` are compared, and their largest
+    distance in this revolution is limited. The tolerances also hold for an orbit that is described by mean
+    elements instead of osculating ones: J2 varies the semi-major axis by the fraction k = 3/2 J2 (R/p)^2 and
+    the eccentricity by at most 2 k in a revolution. Raises UsageError for invalid elements, and OrbitError if
+    SGP4 cannot propagate them to the first revolution.
     """
     date = julian_date(utc)
     start, known = elements(orbit, date), TwoLineElements(*lines)

@@ -244,7 +244,7 @@ class Recovery:
 
     def reset(self) -> None:
         """Record that the unit has restarted, and therefore runs with the settings in its flash memory."""
-        # The first sample after a recovery shows the old restart, which the recovery has already handled.
+        # The time stamp of the first sample after a recovery reveals a restart that was handled already.
         self._was_reset = not self._is_fresh
 
     def advance(
@@ -296,9 +296,9 @@ class Recovery:
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
         """Listen at the current baud rate and then either configure the unit or change the baud rate.
 
-        The unit is configured if valid packets arrive or if the line is silent. If only invalid bytes arrive,
-        the configuration is first tried at the configured baud rate, because these bytes may be packets with
-        an unknown layout.
+        The driver starts to configure the unit if valid packets arrive or if the line stays silent. If only
+        invalid bytes arrive, the driver first tries to configure the unit at the configured baud rate,
+        because these bytes may be packets with an unknown layout.
         """
         assert self._listening_since_ns is not None
         if packets > self._packets:
@@ -435,7 +435,7 @@ class ReadingConverter:
         self._settings = settings
         matrices = (settings.gyro_matrix, settings.field_matrix)
         gyro, magnetometer = (np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in matrices)
-        # One product maps a whole sample: quaternion, rate, magnetic field and acceleration.
+        # This matrix maps a whole sample in one product: quaternion, rate, magnetic field and acceleration.
         self._map: FloatArray = np.zeros((13, 13))
         self._map[:4, :4] = settings.attitude_map
         self._map[4:7, 4:7] = gyro @ settings.mounting
