@@ -29,7 +29,7 @@ from hal.interfaces.guardian import CoilReach
 from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
-"""Driver classes of pluggable serial lines and video devices. I2C buses are not pluggable: no classes."""
+"""Driver classes of pluggable serial lines and video devices; I2C buses are not pluggable and have none."""
 _CLASSES = {"inertial_unit": SERIAL, "gps": SERIAL, "camera": VIDEO}
 """Driver classes by the kind of a device."""
 

@@ -25,7 +25,7 @@ from releases import MANIFEST, linked, manifest_text
 SOURCE = "source"
 """File of a release with the SHA-256 digest of its sources and build options."""
 LOCK = "requirements.lock"
-"""Copy, in a release, of the lock file from which the packages of the release were installed."""
+"""Name of the lock file's copy in a release; the packages of the release were installed from this file."""
 SELF_TEST_S = 10
 _PARTS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"

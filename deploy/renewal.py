@@ -42,7 +42,7 @@ DOWN_S = 180.0
 FIRST_CONTACT_S = 60.0
 """Time (s) that a flight must last before its note about a renewal is deleted."""
 MOST_TRIES = 3
-"""Maximum number of attempts to build a release; the end of the process or a power loss ends an attempt."""
+"""Maximum number of attempts to build a release. A killed process or a power loss ends an attempt early."""
 LARGEST_RECORD, LARGEST_BUNDLE = 1 << 16, 128 << 20
 """Maximum sizes (bytes) of a record (request or state) and of a bundle."""
 KEPT_REPORTS, KEPT_REQUESTS = 16, 64

@@ -33,7 +33,7 @@ _SERIAL = {"vn100": "VN-100", "gps": "GPS receiver"}
 _LISTEN_NS = 1_200_000_000
 _LOOK_NS = 20_000_000
 _REGULAR, _PAUSE = 8, 5.0
-"""Limits for loose contact of a serial line: number of pauses between reads, longest over median pause."""
+"""Limits above which a contact is loose: number of pauses between data, ratio of longest to median pause."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -268,7 +268,7 @@ def _opened(out: Path) -> Iterator[IO[str]]:
 
 
 def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
-    """Return the results in the opened file by key, and remove a last line that was cut off by a kill.
+    """Return the results in the opened file by key, and remove a last line that was written incompletely.
 
     Raises UsageError if the folder contains a campaign with another `label`.
     """

@@ -256,7 +256,7 @@ def _address(config: Path, section: Link | None) -> str:
 def _gateway(options: argparse.Namespace, stack: ExitStack) -> Gateway:
     """Return a gateway to the satellite, which `stack` closes.
 
-    The token of the gateway is in a file beside the keys.
+    The token of the gateway is in a file in the folder of the keys.
     """
     token = new_token()
     terminal = stack.enter_context(contextlib.closing(terminal_of(options)))

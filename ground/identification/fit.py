@@ -80,7 +80,7 @@ _MAX_ROUNDS = 25
 _NOISE_STEP = 0.02
 _NOISE_CONVERGED = 0.01
 _GATES = (30.0, 8.0)
-"""Outlier gates in standard deviations of the innovations: the first with assumed noise, then estimated."""
+"""Outlier gates in standard deviations of the innovations, first with assumed, then with estimated noise."""
 _MAX_RESTARTS = 0.02
 """Largest fraction of samples at which the filter may restart."""
 _LAGS = 20

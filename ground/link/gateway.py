@@ -1,10 +1,10 @@
 """Gateway between ground station software, which has no keys, and a protected link.
 
-A connection must begin with the token of the gateway. The token keeps web pages out, which can connect to
-loopback but do not know the token. After the token the connection receives every telemetry packet, live and
-played back, as a stream. The gateway adds time and CRC to each command packet or file transfer packet from
-the connection and sends it in a protected frame. The gateway keeps the sequence count of a command packet,
-because `verification` packets identify a command by this count.
+A connection must begin with the token of the gateway, because web pages can also connect to loopback but do
+not know the token. After the token the connection receives every telemetry packet, live and played back, as a
+stream. The gateway adds time and CRC to each command packet or file transfer packet from the connection and
+sends it in a protected frame. The gateway keeps the sequence count of a command packet, because
+`verification` packets identify a command by this count.
 """
 
 from __future__ import annotations

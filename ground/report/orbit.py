@@ -344,7 +344,7 @@ def requirements(
     pointed: Object | None,
     seen: Object | None,
 ) -> list[Object]:
-    """Compare each value that the configuration's section `requirements` limits with its limit.
+    """Return the comparisons of the results with the limits in the configuration's section `requirements`.
 
     The arguments `detumbled`, `known`, `pointed` and `seen` are the report's results on detumbling, attitude
     knowledge, pointing and the star camera.

@@ -64,7 +64,7 @@ class StepCommand:
 
     @property
     def rise_is_judged(self) -> bool:
-        """Whether the limit of the rise time in the thesis applies, which holds only between two targets."""
+        """Whether the thesis's limit of the rise time applies to this step, which must start at a target."""
         return self.index > 0 and self.from_target
 
 
@@ -261,7 +261,7 @@ def step_row(command: StepCommand, found: StepResponse | None) -> Object:
 
 
 def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Object:
-    """Compare the largest of `values` with the limit: "pass", "miss", or "unknown" if all are NaN."""
+    """Return the largest of `values` and the result for its limit: "pass", "miss", or "unknown" if NaN."""
     known = [value for value in values if not math.isnan(value)]
     worst = max(known, default=math.nan)
     within = worst <= limit * (1.0 + 1e-9)

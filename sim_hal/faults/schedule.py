@@ -179,7 +179,7 @@ _EMULATED = {
     "strings": ("solar_strings", "ads1115"),
     **dict.fromkeys(("coil", "bridge", "pwm"), ("coils", "pca9685")),
 }
-"""Section and driver that a configuration must have for faults of a device, by the device's first word."""
+"""Section and driver that the faults of a device need in the configuration, by the name's first word."""
 
 
 def other_driver(device: str, config: Config) -> str:
