@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -85,13 +82,11 @@ def test_a_newcomer_needs_at_most_ten_commands() -> None:
 
 @pytest.mark.slow
 def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: Path) -> None:
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}
-    _, fly = newcomer()
-    for line in (*fly[:3], f"{fly[3]} --json --no-figures"):
-        done = subprocess.run(
-            ["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
+    """The flight of 150 s is ended soon after the detumbling, which lasts 106 s."""
+    _, (new, check, run, judge) = newcomer()
+    assert "--duration 150" in run
+    for line in (new, check, run.replace("150", "112"), f"{judge} --json --no-figures"):
+        done = command(*shlex.split(line)[1:], folder=tmp_path)
         assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
     (phase,) = json.loads(done.stdout)["detumbling"]["periods"]
     assert phase["slowed"]
