@@ -814,7 +814,7 @@ class Renewal:
             if state.trial is not None:
                 self._begin_revert("no authentic frame arrived")
             what = "configuration accepted on the ground" if step == GROUND else f"previous {step}"
-            text = f"no authentic frame for {state.silent_s:.0f} s: the {what} flies"
+            text = f"no authentic frame for {state.silent_s:.0f} s: the {what} is used"
             if self._go_back(step, "", "command-loss", text):
                 return
             # If the version to which this step returns does not exist, the timer's next step follows at once.
@@ -882,7 +882,9 @@ def boot_id() -> str:
 
 def main(words: Sequence[str]) -> int:
     """Execute one run, and return the exit status."""
-    parser = argparse.ArgumentParser(description="Execute one step of the renewal (docs/fly/renewal.md).")
+    parser = argparse.ArgumentParser(
+        description="Execute one step of the renewal of software or files in orbit (docs/fly/renewal.md)."
+    )
     parser.add_argument("--root", type=Path, default=Path("/"), help="folder of the board's files")
     parser.add_argument("--now", type=float, help="time since boot (s) to assume, for tests")
     parser.add_argument(

@@ -184,7 +184,9 @@ def main() -> int:
     now = time.monotonic()
     tries = Tries(os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], now)
     state = SafeState(tries, now)
-    say(f"the flight software ended too often: start {tries.number} in {state.due - now:.0f} s")
+    say(
+        f"the flight software ended too often: start number {tries.number} follows in {state.due - now:.0f} s"
+    )
     serve(state, os.environ.get("KNIGHTCUBE_COMMANDS", ""))
     tries.keep(time.monotonic())
     say(f"the flight software is started again, start {tries.number}")

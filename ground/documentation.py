@@ -176,7 +176,9 @@ def main() -> None:
     """Print the documentation."""
     parser = argparse.ArgumentParser(prog="python -m ground.documentation", description=__doc__)
     kinds = parser.add_mutually_exclusive_group()
-    kinds.add_argument("--json", action="store_true", help="print the ground database instead of Markdown")
+    kinds.add_argument(
+        "--json", action="store_true", help="print the telemetry database (JSON) instead of Markdown pages"
+    )
     kinds.add_argument("--telecommands", action="store_true", help="print the telecommands")
     arguments = parser.parse_args()
     if arguments.json:

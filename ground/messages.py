@@ -251,7 +251,7 @@ def _of_magnitudes(sigma: FloatArray) -> list[str]:
         return []
     return [
         f"COMMENT Standard deviation of MAG {np.median(known):.3f} in the median, {known.max():.3f} at most:",
-        "COMMENT the scatter of the sightings, without the common error by star colours.",
+        "COMMENT the scatter of the sightings, without the common error due to star colours.",
     ]
 
 
@@ -366,8 +366,9 @@ def _message(item: ObjectOrbit) -> list[str]:
     version, *header = _header("CCSDS_OPM_VERS = 3.0")
     return [
         version,
-        f"COMMENT First orbit by angles only: {item.sightings} sightings in {item.span:.0f} s.",
-        f"COMMENT Distance {1e-3 * orbit.distance:.1f} km at the epoch, {low:.1f} to {high:.1f} km by 95 %.",
+        f"COMMENT Initial orbit from angles only: {item.sightings} sightings in {item.span:.0f} s.",
+        f"COMMENT Distance {1e-3 * orbit.distance:.1f} km at the epoch, "
+        f"{low:.1f} to {high:.1f} km at 95 % confidence.",
         *header,
         f"OBJECT_NAME = OBJECT-{item.number}",
         "OBJECT_ID = UNKNOWN",

@@ -246,15 +246,16 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
             "A, noise of the current of a coil [computed]",
         ),
         "",
-        ("pointing:", "body +z points to the goal, and +x along the flight if the roll is given"),
+        ("pointing:", "body +z points to the goal, +x in the direction of flight if the roll is given"),
         (
             f"  roll: {values.roll:g}",
-            f"rad, roll error ({math.degrees(values.roll):.0f} deg) of the same cost as 1 deg [computed]",
+            f"rad, roll error ({math.degrees(values.roll):.0f} deg) with the same cost as a pointing "
+            "error of 1 deg [computed]",
         ),
         *_cone_lines(satellite),
         "",
         "targets:",
-        ("  - {at: 0.0, point: nadir, roll_deg: 0.0}", "body +z down, +x along the flight"),
+        ("  - {at: 0.0, point: nadir, roll_deg: 0.0}", "body +z down, +x in the direction of flight"),
         "",
         ("requirements:", "requirements that `knightcube report` checks; null: not checked"),
         (

@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 
     i2c = devices.add_parser(
         "i2c",
-        help="the coils' I2C bus, for unchanged programs",
+        help="the coils' I2C bus as /dev/i2c-N, for any program",
         description="Serve the PWM chip and the current monitor of a configuration's coils, in real time, to "
         "programs that open /dev/i2c-N themselves.",
         epilog=_I2C_EXAMPLES,
@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--bus", type=int, choices=range(256), default=1, metavar="N", help="serve /dev/i2c-N (default 1)")
     add("--seed", type=_seed, default=1, help="seed of the currents' noise (default 1)")
     add("--duration", type=_positive, metavar="S", help="end after S seconds")
-    add("--json", action="store_true", help="print one JSON object instead of the environment")
+    add("--json", action="store_true", help="print one JSON object instead of environment variables")
     i2c.set_defaults(command=emulate_i2c.emulate)
 
     serve = commands.add_parser(

@@ -76,7 +76,7 @@ if TYPE_CHECKING:
     from sim_hal.rig import EmulatedBench, PosedCamera, SimulationRequest
 
 NO_CAMERA = (
-    "real devices are flown: give `{driver: v4l2, path: ...}` or `{driver: aravis, name: ...}`, or "
+    "the flight uses real devices: give `{driver: v4l2, path: ...}` or `{driver: aravis, name: ...}`, or "
     "give `camera: none`"
 )
 _BEFORE_ELEMENTS = 365.0

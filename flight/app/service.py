@@ -618,10 +618,10 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
         except ConfigError:  # the stored configuration was flown with another software version
             continue
         return Chosen(
-            one.path, one.text, f"{path}: {problem}: the last configuration that has flown is used; {_CURE}"
+            one.path, one.text, f"{path}: {problem}: the configuration of an earlier flight is used; {_CURE}"
         )
     if os.path.lexists(sum_file(path)) or folder is not None:
-        problem += f", and no configuration that has flown is stored; {_CURE}"
+        problem += f", and no configuration of an earlier flight is stored; {_CURE}"
     raise UnreadConfigError(str(path), problem)
 
 

@@ -83,7 +83,7 @@ PING = telecommand(
     "ping",
     0x201,
     "Answer without any other effect",
-    Field("number", "u4", "-", "number that the answer repeats"),
+    Field("number", "u4", "-", "number that the reply echoes"),
 )
 SAFE = telecommand(
     "safe",

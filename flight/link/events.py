@@ -107,7 +107,7 @@ COIL_TRUSTED = _info(35, "coil-trusted", "an isolated coil is used again, by com
 COIL_CORRECTED = _warning(
     143, "coil-corrected", "a coil is used with another sign or gain, because the motion shows it"
 )
-COIL_TESTED = _info(144, "coil-tested", "coils that pointing hardly uses were tested by short currents")
+COIL_TESTED = _info(144, "coil-tested", "coils that pointing hardly uses were tested by short current pulses")
 COIL_SUSPECT = _warning(
     36, "coil-suspect", "the supply current does not match the commanded currents; the faulty coil is unknown"
 )
@@ -155,13 +155,17 @@ STATE_LOST = _warning(
     62, "state-lost", "both copies of the stored state are damaged; default values are used"
 )
 STATE_UNWRITTEN = _warning(63, "state-unwritten", "the state cannot be written to disk")
-STATE_OLD = _warning(98, "state-old", "the stored state lacks boots, which counts as an unclean shutdown")
+STATE_OLD = _warning(
+    98, "state-old", "the stored state precedes the last boot, so the last shutdown counts as unclean"
+)
 PARAMETERS_LEFT = _warning(
     115, "parameters-left", "the loaded parameter table is rejected and the previous table is used"
 )
 START_WAITED = _warning(99, "start-waited", "the start failed and was repeated; the text gives the reason")
 CONFIG_DAMAGED = _warning(
-    67, "config-damaged", "the configuration is not the accepted one; the last flown configuration is used"
+    67,
+    "config-damaged",
+    "the configuration is not the accepted one; the configuration of an earlier flight is used",
 )
 LENS_CHANGED = _warning(157, "lens-changed", "a frame contradicts the learned lens, which is learned again")
 LEARNED_REFUSED = _warning(68, "learned-refused", "implausible or contradicted learned values were rejected")
@@ -210,7 +214,7 @@ SUN_CLEAR = _info(107, "sun-clear", "the solar strings detect the Sun again")
 CLOCK_OFF = _warning(
     130,
     "clock-off",
-    "the wall clock differs from the time of the GPS receiver, which is used, or precedes the elements",
+    "the wall clock differs from GPS time, which is used instead, or precedes the epoch of the elements",
 )
 FIELD_REFUSED = _warning(
     131, "field-refused", "the magnetometer is ignored because its value is stuck or contradicts the estimate"
@@ -247,7 +251,7 @@ BATTERY_CHARGED = EventKind(
     164,
     "battery-charged",
     Severity.INFORMATION,
-    "the battery has recovered; a flight in SAFE because of the battery continues",
+    "the battery has recovered; a flight in SAFE because of the battery leaves SAFE",
     Reaction.RETURN,
 )
 POWER_SENSOR_LOST = _warning(
@@ -258,7 +262,9 @@ POWER_SENSOR_RECOVERED = _info(
 )
 
 WORK_SHED = _warning(170, "work-shed", "the processor is overloaded, so less important work is reduced")
-WORK_RESTORED = _info(171, "work-restored", "reduced work is done again, because the processor has room")
+WORK_RESTORED = _info(
+    171, "work-restored", "reduced work is resumed, because the processor has spare capacity"
+)
 
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)

@@ -559,7 +559,7 @@ class CoilMonitor:
         for axis in self.correction.unreviewed:
             if slow and response.is_healthy(axis):
                 self.correction.confirm(axis)
-                self._tell(axis, f"{response.text(axis)} while the body is slow, which confirms its sign")
+                self._tell(axis, f"{response.text(axis)} while the body is slow: the sign is confirmed")
         known = self._verdicts.keys() | self._rests.keys() | self._settings.absent
         # An uncommanded current also produces a torque, which could be mistaken for that of a reversed coil.
         if not self._leg.suspicion and (not self._strangeness or self._prime is not None):

@@ -193,14 +193,14 @@ def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]
     seen: set[str] = set()
     for fact in facts:
         if fact.name in seen:
-            raise FlightError(f"fact {fact.name} is listed twice in the table")
+            raise FlightError(f"condition {fact.name} is listed twice in the table")
         seen.add(fact.name)
         if fact.after < 1 or fact.mended_after < 1:
-            raise FlightError(f"fact {fact.name}: a number of updates must be at least 1")
+            raise FlightError(f"condition {fact.name}: the numbers of updates must be at least 1")
         if not fact.modes & modes_of(fact.begins.reaction):
             raise FlightError(
-                f"fact {fact.name}: its reaction {fact.begins.reaction.name.lower()} has no effect "
-                "in any mode in which the fact is watched"
+                f"condition {fact.name}: its reaction {fact.begins.reaction.name.lower()} has no effect "
+                "in any mode in which the condition is monitored"
             )
 
 

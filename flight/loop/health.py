@@ -614,10 +614,14 @@ LEVELS: tuple[ShedLevel, ...] = (
     ShedLevel(True, True, 1, 1, "all work is done"),
     ShedLevel(False, True, 1, 1, _NEWEST),
     ShedLevel(False, False, 1, 1, f"{_NEWEST}, no search for objects"),
-    ShedLevel(False, False, 2, 1, f"{_NEWEST}, no search for objects, 1 of 2 frames"),
-    ShedLevel(False, False, 2, 2, f"{_NEWEST}, no search for objects, 1 of 2 frames and periodic plans"),
-    ShedLevel(False, False, 4, 4, f"{_NEWEST}, no search for objects, 1 of 4 frames and periodic plans"),
-    ShedLevel(False, False, 8, 8, f"{_NEWEST}, no search for objects, 1 of 8 frames and periodic plans"),
+    ShedLevel(False, False, 2, 1, f"{_NEWEST}, no search for objects, half of the frames"),
+    ShedLevel(False, False, 2, 2, f"{_NEWEST}, no search for objects, half of the frames and periodic plans"),
+    ShedLevel(
+        False, False, 4, 4, f"{_NEWEST}, no search for objects, a quarter of the frames and periodic plans"
+    ),
+    ShedLevel(
+        False, False, 8, 8, f"{_NEWEST}, no search for objects, an eighth of the frames and periodic plans"
+    ),
 )
 """Levels of load shedding, from no reduction to the strongest reduction of the work."""
 

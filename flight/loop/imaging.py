@@ -325,7 +325,8 @@ class FrameReport:
         """Record the lens parameters, and report if the frame contradicted the parameters `before` it."""
         if lens.contradictions > before.contradictions:
             text = (
-                f"frame {frame.sequence} contradicts the lens of {before.frames} frames: it is learned again"
+                f"frame {frame.sequence} contradicts the lens estimated from {before.frames} frames: "
+                "the lens is estimated again"
             )
             self._events.report(events.LENS_CHANGED, now_ns, text)
         f, x, y, k1, k2, line_time, psf_sigma = lens.learned[0].tolist()

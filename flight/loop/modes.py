@@ -52,7 +52,7 @@ class Trigger(Enum):
     DETUMBLED = "rate is low"
     SLOWED = "rate is low, attitude unknown"
     ARRIVED = "arrived"
-    KNOWN_SUN = "attitude known, to the sun"
+    KNOWN_SUN = "attitude known, turn to the Sun"
     KNOWN_POINT = "attitude known"
     LOST = "attitude lost"
     CHARGED_ACQUIRE = "battery charged, acquire"
@@ -163,7 +163,9 @@ def check(table: Table) -> None:
             if row[trigger] is not Mode.SAFE and not (
                 mode is Mode.SAFE and row[trigger] is TriggerAnswer.STAY
             ):
-                raise FlightError(f"mode table: {trigger.value!r} does not lead from {mode.label} to safe")
+                raise FlightError(
+                    f"mode table: trigger {trigger.value!r} does not change {mode.label} to safe"
+                )
         if not any(isinstance(to, Mode) and to is not mode for to in row.values()):
             raise FlightError(f"mode table: {mode.label} is a dead end")
         if mode is not Mode.BOOT and Mode.BOOT in row.values():

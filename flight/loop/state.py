@@ -452,7 +452,7 @@ class StateStore:
         if newest is None or newest.copy is None:
             if not bad:
                 return StoredState()
-            self._report(events.STATE_LOST, f"{bad}: defaults are used, which counts as an unclean shutdown")
+            self._report(events.STATE_LOST, f"{bad}: defaults are used; the last shutdown counts as unclean")
             return StoredState(running=True)
         self._generation = newest.copy.generation
         if bad:
@@ -570,7 +570,8 @@ class StateKeeper:
         loaded = store.load()
         if boots > loaded.boot_count:
             notices.report(
-                events.STATE_OLD, f"the state is of boot {loaded.boot_count}, but boot {boots} is recorded"
+                events.STATE_OLD,
+                f"the state was saved in boot {loaded.boot_count}, but boot {boots} is recorded",
             )
             loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
         self._begun = begin_boot(loaded, self._label(), devices)

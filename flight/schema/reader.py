@@ -219,7 +219,7 @@ def _check_coils(config: Config, refuse: Refuse) -> None:
             refuse(f"coils.windings[{index}].axis", problem)
     count = len(coils.windings)
     if not 2 <= count <= MOST_COILS:
-        refuse("coils.windings", f"has {count} entries: 2 to {MOST_COILS} coils can be flown")
+        refuse("coils.windings", f"has {count} entries: 2 to {MOST_COILS} coils are supported")
     used = [channel for index, coil in enumerate(coils.windings) for channel in coil.pins(index)]
     if len(set(used)) != len(used):
         twice = next(channel for channel in used if used.count(channel) > 1)

@@ -202,7 +202,14 @@ def _noise_findings(part: str, values: FloatArray, sigma: float, unit: str) -> l
     if noise.min() < 1e-3 * sigma:
         axes = ", ".join(axis for axis, value in zip(_AXES, noise, strict=True) if value < 1e-3 * sigma)
         text = f"its values on {axes} do not change: noise {noise.min():.1e} {unit}, expected {sigma:.2g}"
-        return [Finding(part, "stuck", text, "switch the unit off and on; replace it if the values stay")]
+        return [
+            Finding(
+                part,
+                "stuck",
+                text,
+                "switch the unit off and on; replace it if the values still do not change",
+            )
+        ]
     return []
 
 
@@ -755,7 +762,9 @@ def _wrong_current(test: CoilTest, state: CoilsFound, common: float, size_known:
     cure = f"set `shunt` to the fitted value, {bound}{common:.3g} times the configured value"
     if size_known or not 0.3 < common < 3.0:
         return [Finding("power_monitor", "wrong shunt", text, cure)]
-    cure = "check the shunt, `supply_voltage` and the resistances; the field strengths are not configured"
+    cure = (
+        "check the shunt, `supply_voltage` and the resistances; the configuration states no field strengths"
+    )
     return [Finding("power_monitor", "wrong current", text, cure)]
 
 

@@ -87,7 +87,7 @@ def _monitor_faults(key: str, power: Power, rest: PowerReading, driven: PowerRea
                 key,
                 "stuck",
                 text,
-                "switch it off and on, and check its wiring; replace it if the readings stay",
+                "switch it off and on, and check its wiring; replace it if the readings still do not change",
             )
         ]
     low, high = 0.9 * power.battery.voltage(0.0), 1.05 * power.battery.voltage(1.0)
@@ -201,7 +201,11 @@ def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
     utc, positions = np.array([one.utc_ns for one in fixes]), np.array([one.position for one in fixes])
     if len(fixes) > 2 and (np.diff(utc) == 0).mean() > 0.5:
         text = f"its time does not advance in {len(fixes)} fixes"
-        return [Finding("gps", "stuck", text, "switch it off and on; replace it if the fix stays")]
+        return [
+            Finding(
+                "gps", "stuck", text, "switch it off and on; replace it if the time still does not advance"
+            )
+        ]
     findings = []
     if abs(offset) > _CLOCK_S:
         text = f"its time differs from that of this computer by {-offset:.0f} s"

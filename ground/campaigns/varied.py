@@ -191,7 +191,7 @@ def _below(holder: Any, step: Any, one: Variation, path: Sequence[Any]) -> Any:
         return holder[step]
     names = [str(name) for name in holder] if isinstance(holder, dict) else []
     near = difflib.get_close_matches(str(step), names, 3) or names
-    cure = f"one of {', '.join(near)}" if near else "a range such as 1..5 instead, if the key exists"
+    cure = f"one of {', '.join(near)}" if near else "a range such as 1..5, which needs no configured value"
     place = ".".join(map(str, path))
     raise UsageError(f"--vary {one.key}={one.text}: the configuration has no value {place}: give {cure}")
 

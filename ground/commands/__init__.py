@@ -9,7 +9,11 @@ COMMANDS = {
     ),
     "keys": ("operate", "make keys for an authenticated link", "station:configure_keys"),
     "files": ("operate", "list, get and put the files of a satellite", "satellite:configure_files"),
-    "renewal": ("operate", "sign, activate and confirm a renewal of a satellite", "renewal:configure"),
+    "renewal": (
+        "operate",
+        "sign, activate and confirm new software or files of a satellite",
+        "renewal:configure",
+    ),
     "gateway": (
         "operate",
         "relay plain packets between a ground station and the link",
@@ -58,7 +62,7 @@ COMMANDS = {
         "samples:configure_samples",
     ),
     "horizon": ("sky", "find the nadir in a picture of the Earth's limb", "horizon:configure"),
-    "bringup": ("fly", "lead through the first bench session with new hardware", "bringup:configure"),
+    "bringup": ("fly", "guide you through the first bench session with new hardware", "bringup:configure"),
     "calibrate": ("sky", "calibrate a camera's lens from pictures of the sky", "calibrate:configure"),
 }
 """Group and purpose of each command, and the module and function that add its arguments to a parser."""

@@ -41,13 +41,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube bringup` to the parser."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     purpose = (
-        "Lead through the first bench session with new hardware. Find each device; measure rate and noise "
-        "of the inertial unit; check its axes by a turn about each body axis; drive each coil briefly, and "
-        "check its sign and strength by the magnetometer and the supply current; take dark and first-light "
-        "frames; show the PSF width for focusing; calibrate the lens. Each fault is named with its cure. The "
-        f"folder keeps the results ({REPORT}), pictures, and {FRAGMENT}: the measured values as a "
-        "configuration that extends CONFIG. A repeated command continues after the last finished step. Exit "
-        "status 0: no fault; 1: faults, or steps that could not be done."
+        "Guide you through the first bench session with new hardware. Find each device; measure rate and "
+        "noise of the inertial unit; check its axes by a turn about each body axis; drive each coil briefly, "
+        "and check its sign and strength by the magnetometer and the supply current; take dark and "
+        "first-light frames; show the PSF width for focusing; calibrate the lens. Each fault is reported "
+        f"with its remedy. The folder keeps the results ({REPORT}), pictures, and {FRAGMENT}: the measured "
+        "values as a configuration that extends CONFIG. Run the same command again to continue after the "
+        "last finished step. Exit status 0: no fault; 1: faults, or steps that could not be done."
     )
     parser.description = textwrap.fill(purpose, 100)
     parser.epilog = (
@@ -68,7 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="CONFIG2",
         help="emulate devices with the wiring of this configuration, which may differ from CONFIG",
     )
-    parser.add_argument("--yes", action="store_true", help="do not wait for a person's answers")
+    parser.add_argument("--yes", action="store_true", help="do not wait for answers of the operator")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run, out=Path("bringup"))
 

@@ -194,7 +194,7 @@ def _camera_section(terms: DeterminedLens) -> str:
         f"  columns: {lens.columns}",
         f"  rows: {lens.rows}",
         f"  field_of_view_deg: {_field_of_view(terms):.6f}",
-        "  lens:                       # px; the pixel (x, y) on the axis; radial distortion of tangents",
+        "  lens:                       # px; pixel (x, y) on the optical axis; k1, k2 in the tangent plane",
         f"    focal_length: {lens.focal_length:.4f}",
         f"    centre: [{lens.centre[0]:.4f}, {lens.centre[1]:.4f}]{assumed}",
         *(f"    {name}: {getattr(lens, name):.8f}" for name in ("k1", "k2") if name not in omitted),

@@ -18,10 +18,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Fly a simulated configuration many times, each time with values that are drawn from stated "
         "distributions, and with its own noise. Prints a table of the figures that the report judges, "
-        "with the drawn value of the strongest influence, and lists failed flights with the command that "
-        "flies each again. Draws the figures over the drawn values (extra `plots`). All cores fly, or a Dask "
-        "cluster (extra `dask`). An interrupted campaign continues with the same command. Exit status 0 if "
-        "every flight is within its limits, otherwise 1."
+        "each with the varied value that influences it most, and lists failed flights with the command that "
+        "repeats each. Plots the figures against the drawn values (extra `plots`). The flights run on all "
+        "cores, or on a Dask cluster (extra `dask`). After an interruption, run the same command again to "
+        "continue. Exit status 0 if every flight is within its limits, otherwise 1."
     )
     parser.epilog = (
         f"example: {PROGRAM} campaign orbit_3u --vary craft.inertia=10% --vary detumble.act=0.5..2 --runs 50"
@@ -77,10 +77,10 @@ def run(options: argparse.Namespace) -> int:
             only=options.only,
         )
     except KeyboardInterrupt:
-        sys.stderr.write(f"\ninterrupted; the same command continues in {out}\n")
+        sys.stderr.write(f"\ninterrupted; run the same command again to continue in {out}\n")
         return 130
     except CampaignError as error:
-        raise CampaignError(f"{error}; the same command continues in {out}") from error
+        raise CampaignError(f"{error}; run the same command again to continue in {out}") from error
     sys.stdout.write(json.dumps(found.facts) + "\n" if options.json else found.text)
     try:
         drawn = draw_campaign(results_in(out), out / "campaign.png")

@@ -205,7 +205,7 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
         lines += [
             f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",
             f"from boresight:   {values['from_boresight_deg']:.3f} deg, "
-            f"towards {values['towards_deg']:.3f} deg from right to down",
+            f"towards {values['towards_deg']:.3f} deg (0 right, 90 down)",
             f"1 sigma:          {sigmas[1]:.3f} deg and {sigmas[0]:.3f} deg along the principal axes",
             f"limb:             {nadir.used} edges, residual {nadir.residual:.2f} px rms",
         ]
@@ -289,7 +289,9 @@ def _check_second(options: argparse.Namespace) -> None:
     if options.method != "circle" and options.second is None:
         raise UsageError(f"--method {options.method}: give the other picture with --second")
     if options.method == "graphic" and options.turned is None:
-        raise UsageError("--method graphic: give the angle of the second camera to the right with --turned")
+        raise UsageError(
+            "--method graphic: give with --turned the angle by which the second camera is turned to the right"
+        )
     if options.altitude is None and (options.method != "vector" or options.nadir is None):
         raise UsageError(f"--method {options.method}: it needs --altitude")
     if options.nadir is not None and not np.linalg.norm(options.nadir) > 0.0:
@@ -379,7 +381,7 @@ def _paper_text(method: str, found: _PaperNadir | None, reason: str) -> str:
         f"edges:            {len(found.seen.points)} found\n"
         f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}\n"
         f"from boresight:   {values['from_boresight_deg']:.3f} deg, "
-        f"towards {values['towards_deg']:.3f} deg from right to down\n"
+        f"towards {values['towards_deg']:.3f} deg (0 right, 90 down)\n"
         f"circle:           centre {circle.centre[0]:.1f}, {circle.centre[1]:.1f} px,"
         f" radius {circle.radius:.1f} px\n"
         f"1 sigma:          not available with the method {method}\n"

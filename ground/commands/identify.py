@@ -107,7 +107,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation")
     parser.add_argument(
-        "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
+        "--realtime", action="store_true", help="run simulated devices on the machine's clock"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="draw measured and predicted motion")
@@ -186,7 +186,7 @@ def _quantity_facts(one: LearnedQuantity) -> dict[str, Any]:
 def _table(found: LearnedDescription, folder: Path) -> str:
     """Return the estimated values as a table."""
     lines = [
-        f"flight: {folder}, learned up to {found.time:.0f} s",
+        f"flight: {folder}, values learned until {found.time:.0f} s",
         "",
         f"{'quantity':31s}{'described':>13s}{'learned':>13s}{'claim':>10s}{'change':>14s}",
     ]
@@ -204,8 +204,8 @@ def _fly(options: argparse.Namespace) -> Path:
     """Run a flight with the excitation, and return its folder."""
     if isinstance(configuration.load(options.source), OrbitConfig):
         raise UsageError(
-            f"{options.source}: a satellite is identified from a run: fly it with `knightcube run`, "
-            "and give the folder of the run"
+            f"{options.source}: a satellite is identified from a run: make a run with "
+            "`knightcube run`, and give its folder"
         )
     from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
     from flight.app.run import default_folder  # noqa: PLC0415
@@ -276,12 +276,12 @@ def _text(made: _Identified) -> str:
         f"flight: {made.folder}, {len(record.time)} samples in {record.time[-1] - record.time[0]:.0f} s, "
         f"{len(found.innovations.restarts)} restarts of the filter",
         "",
-        "from the motion, per inertia:",
+        "from the motion, divided by the inertia:",
     ]
     for name in NAMES:
         value = f"{getattr(found.constants, name):+12.5e} +- {found.sigma(name):.1e} {UNITS[name]}"
         lines.append(f"  {name + ':':18s}{value}, configured {getattr(before, name):.4g}")
-    lines += ["", "with the scale, which the motion does not determine:"]
+    lines += ["", "absolute values, whose common scale the motion does not determine:"]
     for name, unit in _ABSOLUTE_UNITS.items():
         scaled = getattr(plant, name)
         label, value = name.replace("_", " ") + ":", f"{scaled.value:12.5e} +- {scaled.sigma:.1e} {unit}"

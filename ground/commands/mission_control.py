@@ -68,7 +68,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "limits, transfers files, executes command stacks and, with --station or --stations, shows the "
         "passes on its timeline. Needs Java 17 and the extra `interop`. Loopback only. Ctrl-C ends."
     )
-    parser.add_argument("config", type=config_path, metavar="CONFIG", help="configuration that is flown")
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help="configuration of the flight")
     way = parser.add_mutually_exclusive_group()
     text = "address of the satellite's link (default `link.udp`, or `link.tcp`, of CONFIG)"
     way.add_argument("--link", metavar="ADDRESS", help=text)

@@ -194,7 +194,7 @@ def _lines(found: list[Pass]) -> list[str]:
         for one in found
     ]
     head = ["station", "rise UTC", "az", "top", "az", "elevation", "km", "set", "az", "s", "satellite", "Sun"]
-    note = "  az: azimuth, deg; km: distance at the top; Sun: its elevation at the station, deg"
+    note = "  az: azimuth, deg; km: distance at the top (culmination); Sun: its elevation at the station, deg"
     return [*table(head, rows), note]
 
 

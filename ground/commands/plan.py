@@ -52,10 +52,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "knightcube plan --orbit orbit --from nadir --to sun --at 2026-03-01T12:00:00 --within 600"
     )
     parser.add_argument(
-        "--from", dest="start", required=True, metavar="Q2", help="q2 at the start; with --orbit a target"
+        "--from",
+        dest="start",
+        required=True,
+        metavar="Q2",
+        help="q2 at the start, or a target such as nadir with --orbit",
     )
     parser.add_argument(
-        "--to", dest="end", required=True, metavar="Q2", help="q2 at the end; with --orbit a target"
+        "--to",
+        dest="end",
+        required=True,
+        metavar="Q2",
+        help="q2 at the end, or a target such as sun with --orbit",
     )
     parser.add_argument("--from-rate", type=finite, metavar="W", help="rad/s at the start (default 0)")
     parser.add_argument("--to-rate", type=finite, metavar="W", help="rad/s at the end (default 0)")
@@ -304,7 +312,9 @@ def _target(option: str, text: str) -> PointingTarget:
     try:
         goal = Goal.named(words[0] if words else "")
         if goal is Goal.OBJECT:
-            raise UsageError("an object is detected in flight: no slew can be planned to it")
+            raise UsageError(
+                "the direction of an object is known only in flight: no slew to it can be planned"
+            )
         split = 1 + NUMBERS.get(goal, (0,))[-1]
         numbers, rest = [finite(word) for word in words[1:split]], words[split:]
         roll = math.radians(finite(rest[1])) if len(rest) == 2 and rest[0] == "roll" else None

@@ -200,7 +200,7 @@ def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:
         lines.append(f"rate x, y, z:  {values} mrad/s")
         lines.append(f"magnitude:     {1e3 * size:.4f} mrad/s +- {100.0 * spread / size:.3f} %")
     if found.status is StreakStatus.AMBIGUOUS:
-        lines.append("direction:     unknown, the rate may be its opposite: give --prior")
+        lines.append("direction:     unknown, the rate may have the opposite sign: give --prior")
     length = f", {found.length:.1f} px long" if math.isfinite(found.length) else ""
     lines.append(f"streaks:       {found.found} found, {found.used_count} used{length}")
     for item in objects:

@@ -53,8 +53,8 @@ _TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube renewal` to the parser."""
     parser.description = (
-        "Renew a satellite in orbit: make signing keys, sign a configuration, elements, a sky index or a "
-        "release, and activate, confirm or withdraw it over the link."
+        "Update software or files of a satellite in orbit: make signing keys, sign a configuration, "
+        "elements, a sky index or a release, and activate, confirm or withdraw it over the link."
     )
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
     keys = words.add_parser("keys", help="make root keys, a signing key and the first metadata")
@@ -225,7 +225,7 @@ def _command(options: argparse.Namespace) -> int:
     if not reports[-1].stage.final:
         raise FlightError(
             f"no result of the renewal within {timeout:g} s: look at the telemetry, and send `confirm` or "
-            "`withdraw`, whose answer says whether a trial is running"
+            "`withdraw`; the reply to either states whether a trial is running"
         )
     return 0
 

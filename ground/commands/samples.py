@@ -73,9 +73,9 @@ def _progress(name: str) -> None:
 def configure_index(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube index` to the parser."""
     parser.description = (
-        "Make the sky index of one camera: triangles that fit into its field of view, of stars down to its "
-        "faintest, with merged pairs that its pixels do not resolve. The configuration's "
-        "camera.star_tracker.index, or --index of `knightcube solve`, names the file."
+        "Make the sky index of one camera: triangles that fit into its field of view, of the stars that it "
+        "detects. Pairs of stars that its pixels do not resolve are merged. The file is named by "
+        "camera.star_tracker.index of a configuration, or by --index of `knightcube solve`."
     )
     parser.epilog = "example: knightcube index --camera flight.yaml --faintest 6.5 --out mission.index"
     add_field(parser, required=True)

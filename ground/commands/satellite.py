@@ -157,7 +157,7 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     words.add_parser("stop-playback", help="with --link: end the playback")
     timed = words.add_parser("schedule", help="with --link: execute a command at a UTC")
     timed.add_argument("at", metavar="UTC", help="such as 2026-11-23T21:00:00")
-    text = "a command as it is typed without schedule, such as point nadir --roll 90"
+    text = "the command and its arguments, such as point nadir --roll 90"
     timed.add_argument("words", nargs=argparse.REMAINDER, metavar="WHAT", help=text)
     deleted = words.add_parser("unschedule", help="with --link: delete a scheduled command")
     deleted.add_argument("number", type=int, metavar="N", help="number in list-schedule; 0 deletes all")
@@ -206,7 +206,7 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
             "frame, scalar last; to ground LAT LON, degrees; or to object, the moving object that the star "
             f"camera detects in its field of view, or near RA DEC, degrees. Hazard: {POINT.hazard}."
         )
-        text = "numbers of inertial, ground and object"
+        text = "QX QY QZ QW of inertial, LAT LON of ground, RA DEC of object"
         parser.add_argument("goal", choices=[goal.label for goal in Goal])
         parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help=text)
         parser.add_argument(
@@ -488,7 +488,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube files` to the parser."""
     parser.description = (
         "List the files of a satellite, get files from it and put files on it over its link. Received data "
-        "is kept after Ctrl-C, and the same command later continues. Exit status 1 if a file is incomplete."
+        "is kept after Ctrl-C; run the same command again to continue. Exit status 1 if a file is incomplete."
     )
     add_link_options(parser, parser.add_mutually_exclusive_group(required=True))
     _add_spi(parser)
@@ -668,7 +668,7 @@ class _FileWork:
             self._session.take(self._terminal.take(), time.monotonic_ns())
         now_ns = time.monotonic_ns()
         self._session.transmit(now_ns)
-        kept = "; the received data is kept, and the same command continues" if name else ""
+        kept = "; the received data is kept: run the same command again to continue" if name else ""
         if self._ended():
             raise FlightError(f"ended by a signal{kept}")
         if now_ns - self._session.received_ns > self._patience_s * 1e9:

@@ -248,8 +248,8 @@ QUESTIONS = (
     Question(
         "coil",
         "KEY=VALUE,...",
-        "equal coils by axis, dipole (A m^2) at the current limit (A), and resistance (ohm), such as "
-        f"{COIL_EXAMPLE}; an air coil also by turns and area (m^2) instead of the dipole",
+        "equal coils, one along each named axis: dipole (A m^2) at the current limit (A), and resistance "
+        f"(ohm), such as {COIL_EXAMPLE}; for an air coil turns and area (m^2) can replace the dipole",
         read_coils,
     ),
     Question("star-camera", "DEG", "field of view of the star camera, deg, or none", _read_camera, "20"),
@@ -305,7 +305,7 @@ def _perigee_problem(altitude: float, eccentricity: float) -> str:
     most = math.floor(1e4 * (altitude - _LOWEST_PERIGEE) / axis) / 1e4
     return (
         f"the perigee is at {perigee:.0f} km, below {_LOWEST_PERIGEE:g} km: "
-        f"at {altitude:g} km give an eccentricity up to {most:g}"
+        f"for a mean altitude of {altitude:g} km give an eccentricity up to {most:g}"
     )
 
 

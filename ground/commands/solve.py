@@ -90,14 +90,15 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=tuple(METHODS),
         default=DEFAULT_METHOD,
-        help="identification; all methods except the default need the field to 1.8 %%: see --fov-error",
+        help="identification; all methods except the default need a field of view known to within 1.8 %%: "
+        "see --fov-error",
     )
     parser.add_argument(
         "--attitude",
         choices=(IMAGE, *SOLVERS),
         default=IMAGE,
-        help="image: the fit in the image, each star with its own covariance (default); else a solver of "
-        "directions",
+        help="image: fit of the star positions in the image, each with its own covariance (default); the "
+        "other methods solve Wahba's problem for the directions of the stars",
     )
     parser.add_argument(
         "--centroid",
@@ -232,9 +233,9 @@ def _text(solution: StarSolution, seconds: float) -> str:
         f"declination:      {solution.declination_deg:+.4f} deg",
         f"roll:             {solution.roll_deg:.3f} deg",
         f'1 sigma:          {sigma[0]:.2f}" x, {sigma[1]:.2f}" y, {sigma[2]:.1f}" about the boresight',
-        f'field of view:    {solution.field_of_view_deg:.4f} deg across, {per_pixel:.2f}" a pixel',
+        f'field of view:    {solution.field_of_view_deg:.4f} deg across, {per_pixel:.2f}" per pixel',
         f"stars:            {len(stars)} of {len(frame.points)} {frame.kind.value} matched,"
-        f" residual {rms:.2f} px rms an axis",
+        f" residual {rms:.2f} px rms per axis",
         f"by chance:        10^{solution.log10_false_alarm:.0f}",
     ]
     if solution.mirrored:
@@ -258,5 +259,5 @@ def _motion_text(solution: StarSolution) -> list[str]:
     values = "  ".join(f"{rate:+.4f} +- {spread:.4f}" for rate, spread in each)
     lines = [length, f"rate x, y, z:     {values} mrad/s"]
     if not solution.rate_sign_known:
-        lines.append("direction:        unknown, the rate may be its opposite: give --prior")
+        lines.append("direction:        unknown, the rate may have the opposite sign: give --prior")
     return lines

@@ -119,7 +119,7 @@ def configure_watch(parser: argparse.ArgumentParser) -> None:
         help="folder of a run or of an archive, a socket, or HOST:PORT",
     )
     add_link_options(parser, way)
-    text = "mission time between plain lines (default %(default)g s)"
+    text = "mission time between printed lines (default %(default)g s)"
     parser.add_argument("--every", type=positive, default=10.0, metavar="S", help=text)
     text = "time without new packets before the command ends (default %(default)g s)"
     parser.add_argument("--patience", type=positive, default=30.0, metavar="S", help=text)
@@ -296,7 +296,10 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--to", metavar="SOCKET", help="send commands to the flight's UNIX socket or HOST:PORT")
     way.add_argument(
-        "--fly", metavar="CONFIG", type=Path, help="fly this simulated configuration into RUN in real time"
+        "--fly",
+        metavar="CONFIG",
+        type=Path,
+        help="simulate this configuration in real time, with the log in RUN",
     )
     add_link_options(parser, way)
     parser.add_argument(
@@ -310,7 +313,7 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME,LAT,LON[,HEIGHT[,MASK]]",
-        help="a ground station of the panel of passes, as for `passes`; may be repeated",
+        help="ground station whose passes the page lists, given as for `passes`; may be repeated",
     )
     parser.add_argument("--stations", type=Path, metavar="FILE", help="YAML file with a list `stations`")
     text = "port of the page, 0 for any (default %(default)s)"

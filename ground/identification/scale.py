@@ -110,7 +110,7 @@ class AbsolutePlant:
             ("field", prior, "inertia and dipole"),
         ):
             share = 100.0 * (getattr(self, name).own_prior or 0.0)
-            found[name] = f"{share:.0f} % {own}, {100.0 - share:.0f} % {others} with the motion"
+            found[name] = f"{share:.0f} % {own}, {100.0 - share:.0f} % motion with {others}"
         return found
 
 

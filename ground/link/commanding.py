@@ -173,8 +173,8 @@ def explained(report: Report) -> str:
     if report.stage is not Stage.REPEATED:
         return report.text
     return (
-        f"{report.text}: the ground's folder of keys is an older copy; its counter is raised as soon as "
-        "telemetry arrives, so send the command again"
+        f"{report.text}: the counter in the ground's folder of keys is too low, because the folder is an "
+        "older copy; the next telemetry raises the counter: then send the command again"
     )
 
 

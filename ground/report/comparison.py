@@ -83,8 +83,8 @@ def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
     power = summary["power"]
     yield "supply at the coils, V |I|, average", (_scaled(power["supply_average_w"], 1e3), "mW")
     yield "supply at the bus, average", (_scaled(power["bus_average_w"], 1e3), "mW")
-    yield "R I^2, heat of steady currents, average", (_scaled(power["heat_average_w"], 1e3), "mW")
-    yield "R I^2, heat of steady currents, energy", (power["heat_j"], "J")
+    yield "heat R I^2 of steady currents, average", (_scaled(power["heat_average_w"], 1e3), "mW")
+    yield "heat R I^2 of steady currents, energy", (power["heat_j"], "J")
     estimate = summary["estimate"] or {}
     yield "estimate: angle, rms error", (_scaled(estimate.get("angle_rms_rad"), 1e3), "mrad")
     yield "estimate: rate, rms error", (_scaled(estimate.get("rate_rms_rad_s"), 1e3), "mrad/s")

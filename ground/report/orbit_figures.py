@@ -421,7 +421,7 @@ def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
     # Dipole perpendicular to the field that produces this torque, relative to the dipole limit (worst axis).
     share = np.max(np.abs(np.cross(field, torque)) / size[:, None] ** 2 / craft.limit, axis=1)
     if share.max() > 0.3:
-        label = "limit across the field in this direction"
+        label = "limit of the torque across the field"
         largest = 1e6 * across / np.where(share > 0.0, share, np.nan)
         ax.plot(times, largest, color=panels.GREY, linestyle=panels.DASHED, label=label)
     panels.style(ax, "torque, µN m", "Torque of the coils", "")

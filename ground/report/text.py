@@ -151,12 +151,12 @@ def _knowledge(found: Object | None) -> list[str]:
         for one in found["description"]
     ]
     if learned:
-        learned.insert(0, "  learned description, rms (inertia relative to the trace, camera in rad):")
+        learned.insert(0, "  estimated parameters, rms (inertia divided by its trace, camera in rad):")
     return [
         "Attitude knowledge",
         f"  {share}; first fine at {number(found['fine_after_s'], 1)} s",
-        f"  error while fine {number(found['fine_error_rms_rad'], 4, DEGREES)} deg rms over three axes "
-        f"({number(found['with_stars_error_rms_rad'], 4, DEGREES)} with stars), "
+        f"  error of the fine attitude {number(found['fine_error_rms_rad'], 4, DEGREES)} deg rms over "
+        f"three axes ({number(found['with_stars_error_rms_rad'], 4, DEGREES)} with stars), "
         f"maximum {number(found['fine_error_worst_rad'], 4, DEGREES)} deg; "
         f"maximum {number(found['worst_sigmas'], 1)} sigma per axis, "
         f"NEES per axis {number(found['nees_per_axis'])}",
@@ -285,7 +285,7 @@ def _power(power: Object, thesis: bool) -> list[str]:
             else []
         ),
         (
-            "R I^2, heat of steady currents",
+            "heat R I^2 of steady currents",
             f"average {number(power['heat_average_w'], 3, 1e3)} mW, total {number(power['heat_j'], 3)} J",
         ),
         (
@@ -403,9 +403,9 @@ def _star_camera(found: Object | None) -> list[str]:
     share = f" ({number(found['share'], 1, 100.0)} %)" if found["share"] is not None else ""
     return [
         f"Star camera: attitude or rate at {found['measured']} of {found['unobstructed']} unobstructed "
-        f"instants{share}; longest gap {number(found['longest_gap_s'], 0)} s",
-        f"  {found['instants']} scheduled instants, {found['slow']} of them below camera.max_rate; "
-        "unobstructed: also outside pointing.cones of Sun and Earth",
+        f"exposures{share}; longest gap {number(found['longest_gap_s'], 0)} s",
+        f"  {found['instants']} scheduled exposures, {found['slow']} of them below camera.max_rate; "
+        "unobstructed: below it and outside the cones of Sun and Earth (pointing.cones)",
     ]
 
 
@@ -419,7 +419,7 @@ def _lens(found: Object | None) -> list[str]:
     (delay, delay_sigma), (psf, psf_sigma) = found["line_time_s"], found["psf_sigma_px"]
     return [
         f"Learned lens: focal length {focal:.2f} +- {focal_sigma:.2f} px, optical axis "
-        f"{x:.2f} +- {x_sigma:.2f}, {y:.2f} +- {y_sigma:.2f} px, radius of a corner "
+        f"{x:.2f} +- {x_sigma:.2f}, {y:.2f} +- {y_sigma:.2f} px, distance of a corner from the centre "
         f"+- {100.0 * found['corner_sigma']:.4f} %",
         f"  line time {1e6 * delay:.2f} +- {1e6 * delay_sigma:.2f} us, point spread {psf:.2f} +- "
         f"{psf_sigma:.2f} px; from {found['frames']} frames, {found['contradictions']} contradictions",
@@ -450,7 +450,7 @@ def _health(health: Object | None) -> list[str]:
     good = ", ".join(f"{name} {number(share, 1, 1e2)} %" for name, share in health["streams_good"].items())
     lines = [
         f"Health: streams good {good}",
-        f"  facts raised: {', '.join(health['facts']) or 'none'}; "
+        f"  conditions detected: {', '.join(health['facts']) or 'none'}; "
         f"watchdog fed {health['watchdog_fed']} times, wall clock set {health['clock_steps']} times",
     ]
     if health["proportional_bytes"] is not None:

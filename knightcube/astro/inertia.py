@@ -42,7 +42,8 @@ def inertia_problem(inertia: FloatArray) -> str:
         if abs(above - below) > _ROUNDING * scale:
             return (
                 f"is not symmetric: row {row + 1}, column {column + 1} is {above:g}, and row {column + 1}, "
-                f"column {row + 1} is {below:g}: give both the same value, minus the product of inertia"
+                f"column {row + 1} is {below:g}: give both the same value, the negative of the product "
+                "of inertia"
             )
     moments = np.linalg.eigvalsh(0.5 * (inertia + inertia.T))
     shown = ", ".join(f"{moment:.6g}" for moment in moments)

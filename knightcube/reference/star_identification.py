@@ -760,7 +760,7 @@ def _classical(propose: Propose, source: str) -> Method:
 
 
 METHODS: dict[str, Method] = {
-    DEFAULT_METHOD: Method(_default, "triangles by shape, orientation and size at once; votes"),
+    DEFAULT_METHOD: Method(_default, "votes of triangles that match in shape, orientation and size"),
     "angle": _classical(propose_angles, "Gottlieb 1978"),
     "spherical-triangle": _classical(propose_spherical, "Cole & Crassidis 2004"),
     "planar-triangle": _classical(propose_planar, "Cole & Crassidis 2006"),

@@ -299,7 +299,7 @@ def smbus(
         case 5 | 6 | 8 if not (size == _BLOCK and reading):
             return _block(bus, address, reading, head, size, data)
         case _:
-            raise OSError(errno.EOPNOTSUPP, f"SMBus transfer {size} is not offered")
+            raise OSError(errno.EOPNOTSUPP, f"SMBus transfer {size} is not supported")
     return b"".join(bus.transfer(messages))
 
 

@@ -62,7 +62,7 @@ class SolarCellsModel:
         if np.shape(self.normals) != (count, 3) or np.shape(self.peaks) != (count,):
             raise ValueError(f"{DEVICE}: give normals (n, 3) and peaks (n,)")
         if np.shape(self.gain_errors) != (count,):
-            raise ValueError(f"{DEVICE}: give one gain error a string")
+            raise ValueError(f"{DEVICE}: give one gain error per string")
         limits = {"grazing": (0.0, 0.5, "rad"), "noise": (0.0, 10.0, "A"), "albedo": (0.0, 1.0, "")}
         check_limits(DEVICE, self, limits)
 

@@ -147,7 +147,9 @@ def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledF
         if fault.kind.where is Where.REALTIME and not realtime:
             raise UsageError(f"fault {str(fault)!r}: it exists in real time only: add --realtime")
         if fault.kind.where is Where.COMMAND_LINE:
-            raise UsageError(f"fault {str(fault)!r}: give it with --fault; a file cannot corrupt itself")
+            raise UsageError(
+                f"fault {str(fault)!r}: give it with --fault, because it corrupts the configuration file"
+            )
     alone = [fault for fault in faults if not fault.kind.adds]
     for number, fault in enumerate(alone):
         for other in alone[:number]:

@@ -455,9 +455,9 @@ def test_silence_leads_back_to_release_configuration_and_ground(board: RenewedBo
     assert (board.release(), board.flown()) == ("old", ground)
     texts = [text for _, text in board.reports("")]
     assert [text.partition(" the ")[2] for text in texts] == [
-        "previous release flies",
-        "previous configuration flies",
-        "configuration accepted on the ground flies",
+        "previous release is used",
+        "previous configuration is used",
+        "configuration accepted on the ground is used",
     ]
     board.step(1e6)
     assert len(board.reports("")) == 3

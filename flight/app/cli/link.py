@@ -97,7 +97,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "and playback from its log, commands to its socket. The link is a process of its own, at low "
         "priority. While keys, an address or a port are missing, it reports this and waits. SIGTERM ends it."
     )
-    parser.add_argument("config", type=config_path, metavar="CONFIG", help="the configuration that is flown")
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help="configuration of the flight")
     parser.add_argument(
         "--log",
         type=Path,

@@ -85,9 +85,10 @@ def _coils(ending: FlightEnding) -> str:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Fly a configuration on real devices, or on simulated devices where it has a simulation section. "
-        "Simulated flights run as fast as they can; --realtime flies them on the machine's clock, with the "
-        "devices in a process of their own. Ctrl-C ends a flight with the coils at zero and the log closed."
+        "Run the flight of a configuration on real devices, or on simulated devices if it has a simulation "
+        "section. Simulated flights run as fast as they can; with --realtime they run on the machine's "
+        "clock, with the devices in a process of their own. Ctrl-C ends a flight with the coils at zero and "
+        "the log closed."
     )
     carried = ", ".join(names())
     parser.add_argument("config", type=config_path, metavar="CONFIG", help=f"YAML file, or one of {carried}")
@@ -99,13 +100,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, metavar="S", help="another duration")
     parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation")
     parser.add_argument(
-        "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
+        "--realtime", action="store_true", help="run simulated devices on the machine's clock"
     )
     parser.add_argument(
         "--devices",
         type=Path,
         metavar="FILE",
-        help="fly the simulated devices of `python -m sim_hal serve --facts FILE`; with --realtime",
+        help="use the simulated devices of `python -m sim_hal serve --facts FILE`; with --realtime",
     )
     parser.add_argument(
         "--fault",

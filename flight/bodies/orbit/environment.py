@@ -405,7 +405,7 @@ class EstimatedEnvironment:
         if by_fixes and by_elements and self._is_begun(sequence, last):
             return self._use(fix, offset_ns, time_ns, confirmed=False)
         causes = {
-            "the time jumps against the time of earlier fixes": not by_time,
+            "the time jumps relative to the time of earlier fixes": not by_time,
             "the fix contradicts the orbit of earlier fixes": not by_fixes,
             "the fix contradicts the orbit elements": not by_elements,
             "the magnetic field or the Sun contradicts the orbit of the fixes": sequence.refuted,

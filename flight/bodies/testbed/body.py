@@ -149,7 +149,7 @@ class UnitFeed:
             self._refused = 0 if at_rest else self._refused
             return ReadingAgreement(True)
         self._refused += at_rest
-        return ReadingAgreement(False, f"the angle from the magnetic field, {angle:.4f} rad,")
+        return ReadingAgreement(False, f"the angle computed from the magnetic field, {angle:.4f} rad,")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
         """Return False, because only the inertial unit's attitude starts this filter."""

@@ -56,7 +56,7 @@ CANCEL_FILE = telecommand(
 SUSPEND_FILE = telecommand(
     "suspend-file",
     0x229,
-    "Suspend a transfer until it is resumed, also over restarts",
+    "Suspend a transfer until it is resumed, even across restarts",
     *CANCEL_FILE.fields,
 )
 RESUME_FILE = telecommand("resume-file", 0x22A, "Resume a suspended transfer", *CANCEL_FILE.fields)

@@ -24,10 +24,10 @@ def _parameter(key: str, unit: str, low: float, high: float, meaning: str) -> Fi
 
 
 PARAMETER_FIELDS: tuple[Field, ...] = (
-    _parameter("modes.arrived_angle", "rad", 1e-4, 0.5, "largest angle error of an arrived slew"),
-    _parameter("modes.arrived_rate", "rad/s", 1e-5, 0.5, "largest rate error of an arrived slew"),
+    _parameter("modes.arrived_angle", "rad", 1e-4, 0.5, "largest angle error of a completed slew"),
+    _parameter("modes.arrived_rate", "rad/s", 1e-5, 0.5, "largest rate error of a completed slew"),
     _parameter(
-        "modes.arrived_for", "s", 0.1, 600.0, "time within both limits after which a slew has arrived"
+        "modes.arrived_for", "s", 0.1, 600.0, "time within the limits of angle and rate that completes a slew"
     ),
     _parameter("modes.slew_limit", "s", 1.0, 1e5, "time after which a slew is late"),
     _parameter(
@@ -36,7 +36,7 @@ PARAMETER_FIELDS: tuple[Field, ...] = (
     _parameter("modes.hold_patience", "s", 0.1, 3600.0, "time above `hold_error` after which a hold fails"),
     _parameter("modes.tumble_rate", "rad/s", 1e-3, 10.0, "rate above which the body is detumbled"),
     _parameter("modes.blind_limit", "s", 1.0, 1e5, "time without an estimate after which the mode is safe"),
-    _parameter("modes.known_for", "s", 0.1, 3600.0, "time with an attitude after which acquisition ends"),
+    _parameter("modes.known_for", "s", 0.1, 3600.0, "duration of a known attitude that ends acquisition"),
     _parameter("modes.lost_for", "s", 0.1, 3600.0, "time without an attitude after which acquisition starts"),
     _parameter("health.cpu_share", "-", 0.01, 64.0, "largest processor load of the control process"),
     _parameter("health.memory", "B", 1e6, 1e12, "largest memory of all flight processes"),
@@ -165,7 +165,7 @@ HEALTH = Packet(
     "health",
     0x132,
     "1 Hz",
-    "Mode, streams of readings, facts and resources of the board",
+    "Mode, streams of readings, monitored conditions and resources of the board",
     (
         Field("mode", "u1", "-", "current mode", states=MODES, alarms=SAFE_ALARM),
         Field("mode_age", "f8", "s", "time in this mode"),
@@ -181,8 +181,13 @@ HEALTH = Packet(
         counter("clock_steps", "number of changes of the wall clock"),
         Field("cpu_share", "f8", "-", "processor load of the control process; NaN if unknown"),
         Field("resident", "f8", "B", "resident memory of the control process; NaN if unknown"),
-        Field("proportional", "f8", "B", "proportional memory of all flight processes; NaN if unknown"),
-        Field("memory_slope", "f8", "B/s", "growth of the proportional memory; NaN if unknown"),
+        Field(
+            "proportional",
+            "f8",
+            "B",
+            "memory (proportional set size) of all flight processes; NaN if unknown",
+        ),
+        Field("memory_slope", "f8", "B/s", "growth of the memory (proportional set size); NaN if unknown"),
         Field("disk_free", "f8", "B", "free disk space for the flight log; NaN if unknown"),
         Field("temperature", "f8", "deg C", "highest temperature of the board; NaN if unknown"),
     ),
@@ -197,8 +202,8 @@ WORKLOAD = Packet(
     "Work that is reduced because the processor is overloaded",
     (
         Field("level", "u1", "-", "level of the reduction; 0 if all work is done", limits=_LEVEL),
-        counter("frames_shed", "frames of the star camera that were not taken since start"),
-        counter("plans_shed", "periodic plans that were not made since start"),
+        counter("frames_shed", "frames of the star camera skipped since start"),
+        counter("plans_shed", "periodic plans skipped since start"),
         counter("frames_late", "frames since start whose processing took too long or whose worker was busy"),
         counter("plans_late", "plans since start that took too long"),
         counter("cycles_lost", "control cycles skipped since start"),
@@ -221,7 +226,7 @@ COMMAND = Packet(
 )
 
 
-_DRAWN = "%s; positive while the battery is discharged"
+_DRAWN = "%s; positive while the battery discharges"
 POWER = Packet(
     "power",
     0x134,
@@ -323,7 +328,7 @@ TARGET = Packet(
     "at each command",
     "A new commanded attitude",
     (
-        counter("index", "number of the step from 0, or of a commanded slew from 1001"),
+        counter("index", "number of the step, counted from 0, or of a commanded slew, counted from 1001"),
         Field("q2", "f8", "-", "commanded final q2", limits=_Q2),
         Field("rate", "f8", "rad/s", "commanded final rate"),
     ),
@@ -469,7 +474,8 @@ DESCRIPTION = Packet(
             "coils_ratio_sigma",
             "f4",
             "-",
-            _ONE_SIGMA + "coils divided by the ratio of the traces of the estimated and configured inertia",
+            _ONE_SIGMA
+            + "coils times the trace of the configured inertia, divided by that of the estimated inertia",
             9,
         ),
         Field("gyro_bias", "f8", "rad/s", "gyro bias, body axes", 3),
@@ -536,7 +542,12 @@ DIRECTIONS = Packet(
         flag("sun_used", "whether the estimate used the Sun's direction"),
         Field("nadir", "f8", "-", "direction of nadir, body axes; NaN if unknown", 3),
         Field("nadir_sigma", "f4", "rad", "standard deviation of nadir per axis; NaN if unknown"),
-        Field("nadir_cameras", "u1", "-", "bit mask of the cameras that show the limb; 0 if from brightness"),
+        Field(
+            "nadir_cameras",
+            "u1",
+            "-",
+            "bit mask of the cameras that show the limb; 0 if nadir is from the brightness of all images",
+        ),
         flag("nadir_used", "whether the estimate used the nadir"),
     ),
 )
@@ -548,19 +559,26 @@ SEPARATE_ATTITUDES = Packet(
     "Attitudes determined as by Meller et al., for comparison; quaternions rotate ICRS into body axes",
     (
         Field("middle_ns", "i8", "ns", "mission time of the attitudes"),
-        Field("cameras", "f8", "-", "attitude by Sun and nadir, scalar last; NaN if unknown", 4),
-        Field("cameras_sigma", "f4", "rad", "standard deviation of the attitude by Sun and nadir per axis"),
-        Field("magnetometer", "f8", "-", "attitude by the magnetometer, scalar last; NaN if unknown", 4),
+        Field("cameras", "f8", "-", "attitude from Sun and nadir, scalar last; NaN if unknown", 4),
+        Field("cameras_sigma", "f4", "rad", "standard deviation per axis of the attitude from Sun and nadir"),
+        Field("magnetometer", "f8", "-", "attitude from the magnetometer, scalar last; NaN if unknown", 4),
         Field(
-            "magnetometer_sigma", "f4", "rad", "standard deviation of the magnetometer's attitude per axis"
+            "magnetometer_sigma",
+            "f4",
+            "rad",
+            "standard deviation per axis of the attitude from the magnetometer",
         ),
         Field("fused", "f8", "-", "mean of both attitudes, scalar last; NaN if unknown", 4),
         Field("fused_sigma", "f4", "rad", "standard deviation of the mean of both attitudes per axis"),
         Field("filtered", "f8", "-", "attitude of the filter with the gyros, scalar last; NaN if unknown", 4),
         Field("filtered_sigma", "f4", "rad", "standard deviation of the filter's attitude per axis"),
         Field("gyro_bias", "f8", "rad/s", "gyro bias that the filter estimates, body axes", 3),
-        Field("flown", "f8", "-", "attitude of the filter that is flown, scalar last; NaN if unknown", 4),
-        Field("flown_sigma", "f4", "rad", "standard deviation of the attitude that is flown per axis"),
+        Field(
+            "flown", "f8", "-", "attitude estimate that is used for control, scalar last; NaN if unknown", 4
+        ),
+        Field(
+            "flown_sigma", "f4", "rad", "standard deviation per axis of the attitude that is used for control"
+        ),
     ),
 )
 
@@ -659,7 +677,12 @@ LENS = Packet(
         Field("line_time", "f8", "s", "delay between the exposures of successive rows"),
         Field("psf_sigma", "f8", "px", "standard deviation of the point spread"),
         Field("sigma", "f8", "-", _ONE_SIGMA + "the seven values above, each in its unit", 7),
-        Field("corner_sigma", "f8", "-", "relative standard deviation of an image corner's radius"),
+        Field(
+            "corner_sigma",
+            "f8",
+            "-",
+            "relative standard deviation of the distance of an image corner from the centre",
+        ),
     ),
 )
 
@@ -705,7 +728,7 @@ TRACK = Packet(
         Field("place", "f8", "m", "geocentric position of the camera; NaN if unknown", 3),
         Field("velocity", "f8", "m/s", "geocentric velocity of the camera; NaN if unknown", 3),
         Field("place_sigma", "f8", "m", "standard deviation of the position per axis"),
-        flag("relative", "whether the attitude is estimated without identified stars in this frame"),
+        flag("relative", "whether the attitude of this frame is estimated without identified stars"),
     ),
     version=3,
 )
@@ -717,7 +740,7 @@ PARAMETERS = Packet(
     "at the start of a flight that takes commands, after each load, and on request",
     "Table of the parameters in use",
     (
-        counter("loads", "number of loaded tables, including earlier boots"),
+        counter("loads", "number of tables loaded in this and earlier boots"),
         Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
         Field("table", "u1", "-", "source of the table", states=TABLES),
         flag("kept", "whether the table is stored on disk"),
@@ -769,7 +792,7 @@ VERIFICATION = Packet(
         Field("counter", "i8", "-", "counter of the command's frame; at most 2^63 - 1"),
         Field("stage", "u1", "-", "stage of the command", states=STAGES),
         Field("name", "S16", "-", "name of the command, empty if unknown"),
-        Field("text", "S128", "-", "values of the command, or the reason of the stage"),
+        Field("text", "S128", "-", "values of the command, or the reason for its stage"),
         Field("packet", "u2", "-", "first 16 bits of the command's packet; 0 if it was not read"),
         Field("sequence", "u2", "-", "sequence count of the command's packet"),
     ),

@@ -308,7 +308,7 @@ def error_meaning(sentence: Sentence) -> tuple[int, str] | None:
         code = int(sentence.fields[0], 16)
     except (IndexError, ValueError):
         return -1, "an unreadable error"
-    return code, ERRORS.get(code, "an error without a published meaning")
+    return code, ERRORS.get(code, "an undocumented error")
 
 
 LONGEST_LINE = 256  # size of the unit's receive buffer (bytes); its longest answer has about 100 bytes

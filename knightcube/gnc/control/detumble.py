@@ -89,7 +89,8 @@ class DetumblerSettings:
                 raise UsageError(f"detumble {name} is {value}: it must be finite and positive")
         if self.share >= 1.0:
             raise UsageError(
-                f"detumble share is {self.share}: it must be below 1, so that the rate keeps its sign"
+                f"detumble share is {self.share}: the fraction of the rate to remove in a window must be "
+                "below 1"
             )
 
 

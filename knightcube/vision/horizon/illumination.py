@@ -178,7 +178,8 @@ def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixe
         return f"the darkest pixels have {100.0 * samples.floor:.0f} % of the brightness of its bright side"
     level = float(np.median(samples.level[sky]))
     if level > _DARKEST:
-        return f"half of the dark side of the limb is brighter than {100.0 * level:.0f} % of its bright side"
+        percent = f"{100.0 * level:.0f} %"
+        return f"the dark side of the limb has a median brightness of {percent} of the bright side"
     # The median absolute value of Gaussian noise is 0.6745 standard deviations.
     mottle = float(np.median(np.abs(samples.mottle[sky]))) / 0.6745
     if mottle > max(_SMOOTHEST, _NOISES * samples.noise):

@@ -530,7 +530,7 @@ def _contradiction(one: Hypothesis) -> str:
         return f"the nadir contradicts a coarse direction by {one.guess.orientation.mismatch:.1f} sigma"
     if one.altitude_off > _MOST_ALTITUDE:
         altitude = one.fit.view.surface.height_of(one.fit.view.position)
-        return f"the limb implies an altitude of {1e-3 * altitude:.0f} km: give the altitude if it is right"
+        return f"the limb implies an altitude of {1e-3 * altitude:.0f} km: if it is right, pass it explicitly"
     return ""
 
 

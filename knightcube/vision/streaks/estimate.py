@@ -584,7 +584,7 @@ def _rejection(
         (verdict is StreakVerdict.REJECTED, "the motion divides streaks into segments or joins several"),
         (
             max(common.across, common.along) > settings.worst_shaking,
-            f"the body vibrated: all streaks vary in common by {common.across:.2f} px across and "
+            f"the body vibrated: all streaks vary together by {common.across:.2f} px across and "
             f"{100.0 * common.along:.0f} % in brightness",
         ),
         (double > _MOST_DOUBLE, "most streaks are double: the body vibrated, or the point spread is a ring"),

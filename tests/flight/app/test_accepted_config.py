@@ -134,7 +134,7 @@ def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7"), encoding="utf-8")
     for environment in ({}, {"STATE_DIRECTORY": str(tmp_path / "empty")}):
         with pytest.raises(
-            ConfigError, match=r"no configuration that has flown is stored; .*install\.sh --accept"
+            ConfigError, match=r"no configuration of an earlier flight is stored; .*install\.sh --accept"
         ):
             accepted_config(accepted, environment)
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
@@ -235,4 +235,4 @@ def test_a_flight_of_a_kept_configuration_says_so_and_records_it_as_an_event(
     fly(request)
     events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
     assert "no such file" in events["config-damaged"]
-    assert "the last configuration that has flown is used" in capsys.readouterr().err
+    assert "the configuration of an earlier flight is used" in capsys.readouterr().err

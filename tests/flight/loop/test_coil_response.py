@@ -262,7 +262,7 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     body.fly(40.0)
     assert watch.correction.factors.tolist() == signs.tolist()
     assert watch.correction.unreviewed == frozenset()
-    assert "confirms its sign" in watch.news()[0]
+    assert "the sign is confirmed" in watch.news()[0]
 
 
 @pytest.mark.parametrize("axis", range(3))

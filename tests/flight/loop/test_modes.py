@@ -123,7 +123,7 @@ def test_a_table_that_keeps_a_mode_from_safe_is_refused(mode: Mode, trigger: Tri
     for wrong in (TriggerAnswer.STAY, TriggerAnswer.REFUSE, Mode.HOLD):
         table = copied()
         table[mode][trigger] = wrong
-        with pytest.raises(FlightError, match=f"does not lead from {mode.label} to safe"):
+        with pytest.raises(FlightError, match=f"does not change {mode.label} to safe"):
             check(table)
 
 

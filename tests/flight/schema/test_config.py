@@ -328,7 +328,7 @@ COIL = "{axis: [0.0, 0.0, 1.0], dipole_per_ampere: 0.648, resistance: 23.0, chan
         ),
         (
             "\n    - ".join(COIL.replace("[4, 5]", f"[{4 + 2 * k}, {5 + 2 * k}]") for k in range(5)),
-            "has 7 entries: 2 to 6 coils can be flown",
+            "has 7 entries: 2 to 6 coils are supported",
         ),
         (
             "\n    - ".join(

@@ -111,7 +111,7 @@ def test_a_mistake_is_one_line_and_status_2(
 
 def test_real_devices_need_a_camera_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["camera", "--config", str(with_camera(tmp_path, ""))]) == 2
-    assert "camera.device: real devices are flown: give" in capsys.readouterr().err
+    assert "camera.device: the flight uses real devices: give" in capsys.readouterr().err
 
 
 def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_a_rate_is_printed_in_milliradians_with_its_deviation() -> None:
 
 def test_a_rate_of_unknown_sign_says_so() -> None:
     text = rate._text(motion(status=StreakStatus.AMBIGUOUS), ())
-    assert "direction:     unknown, the rate may be its opposite: give --prior\n" in text
+    assert "direction:     unknown, the rate may have the opposite sign: give --prior\n" in text
 
 
 @pytest.mark.parametrize("missing", ["rate", "covariance"])

@@ -153,7 +153,7 @@ def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
         (["--fov", "67", "--method", "vector", "--altitude", "600"], "give the other picture with --second"),
         (
             ["--fov", "67", "--method", "graphic", "--altitude", "600", "--second", "limb.png"],
-            "to the right with --turned",
+            "turned to the right",
         ),
         (["--fov", "67", "--turned", "60"], "--turned: only with --method graphic"),
         (["--fov", "67", "--lines", "9"], "--lines: only with --method circle, graphic, vector"),

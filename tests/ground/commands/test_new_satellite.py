@@ -195,7 +195,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
                 "axis=xyz,dipole=1,current=0.1,resistance=5",
                 *4 * FOURTH,
             ),
-            "nothing was written: `coils.windings` has 7 entries: 2 to 6 coils can be flown",
+            "nothing was written: `coils.windings` has 7 entries: 2 to 6 coils are supported",
         ),
         (("--star-camera", "90"), "--star-camera 90: give a number from 6 to 40 deg, or none"),
         (("--name", "my satellite"), "--name my satellite: give letters, digits and underscores"),

@@ -145,6 +145,6 @@ def test_the_learned_lens_is_that_of_the_last_packet() -> None:
     assert (found["frames"], found["focal_length_px"]) == (2, [901.0, 0.1])
     text = "\n".join(_lens(found))
     assert "focal length 901.00 +- 0.10 px" in text
-    assert "radius of a corner +- 0.0400 %" in text
+    assert "distance of a corner from the centre +- 0.0400 %" in text
     assert "line time 0.00 +- 0.10 us" in text
     assert learned_lens(cast(Run, {"lens": rows[:0]})) is None

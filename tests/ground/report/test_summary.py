@@ -291,7 +291,7 @@ def test_the_text_shows_the_table_of_the_thesis(full: Run) -> None:
     assert "  supply power V |I| at the coils   average 34.0 mW, maximum 0.340 W, total 23.80 J\n" in text
     assert "  supply power measured at the bus  average 50.0 mW\n" in text
     assert "  consumption stated in the thesis  average about 100 mW, maximum about 0.5 W\n" in text
-    assert "  R I^2, heat of steady currents    average 23.000 mW, total 16.100 J\n" in text
+    assert "  heat R I^2 of steady currents     average 23.000 mW, total 16.100 J\n" in text
     assert "planner: 3 jobs (done 3)" in text
     assert max(len(line) for line in text.splitlines()) <= 120
 

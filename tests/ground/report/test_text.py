@@ -141,10 +141,10 @@ def test_knowledge_is_in_degrees_and_percent() -> None:
     assert text.splitlines() == [
         "Attitude knowledge",
         "  lost 10.0 %, fine 90.0 %; first fine at 61.2 s",
-        "  error while fine 0.0100 deg rms over three axes (0.0020 with stars), maximum 0.0300 deg; "
-        "maximum 3.1 sigma per axis, NEES per axis 1.05",
+        "  error of the fine attitude 0.0100 deg rms over three axes (0.0020 with stars), maximum 0.0300 "
+        "deg; maximum 3.1 sigma per axis, NEES per axis 1.05",
         "  error of the star camera's attitude 0.0030 deg rms with stars, NEES per axis 0.99",
-        "  learned description, rms (inertia relative to the trace, camera in rad):",
+        "  estimated parameters, rms (inertia divided by its trace, camera in rad):",
         "  inertia: error 0.012 at the start, 0.00045 at the end, one sigma 0.00067",
         "  error of the residual dipole in the last ten minutes in sunlight: 13 %",
         "  error of the residual dipole in the last ten minutes in shadow: 5 %",
@@ -289,11 +289,11 @@ def test_estimate_streaks_and_stars_have_their_errors() -> None:
 def test_the_availability_of_the_star_camera_is_stated() -> None:
     found = {"instants": 90, "slow": 60, "unobstructed": 48, "measured": 42, "share": 0.875}
     lines = blocks(star_camera={**found, "longest_gap_s": 30.0})[-1].splitlines()
-    first = "Star camera: attitude or rate at 42 of 48 unobstructed instants (87.5 %); longest gap 30 s"
+    first = "Star camera: attitude or rate at 42 of 48 unobstructed exposures (87.5 %); longest gap 30 s"
     assert lines[0] == first
-    assert lines[1].startswith("  90 scheduled instants, 60 of them below camera.max_rate;")
+    assert lines[1].startswith("  90 scheduled exposures, 60 of them below camera.max_rate;")
     never = {**found, "unobstructed": 0, "measured": 0, "share": None, "longest_gap_s": 0.0}
-    assert "0 of 0 unobstructed instants; longest" in blocks(star_camera=never)[-1]
+    assert "0 of 0 unobstructed exposures; longest" in blocks(star_camera=never)[-1]
 
 
 @pytest.mark.parametrize(("count", "more"), [(20, ""), (23, "  and 3 more lines; --json lists all frames")])
@@ -337,7 +337,7 @@ def test_modes_health_and_events_are_listed() -> None:
     assert mode_text.splitlines()[2].split() == ["hold", "1.500", "arrived", "-"]
     assert health_text.splitlines() == [
         "Health: streams good imu 98.7 %",
-        "  facts raised: none; watchdog fed 5 times, wall clock set 1 times",
+        "  conditions detected: none; watchdog fed 5 times, wall clock set 1 times",
         "  maximum 0.26 of a core, 3 MiB, 45.7 deg C; memory slope 0.50 MiB/h; 7 MiB of disk free",
     ]
     assert [line.split() for line in event_text.splitlines()[2:]] == [

@@ -127,7 +127,7 @@ def test_what_makes_sense_in_real_time_only_is_refused_in_lock_step() -> None:
     with pytest.raises(UsageError, match="--realtime"):
         scheduled(killed, realtime=False)
     assert scheduled(killed, realtime=True)[0].at == 3.0
-    with pytest.raises(UsageError, match="cannot corrupt itself"):
+    with pytest.raises(UsageError, match="corrupts the configuration file"):
         scheduled((FaultEntry(fault="config: corrupted"),), realtime=True)
 
 

@@ -206,7 +206,7 @@ class PathGuidance:
         if age > self._rules.late_after:
             return f"the plan is late: it started {age:.3f} s ago, {self._rules.late_after} s are allowed"
         if self._planned_ns is not None and origin_ns <= self._planned_ns:
-            return "out of order: the running path is not older"
+            return "out of order: not newer than the path in use"
         return ""
 
     def _unwanted(self, plan: StepPlan) -> str:

@@ -615,7 +615,8 @@ def check(task: SlewTask) -> None:
     low, high = HORIZON_RANGE
     if not low <= task.horizon <= task.longest <= high:
         raise PlanningError(
-            f"horizon {task.horizon:g} s, longest {task.longest:g} s: must rise from {low:g} to {high:g} s"
+            f"horizon {task.horizon:g} s, longest {task.longest:g} s: must satisfy {low:g} <= horizon <= "
+            f"longest <= {high:g} s"
         )
     if not NODES_RANGE[0] <= task.nodes <= NODES_RANGE[1]:
         raise PlanningError(f"nodes is {task.nodes}: must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")

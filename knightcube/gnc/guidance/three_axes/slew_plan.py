@@ -517,7 +517,7 @@ def plan_slew(
     if unknown:
         raise UsageError(f"unknown exclusion cone {unknown.pop()!r}: give sun, earth or moon")
     if Goal.OBJECT in (start.goal, goal.goal):
-        raise UsageError("an object is found in flight: no slew can be planned to it")
+        raise UsageError("the direction of an object is known only in flight: no slew to it can be planned")
     pointing = np.array(pointing_axis, dtype=float)
     satellite = SlewCraft(
         np.array(inertia, dtype=float), np.array(dipole_limit, dtype=float), np.array(heat, dtype=float)

@@ -82,7 +82,7 @@ def test_ctrl_c_keeps_what_came_and_a_second_call_has_the_folder_to_itself(
         assert main([*way, "list"]) == 2
         assert "another process" in capsys.readouterr().err
         process.send_signal(2)
-        assert "the same command continues" in process.stderr.read()
+        assert "run the same command again" in process.stderr.read()
     assert process.returncode == 1
 
 

@@ -252,7 +252,7 @@ def test_the_samples_of_an_image_stand_in_the_middle_of_its_cells() -> None:
         (0.0, 0.0, 0.0, 0.0, ""),
         (0.1, 0.0, 0.0, 0.3, ""),
         (0.0, 0.03, 0.02, 0.0, ""),
-        (0.2, 0.0, 0.0, 0.0, "brighter than 20 %"),
+        (0.2, 0.0, 0.0, 0.0, "median brightness of 20 %"),
         (0.05, 0.03, 0.01, 0.0, "texture of 3.0 %"),
         (0.0, 0.0, 0.0, 0.4, "darkest pixels have 40 %"),
     ],
