@@ -87,7 +87,10 @@ def test_elements_are_fitted_to_the_fixes_in_a_flight_log(tmp_path: Path) -> Non
     [
         (("--altitude", "500", "--inclination", "97.4"), "--altitude needs --epoch"),
         (("--altitude", "50", *ORBIT[2:]), "--altitude 50: give a number from 200 to 2000 km"),
-        ((*ORBIT, "--eccentricity", "0.08"), "the perigee is at -50 km, below 150 km: at 500 km give an"),
+        (
+            (*ORBIT, "--eccentricity", "0.08"),
+            "the perigee is at -50 km, below 150 km: for a mean altitude of 500 km give an",
+        ),
         ((*ORBIT[:5], "noon"), "--epoch: 'noon': give a time such as"),
         (("--config", "step_demo"), "this needs the configuration of a satellite in orbit"),
         (("--config", "orbit", "--anomaly", "3"), "--anomaly: goes with --altitude"),
