@@ -108,7 +108,7 @@ def test_an_odd_checksum_is_damage(accepted: Path, service: dict[str, str], odd:
     else:
         beside.write_text({"empty": "", "short": line[:40], "text": "x" * 64}[odd], encoding="ascii")
     assert accepted_config(accepted, service).path.parent.name == FOLDER
-    with pytest.raises(UnreadConfigError, match="no configuration that has flown"):
+    with pytest.raises(UnreadConfigError, match="no configuration of an earlier flight"):
         accepted_config(accepted, {})
 
 
@@ -161,7 +161,7 @@ def test_configuration_and_sum_that_are_gone_or_damaged_are_replaced_by_the_newe
         else:
             chosen.path.unlink()
             (chosen.path.parent / chosen.path.name.replace("5-", "9-")).write_bytes(b"name: other")
-    with pytest.raises(UnreadConfigError, match="no configuration that has flown"):
+    with pytest.raises(UnreadConfigError, match="no configuration of an earlier flight"):
         accepted_config(accepted, service)
 
 
