@@ -91,7 +91,7 @@ def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
-        ({"goal": PointingTarget(Goal.OBJECT)}, "found in flight"),
+        ({"goal": PointingTarget(Goal.OBJECT)}, "known only in flight"),
         ({"cones": {"venus": 0.1}}, "unknown exclusion cone 'venus'"),
         ({"window": -1.0}, "window"),
     ],
