@@ -28,7 +28,7 @@ from knightcube.gnc.estimation.free_filter import (
 )
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
-STEP, NOISE, STAR, GYRO = 2.0, 5e-8, 5e-5, 4e-5
+STEP, NOISE, STAR, GYRO = 5.0, 5e-8, 5e-5, 4e-5
 IRON = np.array([2e-7, -1e-7, 1e-7])
 SETTINGS = FreeFilterSettings()
 
@@ -58,7 +58,7 @@ class Sky:
             self.filter.gyro(GYRO * drawn[1], GYRO**2 * np.eye(3))
             seen = here.field + IRON + self.error + NOISE * drawn[2]
             self.filter.field(seen, here.field, NOISE**2 * np.eye(3))
-            if stars and k % 5 == 0:
+            if stars and k % 2 == 0:
                 self.filter.attitude(from_rotation_vector(STAR * drawn[3]), STAR**2 * np.eye(3))
 
 
