@@ -80,7 +80,8 @@ class Disturbances(Section, frozen=True, kw_only=True):
     `day_bulge` scales the variation of the air density between day and night. `walks` scales the random walks
     of air density and residual dipole. The angle between body axes and principal axes is at least a third of
     `principal_turn_deg` and at most `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are the standard
-    deviations of the coils' scale errors and axis tilts.
+    deviations of the coils' scale errors and axis tilts. `coil_variation` is the relative standard deviation
+    of the dipole of each coil, which changes every 20 s, for example with the supply voltage.
     """
 
     gravity_gradient: NotNegative = 1.0
@@ -93,6 +94,7 @@ class Disturbances(Section, frozen=True, kw_only=True):
     principal_turn_deg: Annotated[float, Meta(ge=0.0, le=45.0)] = 3.0
     coil_scale: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.03
     coil_tilt_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 1.0
+    coil_variation: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0
 
 
 class FreeBodySection(Section, frozen=True, kw_only=True):

@@ -23,6 +23,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from operator import mul
 from typing import NamedTuple
 
 import msgspec
@@ -455,6 +456,8 @@ class CoilSupply:
 
 
 KNIGHTCUBE_SUPPLY = CoilSupply((23.0, 23.0, 23.0), 3.4)
+VARIED_FOR = 20.0
+"""Time (s) for which the dipole per ampere of a coil that varies is constant."""
 
 
 class FreeBody:
@@ -478,6 +481,8 @@ class FreeBody:
         """
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
+        self._variation, self._seed, self._interval = multiples.coil_variation, seed, -1
+        self._factors: list[float] = []
         self.craft = built_craft(section, errors, description, craft)
         self.utc_start = julian_date(utc)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
@@ -582,7 +587,7 @@ class FreeBody:
         a, b, c = self.craft.inertia
         gradient = (c - b) * gy * gz, (a - c) * gz * gx, (b - a) * gx * gy
         return {
-            "coils": np.cross(self._loads.coil_dipole(acting), field),
+            "coils": np.cross(self._loads.coil_dipole(self._varied(acting)), field),
             "residual dipole": np.cross(self._loads.residual_dipole(around), field),
             "gravity gradient": np.array(turned(self._to_body, gradient)),
             "drag": np.array(drag),
@@ -623,7 +628,7 @@ class FreeBody:
         a, b, c = self._pull
         d, e, f = pull
         between = 0.5 * (a + d), 0.5 * (b + e), 0.5 * (c + f)
-        x, y, z = self._loads.coil_dipole(self._acting)
+        x, y, z = self._loads.coil_dipole(self._varied(self._acting))
         u, v, w = self._residual
         dipole = turned(self._to_principal, (x + u, y + v, z + w))
         loads = Loads(dipole, between, self._torque)
@@ -641,6 +646,16 @@ class FreeBody:
         (a, b, c), (d, e, f) = self._loads.pressures(around, matrix(*turn.tolist()))
         self._torque = turned(self._to_principal, (a + d, b + e, c + f))
         self._residual = self._loads.residual_dipole(around)
+        interval = int(middle / VARIED_FOR)
+        if self._variation and interval != self._interval:
+            self._interval = interval
+            generator = np.random.default_rng([self._seed, _STREAM, 3, interval])
+            largest = math.sqrt(3.0) * self._variation
+            self._factors = (1.0 + generator.uniform(-largest, largest, len(self._acting))).tolist()
+
+    def _varied(self, currents: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the currents (n,), A, that cause the present dipoles in coils that do not vary."""
+        return tuple(map(mul, currents, self._factors)) if self._factors else currents
 
     def _gravity_and_field(self, time: float) -> tuple[Floats, Floats]:
         position, field = self.environment.position_and_field(time)

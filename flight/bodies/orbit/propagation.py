@@ -34,8 +34,8 @@ _EYE: FloatArray = np.eye(3)
 _FROM = np.r_[states.ATTITUDE, states.RATE, states.GYRO, states.MAGNET]
 _TO = np.r_[form.ATTITUDE, form.RATE, form.BIAS, form.FIELD_BIAS]
 _PICKED, _PLACED = np.ix_(_FROM, _FROM), np.ix_(_TO, _TO)
-_MOVING = np.r_[states.ATTITUDE, states.RATE, states.COILS, states.CAMERA]
-_MOVED, _CAMERA = np.ix_(_MOVING, _MOVING), slice(15, 18)
+_MOVING = np.r_[states.ATTITUDE, states.RATE, states.COILS, states.CAMERA, states.VARIATION]
+_MOVED, _CAMERA, _VARIATION = np.ix_(_MOVING, _MOVING), slice(15, 18), slice(18, 21)
 _MOTION = np.ix_(*2 * [np.r_[form.ATTITUDE, form.RATE]])
 _SIZE = FIELD_BIAS.stop
 _PARAMETERS, _NONE = Parameters(), np.zeros(3)
@@ -157,7 +157,7 @@ class EstimatePropagation:
             motion,
             rows_of(motion.inertia),
             rows_of(motion.inverse),
-            rows_of(_EYE + constants[states.COILS].reshape(3, 3)),
+            rows_of(_EYE + constants[states.COILS].reshape(3, 3) + np.diag(constants[states.VARIATION])),
             (a, b, c, d),
             (u, v, w),
             (e, f, g),
@@ -174,13 +174,14 @@ class EstimatePropagation:
         return np.asarray(rows @ moving @ rows.T + seconds**2 / 3.0 * grown)
 
     def _transition(self, begun: _Beginning, moved: _Motion) -> tuple[FloatArray, FloatArray]:
-        """Return the transition matrix (6, 18) of the errors, and the covariance (3, 3) of the rate noise."""
+        """Return the transition matrix (6, 21) of the errors, and the covariance (3, 3) of the rate noise."""
         motion, seconds, dipole = begun.motion, moved.seconds, np.array(moved.dipole)
         found = np.zeros((6, len(_MOVING)))
         found[0:3, 0:3], found[0:3, 3:6] = matrix(moved.rotation), seconds * _EYE
         found[3:6, 3:6] = _EYE + seconds * motion.stiffness(np.array(moved.middle))
-        by_coils = -seconds * (motion.inverse @ np.array(skew(moved.field))) @ by_matrix(dipole)
-        found[0:3, 6:15], found[3:6, 6:15] = 0.5 * seconds * by_coils, by_coils
+        by_dipole = -seconds * (motion.inverse @ np.array(skew(moved.field)))
+        found[3:6, 6:15], found[3:6, _VARIATION] = by_dipole @ by_matrix(dipole), by_dipole * dipole
+        found[0:3, 6:] = 0.5 * seconds * found[3:6, 6:]
         noise = self._free.rate_noise(dipole, begun.around, then=begun.memory, motion=motion)
         return found, seconds * noise
 

@@ -23,6 +23,9 @@ accurately than that of the body, whose uncertainty includes the misalignment of
 `horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
 horizon cameras are used, so this block is a Gauss-Markov process with a long correlation time.
 
+The block `coil_variation` is the relative variation of the dipole along each body axis, for example because
+the supply voltage varies. It is a Gauss-Markov process with a correlation time of tens of seconds.
+
 Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
 sunlight, and the components of the disturbance torques of `knightcube.astro.earth.disturbance`.
 
@@ -91,6 +94,7 @@ BLOCKS = {
     "camera": 3,
     "horizon": 3,
     "field_error": 3,
+    "coil_variation": 3,
 }
 """Number of elements of each block of the error state, in order. Matrices (3, 3) are stored row by row."""
 (
@@ -108,11 +112,12 @@ BLOCKS = {
     CAMERA,
     HORIZON,
     FIELD,
+    VARIATION,
 ) = slices(BLOCKS)
 """Indices of the blocks of the error state."""
 SLOW = slice(GYRO.start, CAMERA.stop)
 """Indices of the slowly varying states, which are stored for the next boot."""
-STATES = FIELD.stop
+STATES = VARIATION.stop
 """Number of elements of the error state."""
 
 
@@ -198,6 +203,7 @@ class FreeMotion:
         flow[3:6, DIPOLE] = -self.inverse @ across
         flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
         flow[3:6, COILS] = flow[3:6, DIPOLE] @ by_matrix(driven)
+        flow[3:6, VARIATION] = flow[3:6, DIPOLE] * driven
         flow[3:6, TORQUES] = self.inverse @ shape
         flow[3:6, INERTIA] = self.trace * strength * self.inverse @ upright @ by_inertia(up)
         return torque, flow
@@ -216,7 +222,7 @@ _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 
 
 LASTING = 20.0
-"""Correlation time (s) of coil errors and field errors of a body at rest, for the equivalent white noise."""
+"""Correlation time (s) of doubted dipoles and of field errors at rest, for the equivalent white noise."""
 CURVATURE = 6.0
 """Correlation time (s) of the angular acceleration that is of second order in the error of the inertia."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
@@ -241,8 +247,7 @@ class FreeFilterSettings:
         torque: expected magnitude and random walk of the aerodynamic torque, N m. The expected magnitudes of
             the solar radiation torque and of the constant torque are fixed fractions of `torque`.
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
-        coil_error: relative error of the coils' dipole that varies over tens of seconds, in addition to the
-            error of the constant coil matrix.
+        coil_error: relative standard deviation of each coil's dipole, which varies over tens of seconds.
         coil_noise: density of the white noise of each coil's dipole while the coils are driven, A m^2
             sqrt(s).
         coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
@@ -303,6 +308,7 @@ class FreeFilterSettings:
             StateBlock("camera", _UNIFORM * errors.camera * ones),
             StateBlock("horizon", _UNIFORM * errors.horizon * ones),
             StateBlock("field_error", self.field * ones),
+            StateBlock("coil_variation", self.coil_error * ones),
         ]
         return ErrorState(with_role(blocks, self.roles))
 
@@ -322,6 +328,8 @@ FIELD_LEARNED = 2_000.0
 """Averaging time (s) of the estimated variance of the field model's error."""
 HORIZON_MEMORY = 3_000.0
 """Correlation time (s) of the misalignment of the horizon cameras."""
+COIL_MEMORY = 20.0
+"""Correlation time (s) of the variation of the coils' dipoles."""
 MINIMUM_FIELD_ERROR = 1e-8
 """Minimum standard deviation (T per axis) of the field model's error, which also represents slow variations
 of the magnetometer's errors."""
@@ -333,7 +341,6 @@ AIR_WALK = 6e-3
 _EYE: FloatArray = np.eye(3)
 _BODY = slice(INERTIA.start, COILS.stop)
 _INERTIA_DIAGONAL = slice(INERTIA.start * (STATES + 1), INERTIA.stop * (STATES + 1), STATES + 1)
-_FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -559,11 +566,6 @@ class FreeFilter:
         return self._constants[GYRO].copy()
 
     @property
-    def magnet_bias(self) -> FloatArray:
-        """Magnetometer bias (3,) T, body axes."""
-        return self._constants[MAGNET].copy()
-
-    @property
     def torque_sizes(self) -> FloatArray:
         """Estimated components (9,), N m, of the disturbance torques."""
         return self._constants[TORQUES].copy()
@@ -760,19 +762,15 @@ class FreeFilter:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
             variance = self.field_error**2 + dt / FIELD_LEARNED * (square - self.field_error**2)
             self.field_error = max(math.sqrt(variance), MINIMUM_FIELD_ERROR)
-        kept = math.exp(-dt / self._settings.field_memory)
-        error *= kept
-        covariance[FIELD] *= kept
-        covariance[:, FIELD] *= kept
-        covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * max(self.field_error, least) ** 2
+        self._decay(FIELD, dt / self._settings.field_memory, max(self.field_error, least) ** 2 * _EYE)
 
-    def _propagate_horizon(self, dt: float) -> None:
-        """Propagate the Gauss-Markov process of the horizon cameras' misalignment."""
-        kept = math.exp(-dt / HORIZON_MEMORY)
-        self._constants[HORIZON] *= kept
-        self.covariance[HORIZON] *= kept
-        self.covariance[:, HORIZON] *= kept
-        self.covariance[HORIZON, HORIZON] += (1.0 - kept**2) * self.layout.prior[HORIZON, HORIZON]
+    def _decay(self, at: slice, part: float, prior: FloatArray) -> None:
+        """Propagate a Gauss-Markov process of covariance `prior` (3, 3) by a `part` of its memory."""
+        kept = math.exp(-part)
+        self._constants[at] *= kept
+        self.covariance[at] *= kept
+        self.covariance[:, at] *= kept
+        self.covariance[at, at] += (1.0 - kept**2) * prior
 
     def _step(self, dt: float, driven: FloatArray, around: FilterEnvironment, doubt: float) -> None:
         """Propagate state and covariance by one step of the classical Runge-Kutta method.
@@ -783,7 +781,8 @@ class FreeFilter:
         motion, rate = self.motion, self.rate
         motion.correct(self._constants[INERTIA])
         middle = multiply(from_rotation_vector(0.5 * dt * rate), self.quaternion)
-        whole = self.coil_matrix @ driven + self.residual_dipole(around.sunlit)
+        whole = self.coil_matrix @ driven + self._constants[VARIATION] * driven
+        whole += self.residual_dipole(around.sunlit)
         torque, flow = motion.torque(middle, driven, whole, self._constants[TORQUES], around)
         first = motion.acceleration(rate, torque)
         second = motion.acceleration(rate + 0.5 * dt * first, torque)
@@ -811,7 +810,8 @@ class FreeFilter:
             flexed = self._settings.inertia_walk**2 * float(rate @ rate)
             self.covariance.reshape(-1)[_INERTIA_DIAGONAL] += dt * flexed
         self._propagate_field_error(dt, around.field_sigma)
-        self._propagate_horizon(dt)
+        self._decay(HORIZON, dt / HORIZON_MEMORY, self.layout.prior[HORIZON, HORIZON])
+        self._decay(VARIATION, dt / COIL_MEMORY, self.layout.prior[VARIATION, VARIATION])
 
     def _curvature(self, by_inertia: FloatArray) -> FloatArray:
         """Return the noise density (3, 3), rad^2/s^3, of second order in the error of the inertia.
@@ -841,8 +841,7 @@ class FreeFilter:
         """
         settings, motion, square = self._settings, motion or self.motion, float(dipole @ dipole)
         at = then or self
-        coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
-        coils += settings.coil_noise**2 if square else 0.0
+        coils = LASTING * doubt**2 + (settings.coil_noise**2 if square else 0.0)
         density = settings.torque_noise**2 * motion.by_torque
         if coils:
             field = attitude_matrix(at.quaternion) @ around.field

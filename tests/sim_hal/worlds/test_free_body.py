@@ -297,6 +297,24 @@ def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
     assert true.size == config.craft.size
 
 
+def test_the_dipole_of_a_coil_varies_every_twenty_seconds() -> None:
+    """The torque of a single driven coil shows its dipole relative to the mean dipole."""
+    varied = FreeBodySection(craft="cubesat_3u", disturbances=Disturbances(coil_variation=0.02))
+    current = np.array([0.1, 0.0, 0.0])
+    body = FreeBody(varied, lambda: current)
+    body.release_at(0)
+    ratios = []
+    for second in range(5, 605, 5):
+        field = body.motion(second * SECOND).field_body
+        torque = body.orbit_truth().torques()["coils"]
+        mean = np.cross(body.craft.coil_dipole @ current, field)
+        ratios.append(np.linalg.norm(torque) / np.linalg.norm(mean))
+    intervals = np.array(ratios).reshape(30, 4)
+    assert np.ptp(intervals, axis=1).max() < 1e-9
+    assert np.std(intervals[:, 0] - 1.0) == pytest.approx(0.02, rel=0.25)
+    assert np.abs(intervals - 1.0).max() < np.sqrt(3.0) * 0.02
+
+
 TENSOR = ((4.0e-3, 2.0e-4, -1.0e-4), (2.0e-4, 5.0e-3, 3.0e-4), (-1.0e-4, 3.0e-4, 6.0e-3))
 
 

@@ -3,7 +3,8 @@
 Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another position of the orbit with a
 tumble, whose rate is lower than the configured one so that all phases fit into the flight. The differences of
 body, coils and sensors from the configuration are at most the accuracies that the configuration states
-(`simulation.free_body.errors`). Cells `NAME-tumble` are only the beginnings of such flights, in which most
+(`simulation.free_body.errors`). The dipoles of the coils vary over tens of seconds with the standard deviation
+that the filter assumes. Cells `NAME-tumble` are only the beginnings of such flights, in which most
 bodies still tumble. They show within minutes whether the claimed uncertainty is correct.
 
 The attitude is evaluated in each phase: tumble, acquisition, slew, and pointing in sunlight and in eclipse.
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.bodies.orbit.body import filter_settings
 from flight.link import events
 from flight.link.modes import POINTING, Mode
 from flight.schema import reader as configuration
@@ -91,8 +93,12 @@ def _flight(
     config = configuration.replace(config, elements=None, duration=duration, targets=config.targets[:1])
     place = float(np.random.default_rng(seed).uniform(0.0, 360.0))
     assert world.free_body is not None
+    varying = configuration.replace(
+        world.free_body.disturbances, coil_variation=filter_settings(config).coil_error
+    )
     body = configuration.replace(
         world.free_body,
+        disturbances=varying,
         orbit=configuration.replace(world.free_body.orbit, true_anomaly_deg=place),
         release=configuration.replace(world.free_body.release, speed=speed),
     )
