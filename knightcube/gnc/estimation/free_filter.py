@@ -845,7 +845,7 @@ class FreeFilter:
         density = settings.torque_noise**2 * motion.by_torque
         if coils:
             field = attitude_matrix(at.quaternion) @ around.field
-            across = motion.inverse @ cross_matrix(field)
+            across = motion.inverse @ cross_matrix(field) @ self.coil_matrix
             density = density + coils * (across @ across.T)
         if square:
             across = motion.inverse @ cross_matrix(dipole)

@@ -3,7 +3,7 @@
 Each flight of `config/orbit.yaml` or `config/orbit_3u.yaml` begins at another position of the orbit with a
 tumble, whose rate is lower than the configured one so that all phases fit into the flight. The differences of
 body, coils and sensors from the configuration are at most the accuracies that the configuration states
-(`simulation.free_body.errors`). The dipoles of the coils vary over tens of seconds with the standard deviation
+(`simulation.free_body.errors`). The dipoles of the coils vary over tens of seconds by the standard deviation
 that the filter assumes. Cells `NAME-tumble` are only the beginnings of such flights, in which most
 bodies still tumble. They show within minutes whether the claimed uncertainty is correct.
 
