@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -52,9 +55,14 @@ def files_of(name: str) -> list[str]:
 
 
 @cache
-def printed_by(script: str) -> str:
-    """Return the output of an example that needs no other tree."""
-    return run([str(EXAMPLES / f"{script}.py")], ROOT).stdout
+def printed_by(script: str, *arguments: str) -> str:
+    """Return the output of an example that needs no other tree. It runs in this process, to save imports."""
+    output = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output):
+        patch.chdir(ROOT)
+        patch.setattr(sys, "argv", [f"{script}.py", *arguments])
+        runpy.run_path(str(EXAMPLES / f"{script}.py"), run_name="__main__")
+    return output.getvalue()
 
 
 @pytest.mark.parametrize(("name", "most"), [("command", 3), ("packet", 1), ("field", 2), ("config_key", 2)])
@@ -64,8 +72,7 @@ def test_an_extension_changes_few_files(name: str, most: int) -> None:
 
 def test_the_star_tracker_solves_the_image_of_its_example() -> None:
     """The star Alnilam (HIP 26311, V 1.69) is near the centre of the field that the script renders."""
-    script = str(EXAMPLES / "star_tracker.py")
-    printed = run([script], ROOT).stdout.splitlines()
+    printed = printed_by("star_tracker").splitlines()
     assert printed[0] == "right ascension  84.050 deg"
     assert printed[1] == "declination      -1.200 deg"
     assert "HIP 26311        V 1.69 at pixel 511" in printed[6]
@@ -83,7 +90,7 @@ def test_own_pictures_of_any_kind_are_solved_or_refused_with_a_reason(tmp_path: 
     pillow.fromarray(np.zeros((64, 64), dtype=np.uint8)).save(tmp_path / "dark.jpg")
     (tmp_path / "notes.txt").write_text("not a picture")
     names = ("grey.png", "colour.png", "mirrored.tif", "stars.fits", "dark.jpg", "notes.txt")
-    printed = run([str(EXAMPLES / "own_pictures.py"), *(str(tmp_path / name) for name in names)], ROOT).stdout
+    printed = printed_by("own_pictures", *(str(tmp_path / name) for name in names))
     lines = [line.removeprefix(f"{tmp_path}/") for line in printed.splitlines()]
     sky = Pointing.of(frame.attitude)
     for name, line in zip(names[:4], lines, strict=False):
@@ -97,14 +104,14 @@ def test_own_pictures_of_any_kind_are_solved_or_refused_with_a_reason(tmp_path: 
 
 
 def test_the_step_of_its_example_is_optimal_within_its_horizon() -> None:
-    printed = run([str(EXAMPLES / "step.py")], ROOT).stdout.splitlines()
+    printed = printed_by("step").splitlines()
     assert printed[0] == "status   optimal"
     assert printed[1] == "horizon  15.00 s"
     assert len(printed) == 8
 
 
 def test_the_slew_of_its_example_keeps_off_the_moon() -> None:
-    printed = run([str(EXAMPLES / "slew.py")], ROOT).stdout.splitlines()
+    printed = printed_by("slew").splitlines()
     assert printed[0] == "status        optimal"
     assert "deg outside its cone" in printed[5]
     assert float(printed[5].split()[1]) >= 0.0
@@ -128,8 +135,11 @@ def test_a_new_packet_is_recorded_read_exported_and_documented(tmp_path: Path) -
 @pytest.mark.slow
 def test_a_new_field_is_flown_and_exported(tmp_path: Path) -> None:
     tree = patched("field", tmp_path / "tree")
-    run(["-m", "flight", "run", "config/step_demo.yaml", "--duration", "2", "--out", "out"], tree)
-    run(["-m", "flight", "export", "out", "--out", "csv"], tree)
+    commands = (
+        ["run", "config/step_demo.yaml", "--duration", "1", "--out", "out"],
+        ["export", "out", "--out", "csv"],
+    )
+    run(["-c", f"from flight.app.cli import main\nfor words in {commands}:\n  assert main(words) == 0"], tree)
     names = (tree / "csv" / "housekeeping.csv").read_text(encoding="utf-8").splitlines()[0]
     assert names.endswith("records_lost,braked_1,braked_2,braked_3")
 
@@ -141,7 +151,7 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
     for value, status in ((3.0, 0), (-1.0, 2)):
         changed = text.replace("  strategy: goal", f"  least_horizon: {value}\n  strategy: goal")
         (tree / "changed.yaml").write_text(changed, encoding="utf-8")
-        words = ["-m", "flight", "run", "changed.yaml", "--duration", "2", "--out", f"run{status}"]
+        words = ["-m", "flight", "run", "changed.yaml", "--duration", "1", "--out", f"run{status}"]
         done = run(words, tree, status)
         assert status == 0 or "least_horizon" in done.stderr
 
@@ -149,7 +159,7 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> None:
     """With feedback alone, the thread deflects the body by the angle k theta / (J w^2)."""
-    printed = run([str(EXAMPLES / "pointing_body.py")], ROOT).stdout
+    printed = printed_by("pointing_body")
     found = re.search(r"pointing error ([\d.]+) deg", printed)
     assert found is not None
     theta = 2.0 * math.asin(0.3)

@@ -21,13 +21,13 @@ from tests.scenario.mode_flights import modes_of
 from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
-BEGIN, SLEW, AFTER, TURN = 20.0, 150.0, 15.0, np.radians([20.0, 20.0, -10.0])
+BEGIN, SLEW, AFTER, TURN = 8.0, 150.0, 8.0, np.radians([20.0, 20.0, -10.0])
 """Start and duration (s) of a slew, time (s) of flight after it, and the slew's rotation vector (rad).
 
 The coils can cause the rotation about x, along the field, only because the field rotates; it reaches 0.7
 deg/s of the 0.8 deg/s that a path may have.
 """
-BROKEN = 22.0
+BROKEN = 10.0
 """Time (s) at which the coils x and z break. The remaining coil causes no torque about its own axis y, about
 which the slew rotates most."""
 PATIENCE = 15.0
@@ -65,7 +65,7 @@ def slewed(tmp_path_factory: pytest.TempPathFactory) -> Run:
 @pytest.fixture(scope="module")
 def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
     faults = [FaultEntry(fault=f"coil-{axis}: open", at=BROKEN) for axis in "xz"]
-    config, section = slewing(105.0, *faults)
+    config, section = slewing(93.0, *faults)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pointing_law, "DAMPING_TIMEOUT", PATIENCE)
         # The coil monitor is disabled, because no slew is planned with a single remaining coil.

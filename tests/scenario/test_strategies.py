@@ -44,6 +44,8 @@ def test_towards_a_goal_the_horizon_shrinks_and_then_each_plan_holds_the_target(
 def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
     run = fly(thesis_config(12.0), tmp_path)
     assert run["plan"]["horizon"].tolist() == [10.0] * 3
+    assert run["plan"]["accepted"].all()
+    assert event_names(run) == ["started", "target", "stopped"]
 
 
 def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None:
