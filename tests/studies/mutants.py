@@ -2,7 +2,8 @@
 
 Each mutant changes one expression on one line of product code and is tested in a temporary copy of the
 repository: the tracked files with their uncommitted changes. The fast tests of the mirrored file run first,
-then those of the mirrored folder, up to the first failure. A failure counts if the same test passes on the
+then those of the mirrored folder, up to the first failure. A test is fast if all its cases together take at
+most two seconds of processor time, by the list slow.txt. A failure counts if the same test passes on the
 unchanged code.
 
 Docstrings, strings, annotations, decorators, imports, `raise` statements and the `strict` of `zip` are not
@@ -37,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.yaml")
 PACKAGES = ("knightcube", "flight", "hal", "sim_hal", "ground")
 LIMIT_S = 600.0  # time limit (s) for the tests of one mutant; a longer run counts as a hang
+SLOW_S = 2.0  # processor time (s) of a listed test function above which it is left out
 MEMORY = 6 << 30  # largest memory (bytes) that the tests of a mutant may allocate
 _COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.GtE, ast.LtE),
@@ -482,6 +484,10 @@ def _copied(root: Path, folder: Path) -> _Copy:
     archive.unlink()
     # This list would put the longest test files first.
     (folder / "tests" / "order.txt").unlink(missing_ok=True)
+    listed = folder / "tests" / "slow.txt"
+    if listed.exists():
+        lines = listed.read_text(encoding="utf-8").splitlines(keepends=True)
+        listed.write_text("".join(line for line in lines if float(line.split()[-1]) > SLOW_S), "utf-8")
     environment = {**os.environ, "PYTHONPATH": str(folder), "OPENBLAS_NUM_THREADS": "1"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     return _Copy(folder, environment)
