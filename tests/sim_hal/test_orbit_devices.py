@@ -21,19 +21,21 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.assembly import assemble, wide_model
 from sim_hal.clock import SimClock
 from sim_hal.emulation import EmulatedWires
+from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
-from sim_hal.settings import SkySection
+from sim_hal.settings import FaultEntry, SkySection
 from sim_hal.star_camera.objects import aberrated, sunlit_ground_angle, view
 from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld
 from tests.sim_hal.faults.benches import bench_of
-from tests.support.flights import TEXT, demo_world
+from tests.support.flights import TEXT, demo_config, demo_world
 from tests.support.orbit_devices import UTC, at_first, orbit_config, orbit_world
 
 
@@ -327,3 +329,28 @@ def test_a_slow_start_shifts_no_device_in_time() -> None:
     longitude, latitude, _ = geodetic(celestial_to_terrestrial(truth.utc) @ truth.position)
     assert seen.longitude * 1e-7 == pytest.approx(math.degrees(longitude), abs=1e-3)
     assert seen.latitude * 1e-7 == pytest.approx(math.degrees(latitude), abs=1e-3), "0.5 s are 0.034 deg"
+
+
+@pytest.mark.parametrize("in_lamplight", [False, True])
+def test_the_noise_of_the_solar_strings_has_the_configured_standard_deviation(in_lamplight: bool) -> None:
+    model = SolarCellsModel(np.eye(3), np.full(3, 0.5), np.zeros(3), noise=3e-3)
+    rng, sun, lit = np.random.default_rng(7), np.array([1.0, 0.0, 0.0]), []
+    for _ in range(150):
+        if in_lamplight:
+            currents = model.in_lamplight(sun, rng)
+        else:
+            currents = model.currents(7e6 * sun, ASTRONOMICAL_UNIT * sun, np.eye(3), rng)
+        lit.append(currents[0])
+    assert np.std(lit) == pytest.approx(3e-3, rel=0.25)
+
+
+def test_a_scheduled_fault_unplugs_the_serial_port_so_that_the_driver_is_refused() -> None:
+    section = reader.replace(demo_world(), faults=(FaultEntry(fault="imu: unplugged @ 0.1 for 0.2"),))
+    lock = build_lockstep(demo_config(10.0, camera=False), section, None, SimClock())
+    lock.release(0)
+    lock.line.host.receive()
+    lock.clock.sleep_until_ns(SECOND_NS // 5)
+    with pytest.raises(NotResponding, match="unplugged"):
+        lock.line.host.receive()
+    lock.clock.sleep_until_ns(SECOND_NS)
+    assert lock.line.host.receive()

@@ -139,6 +139,17 @@ def test_the_error_of_the_dipole_is_relative_to_its_size() -> None:
     assert orbit.dipole_errors(without)["sunlight"] == pytest.approx(0.1), "at least 1e-9 A m^2"
 
 
+def test_an_estimate_after_the_last_true_state_is_compared_with_that_state() -> None:
+    """The packets of a flight and of its truth log do not end at the same time."""
+    run = packed_run(
+        navigation=[(t, {"residual_dipole": [2e-3, 0.0, 0.0]}) for t in (1.0, 1.5)],
+        orbit_truth=[
+            (t, {"residual_dipole": [x, 0.0, 0.0], "sunlit": 1.0}) for t, x in ((0.0, 9e-3), (1.0, 2e-3))
+        ],
+    )
+    assert orbit.dipole_errors(run)["sunlight"] == pytest.approx(0.0, abs=1e-6)
+
+
 def flown(time: float, x: float, z: float = 0.0, mode: Mode = Mode.POINT) -> tuple[float, dict[str, Any]]:
     """Return an attitude packet with a given error from its target."""
     return time, {"mode": int(mode), "quaternion": turned(x, 0.0, z), "target": UPRIGHT}

@@ -80,3 +80,14 @@ def test_a_stale_command_and_the_end_leave_all_bridges_off() -> None:
 @pytest.mark.parametrize("volts", [0.5, -1.0, 3.4, -5.06])
 def test_a_voltage_is_within_half_a_step(volts: float) -> None:
     assert volts_of(control_of(volts)) == pytest.approx(volts, abs=0.0402)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("volts", [5.2, 6.0, 12.0])
+def test_a_voltage_beyond_the_range_becomes_the_largest_voltage_of_the_same_sign(
+    volts: float, sign: float
+) -> None:
+    """The register has eight bits, six of them for the voltage, whose largest value is 5.06 V."""
+    control = control_of(sign * volts)
+    assert 0 <= control <= 0xFF
+    assert volts_of(control) == pytest.approx(sign * 5.06, abs=0.01)

@@ -108,3 +108,15 @@ def test_one_field_alone_gives_no_attitude_at_the_start() -> None:
     first = fly(3, 0.0)
     assert not any(found.magnetometer.known for _, _, found in first)
     assert not any(found.filtered.known for _, _, found in first)
+
+
+def test_a_drift_of_the_attitude_since_the_start_is_attributed_to_the_gyro_bias() -> None:
+    """The gyros are accurate apart from their bias, so that the drift divided by the time is the bias."""
+    filter_ = GyroBiasFilter(1e-9, 1e-2, 0.0)
+    filter_.update(KnownAttitude(START, 1e-12 * np.eye(3)))
+    for _ in range(10):
+        filter_.propagate(from_rotation_vector(BIAS), 1.0)
+    filter_.update(KnownAttitude(START, 1e-12 * np.eye(3)))
+    assert angle(filter_.attitude.quaternion, START) < 1e-4
+    assert filter_.bias == pytest.approx(BIAS, rel=0.01)
+    assert filter_.bias_sigma < 1e-6

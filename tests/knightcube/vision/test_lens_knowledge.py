@@ -161,6 +161,21 @@ def test_wrong_matches_do_not_move_the_lens() -> None:
     assert nees(known, camera) < 20.0
 
 
+def test_stars_that_scatter_beyond_their_claimed_errors_teach_no_more_than_the_scatter_permits() -> None:
+    claims = []
+    for share in (1.0, 0.1):
+        rng = np.random.default_rng(62)
+        camera = TrueCamera.drawn(rng)
+        known = LensKnowledge.of(DESCRIBED, KNOWN)
+        for _ in range(3):
+            frame, sky = frame_of(camera, known, rng)
+            known = known.update(replace(frame, covariance=share * frame.covariance), sky)
+        assert known.frames == 3
+        assert nees(known, camera) < 20.0
+        claims.append(np.sqrt(known.learned[1].diagonal()[:4]))
+    assert np.all(claims[1] > 0.7 * claims[0])
+
+
 def test_frames_that_cannot_teach_change_nothing() -> None:
     rng = np.random.default_rng(71)
     camera, known = TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN)

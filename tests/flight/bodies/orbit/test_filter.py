@@ -492,6 +492,23 @@ def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_les
     assert doubts == pytest.approx([0.0, expected, 0.0], abs=1e-12)
 
 
+def test_a_correction_of_redundant_coils_widens_the_present_estimate() -> None:
+    """The dipole of a corrected coil was unknown before, which the uncertainty of the estimate includes."""
+    pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
+    coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
+    currents, flown, sigmas = coils.currents(np.array([DIPOLE, 0.0, 0.0])), Flown(), []
+    flown.attitudes |= {cycle * PERIOD_NS: IDENTITY for cycle in range(80)}
+    for change in (np.ones(4), np.array([0.5, 1.0, 1.0, 1.0])):
+        filter_ = OrbitFilter(replace(flown.filter._settings, coils=coils), around)
+        for cycle in range(80):
+            filter_.accept(flown._reading_at(cycle * PERIOD_NS))
+            filter_.command(cycle * PERIOD_NS, currents)
+        assert filter_.begin(flown.stars(20 * PERIOD_NS))
+        filter_.correct_coils(change, np.zeros(4))
+        sigmas.append(filter_.worst_sigma)
+    assert sigmas[1] > 1.01 * sigmas[0]
+
+
 TUMBLE = np.array([0.02, -0.05, 0.03])
 
 

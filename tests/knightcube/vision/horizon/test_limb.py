@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from knightcube.vision.horizon.illumination import limb_rays, sun_elevation
 from knightcube.vision.horizon.initial_guess import nadirs_of_pairs, nadirs_of_triples
 from knightcube.vision.horizon.limb import (
     MEAN_RADIUS,
+    PARAMETERS,
     LimbView,
     Prior,
     earth,
@@ -19,6 +22,7 @@ from knightcube.vision.horizon.limb import (
     limb_gradients,
     limb_residuals,
     mean_sphere,
+    stepped,
 )
 from sim_hal.earth_camera import EarthScene
 from tests.support.earth_truth import limb_directions
@@ -158,6 +162,17 @@ def test_wrong_edges_do_not_move_the_fit() -> None:
     assert not np.any(fitted.used[::5])
     assert np.count_nonzero(fitted.used) > 28
     assert np.degrees(np.arccos(min(1.0, float(fitted.view.nadir @ view.nadir)))) < 0.03
+
+
+@pytest.mark.parametrize("height", [-6.4e6, -7e6, -2e7])
+def test_a_limb_below_the_centre_of_the_earth_is_refused(height: float) -> None:
+    """The semi-axes of a surface that far below the ground are negative."""
+    view = _view(np.random.default_rng(3))
+    below = replace(view, limb_height=height)
+    agreeing = np.zeros(20), np.random.default_rng(4).normal(size=(20, PARAMETERS)), np.full(20, 1e-4)
+    prior = Prior(1.0, 1e3, 1e3)
+    assert stepped(view, *agreeing, prior) is not None
+    assert stepped(below, *agreeing, prior) is None
 
 
 def test_edges_all_in_one_place_give_no_limb() -> None:

@@ -30,6 +30,7 @@ from knightcube.vision.objects.detect import (
     evaluate,
     lengths,
     olae_residuals,
+    short_regions,
     slopes,
     star_ends,
 )
@@ -505,6 +506,22 @@ def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
     assert judge.begins_a_star(first[[0, part]], flux)
     assert not judge.begins_a_star(first[[0, part]], 4.0 * flux)
     assert not judge.begins_a_star(first[[0, part]] + np.array([[0.0, 0.0], [4.0, -4.0]]), flux)
+
+
+def test_a_spot_among_streaks_is_a_short_region_in_its_place() -> None:
+    """The spot is far from the left and upper borders of the frame, and so is the box of its region."""
+    rng = np.random.default_rng(4)
+    image = rng.normal(100.0, 2.0, (200, 300))
+    rows, columns = np.mgrid[:200, :300]
+    image += 400.0 * np.exp(-0.5 * ((columns - 171.3) ** 2 + (rows - 82.6) ** 2))
+    segmented = segment_frame(image, _SETTINGS)
+    ends, sigma, label = short_regions(
+        segmented, _ROTATION, _FRAME_CAMERA.pinhole, _SETTINGS, ObjectSettings()
+    )
+    assert ends.shape == (1, 2, 2)
+    np.testing.assert_allclose(ends[0], [[171.3, 82.6]] * 2, atol=0.2)
+    assert sigma == pytest.approx(np.array([1.0]), abs=0.5)
+    assert segmented.regions.labels[83, 171] == label[0]
 
 
 def test_all_forms_find_the_same_light_beside_a_path() -> None:

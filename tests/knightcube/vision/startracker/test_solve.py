@@ -391,6 +391,11 @@ def test_stars_wider_than_the_given_spread_widen_the_attitude_across_the_boresig
     assert _shape_unknown(replace(solved, fix=None), found, settings).fix is None
 
 
+def test_a_frame_without_an_attitude_has_none_to_widen() -> None:
+    refused = FrameSolution(SolveStatus.TOO_FEW_STARS, "too few", FrameKind.POINTS, NARROW.pinhole)
+    assert refused.wider(np.eye(3)) is refused
+
+
 @pytest.mark.parametrize(("sigmas", "agrees"), [(0.0, True), (4.0, True), (10.0, False)])
 @pytest.mark.parametrize("axis", range(3))
 def test_an_attitude_agrees_with_a_prior_within_the_errors_of_both(

@@ -294,6 +294,13 @@ def test_what_cannot_be_planned_is_refused_with_its_reason(
         plan(KNIGHTCUBE, *arguments, **options)  # type: ignore[arg-type]  # nodes is an int
 
 
+@pytest.mark.parametrize("max_stretch", [1.0, 1e3])
+def test_both_ends_of_the_range_of_the_stretch_are_permitted(max_stretch: float) -> None:
+    """A horizon that may not be stretched at all is a common wish."""
+    found = plan(KNIGHTCUBE, 0.1, 0.0, 0.2, 0.0, 10.0, max_stretch=max_stretch)
+    assert found.horizon == pytest.approx(10.0)
+
+
 def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
     """The problems are those of the step demonstration, of the thesis, and twenty with a known optimum.
 

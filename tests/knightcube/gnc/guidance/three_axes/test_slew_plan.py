@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import PlanningError
+from knightcube.gnc.guidance.three_axes import slew_plan
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import (
@@ -128,6 +131,33 @@ def test_a_plan_near_that_of_nearly_the_same_task_takes_a_tenth_of_the_steps() -
     assert again.steps < 30
     assert again.energy < 1.05 * plan_task(turned).energy
     assert clearance(turned, again) >= 0.0
+
+
+@pytest.mark.parametrize(("duration", "given", "longest"), [(200.0, None, 600.0), (200.0, 250.0, 250.0)])
+def test_a_slew_may_last_three_times_the_requested_duration_unless_a_longest_one_is_given(
+    duration: float, given: float | None, longest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned = Mock(side_effect=PlanningError("not planned"))
+    monkeypatch.setattr(slew_plan, "plan_order", planned)
+    elements = (
+        "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05",
+        "2 99999  97.4640 337.4170 0011973 295.7805  64.3547 15.24067411    09",
+    )
+    with pytest.raises(PlanningError, match="not planned"):
+        slew_plan.plan_slew(
+            inertia=np.eye(3),
+            dipole_limit=np.ones(3),
+            heat=np.ones(3),
+            elements=elements,
+            time=datetime(2026, 3, 20, 12, 0),
+            start=PointingTarget(Goal.NADIR),
+            goal=PointingTarget(Goal.SUN),
+            duration=duration,
+            longest=given,
+        )
+    order, ephemeris, first = planned.call_args.args
+    assert order.longest == longest
+    assert ephemeris.times[-1] >= first + longest
 
 
 def test_a_refusal_says_what_the_ends_lie_in() -> None:

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from knightcube.errors import PlanningError
+from knightcube.gnc.guidance.one_axis.vmc_program import SamplePoints, discretisation
 from knightcube.gnc.guidance.three_axes.slew_model import BoresightEnd, Cone
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus
-from knightcube.gnc.guidance.three_axes.slew_vmc import VmcProgram, plan_near, plan_task, prey_paths
+from knightcube.gnc.guidance.three_axes.slew_vmc import (
+    ObservedPaths,
+    VmcProgram,
+    plan_near,
+    plan_task,
+    prey_paths,
+)
 from tests.support.recorded_slews import flown, matrix, off_degrees, problem, task_of
 
 
@@ -63,3 +70,18 @@ def test_the_gradients_of_heat_and_constraints_equal_finite_differences() -> Non
         slope = (np.asarray(values(y + step * way)[0]) - values(y - step * way)[0]) / (2.0 * step)
         found = values(y)[1] @ way
         np.testing.assert_allclose(found, slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
+
+
+def test_the_motion_is_that_of_the_path_to_which_the_parameters_belong() -> None:
+    """The path of the parameters y is the polynomial through the nodes plus the basis times y."""
+    case = problem("E-knightcube-1u-iss-B90-300")
+    task = task_of(case, case["T"])
+    rule = discretisation(10).rule
+    rng = np.random.default_rng(3)
+    nodes, basis, y = rng.normal(size=(10, 3)), rng.normal(size=(10, 3, 4)), rng.normal(size=4)
+    at_nodes = SamplePoints.at(rule, rule.nodes)
+    given = task, case["T"], task.quaternion, np.empty((0, 1)), at_nodes
+    path, first, second = ObservedPaths(*given, nodes, basis).motion(y)
+    np.testing.assert_allclose(path, nodes + basis @ y, atol=1e-12)
+    np.testing.assert_allclose(first, 2.0 * rule.differentiation @ path, atol=1e-9)
+    np.testing.assert_allclose(second, 2.0 * rule.differentiation @ first, atol=1e-7)
