@@ -22,6 +22,7 @@ from ground.report import steps
 from ground.report.signals import bus_power, coil_power
 from ground.telemetry import Run, read_run
 from tests.support.attitude_errors import assert_solved, star_errors, star_mismatch
+from tests.support.coarse_pictures import draw_coarsely
 from tests.support.flights import CONFIG, TEXT, demo_config, demo_world, fly
 from tests.support.ideal_power import clairvoyant_power
 
@@ -215,8 +216,12 @@ def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
-    demonstration: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    demonstration: Run,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    draw_coarsely(monkeypatch)
     output = printed(capsys, "report", demonstration.folder, "--figures", tmp_path / "figures")
     assert "steady-state error" in output
     assert len(list((tmp_path / "figures").glob("*.png"))) == 7

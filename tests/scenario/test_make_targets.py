@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
+from tests.support.coarse_pictures import draw_coarsely
 
 ROOT = Path(__file__).resolve().parents[2]
 MAKEFILE = (ROOT / "Makefile").read_text()
@@ -29,6 +30,7 @@ def test_a_target_flies_and_judges_its_flight(
 ) -> None:
     (tmp_path / "config").symlink_to(ROOT / "config")
     monkeypatch.chdir(tmp_path)
+    draw_coarsely(monkeypatch)
     flown, judged = commands_of(target)
     for command in (f"{flown} --duration {SECONDS[target]}", judged):
         status = main(command.split())

@@ -1,0 +1,20 @@
+"""Pictures with few pixels and without layout, for tests of commands that draw them among other things."""
+
+from __future__ import annotations
+
+import pytest
+
+from ground.report import figures
+
+DPI = 15
+"""Resolution of the pictures (px per inch)."""
+
+
+def draw_coarsely(patch: pytest.MonkeyPatch) -> None:
+    """Let reports draw coarse pictures, to save processor time.
+
+    All elements are still drawn and written. `tests/ground/report` draws pictures with layout.
+    """
+    engine = pytest.importorskip("matplotlib.layout_engine").ConstrainedLayoutEngine
+    patch.setattr(figures, "DPI", DPI)
+    patch.setattr(engine, "execute", lambda _, figure: None)
