@@ -56,7 +56,18 @@ def assert_forms_agree(
 
 def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:
     """Return the results of one implementation, followed by its array arguments after the call."""
-    own = copy.deepcopy(args)
+    own = [_copied(each) for each in args]
     result = form(*own)
     results = list(result) if isinstance(result, tuple) else [] if result is None else [result]
     return results + [each for each in own if isinstance(each, np.ndarray)]
+
+
+def _copied(value: Any) -> Any:
+    """Return a deep copy of an argument; the copy of a read-only array is read-only.
+
+    numba compiles a function twice if it receives read-only and writable arrays.
+    """
+    own = copy.deepcopy(value)
+    if isinstance(own, np.ndarray):
+        own.flags.writeable = value.flags.writeable
+    return own
