@@ -1,7 +1,8 @@
 """Marks as slow the tests listed in tests/slow.txt, and collects the files in the order of tests/order.txt.
 
 `make slow-list` measures and writes both lists. A test is slow if all its cases together take more than
-`LIMIT_S` of processor time, fixtures included. `make quick` leaves slow tests out; a listed test that was
+`LIMIT_S` of processor time. The time includes fixtures, but no compiled functions, which only runs with slow
+tests compare (`tests.support.compiled_forms`). `make quick` leaves slow tests out; a listed test that was
 renamed is not slow until the list is made again. Files that last longer than `LONG_S` come first, in order of
 falling duration, so that the workers of `make test` finish at nearly the same time. The duration of a file
 that waits for processes or sockets exceeds its processor time.
@@ -33,6 +34,8 @@ os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("explore", deadline=None, max_examples=100)
 settings.load_profile("repeatable")
+
+from tests.support import compiled_forms  # noqa: E402  # after the settings above
 
 LIMIT_S = 0.3
 LONG_S = 1.0
@@ -79,6 +82,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--write-slow-list", action="store_true", help=f"write {LIST.name} from this run")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Leave the compilation of functions out of runs without slow tests."""
+    compiled_forms.compiles = config.getoption("markexpr") != "not slow"
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the listed tests as slow, and put the files that take longest first."""
     listed, of_file = _seconds(LIST), _seconds(ORDER)
@@ -97,11 +105,11 @@ def _seconds(path: Path) -> dict[str, float]:
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Measure a test's processor time and duration, including its fixtures and child processes."""
-    begun, clock = _processor_s(), time.monotonic()
+    begun, clock, compiled_s = _processor_s(), time.monotonic(), compiled_forms.compiling_s
     yield
     name, spent = _function(item), _processor_s() - begun
     file = name.partition("::")[0]
-    _spent[name] = _spent.get(name, 0.0) + spent
+    _spent[name] = _spent.get(name, 0.0) + spent - (compiled_forms.compiling_s - compiled_s)
     _lasted[file] = _lasted.get(file, 0.0) + max(spent, time.monotonic() - clock)
 
 

@@ -1,8 +1,13 @@
-"""Comparison of the implementations of a function with numpy, with loops, and compiled by numba."""
+"""Comparison of the implementations of a function with numpy, with loops, and compiled by numba.
+
+Compilation takes seconds. In runs without slow tests, `tests/conftest.py` therefore sets `compiles` to False.
+Then only the implementations with numpy and with loops are compared.
+"""
 
 from __future__ import annotations
 
 import copy
+import time
 from typing import Any
 
 import numpy as np
@@ -10,6 +15,11 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
+
+compiles = True
+"""Whether the implementations are compiled and compared."""
+compiling_s = 0.0
+"""Processor time (s) that the compiled implementations have taken in this process."""
 
 
 def sum_of_squares_numpy(values: FloatArray) -> float:
@@ -32,7 +42,11 @@ def sum_of_squares(values: FloatArray) -> float:
 
 
 def assert_forms_agree(
-    hot: HotFunction[Any, Any], *args: Any, relative: float = 1e-9, interpreted: bool = True
+    hot: HotFunction[Any, Any],
+    *args: Any,
+    relative: float = 1e-9,
+    interpreted: bool = True,
+    compiled: bool = True,
 ) -> None:
     """Call all implementations of a function with copies of the arguments, and compare the results.
 
@@ -40,18 +54,30 @@ def assert_forms_agree(
 
     Array values must agree within `relative` times the value or the array's largest value. With `interpreted`
     the implementation with loops is also called without compilation, because Python checks every index and
-    compiled code does not.
+    compiled code does not. The compiled implementation is called with `compiled`, except in runs without slow
+    tests.
     """
-    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
-    forms = [hot.numpy_form, hot.compiled_form(), *([hot.loop_form] if interpreted else [])]
-    expected, *others = (_called(form, args) for form in forms)
-    for found in others:
+    expected = _called(hot.numpy_form, args)
+    for found in (
+        *([_called(hot.loop_form, args)] if interpreted else []),
+        *([_compiled(hot, args)] if compiled and compiles else []),
+    ):
         assert len(found) == len(expected)
         for one, other in zip(expected, found, strict=True):
             first, second = np.asarray(one), np.asarray(other)
             assert first.dtype.kind == second.dtype.kind
             scale = np.abs(first[np.isfinite(first)]).max(initial=0.0)
             np.testing.assert_allclose(second, first, rtol=relative, atol=relative * float(scale))
+
+
+def _compiled(hot: HotFunction[Any, Any], args: tuple[Any, ...]) -> list[Any]:
+    """Return the results of the compiled implementation, and add its processor time to `compiling_s`."""
+    global compiling_s  # noqa: PLW0603
+    pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
+    begun = time.process_time()
+    results = _called(hot.compiled_form(), args)
+    compiling_s += time.process_time() - begun
+    return results
 
 
 def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:

@@ -6,6 +6,7 @@ The functions are called with arguments that are recorded from fits of simulated
 from __future__ import annotations
 
 import copy
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +27,7 @@ from knightcube.vision.streaks import (
 from knightcube.vision.streaks import frame as streak_frame
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, taken, turn_of
 from tests.support.compiled_forms import assert_forms_agree
 
@@ -60,33 +62,61 @@ def _size(arguments: tuple[Any, ...]) -> int:
     return sum(each.size for each in arguments if isinstance(each, np.ndarray))
 
 
-def _calls(patch: pytest.MonkeyPatch) -> dict[str, list[tuple[Any, ...]]]:
-    """Return the arguments of the first calls of each function of `_FUNCTIONS` in fits of some frames."""
+class _AllCalled(Exception):
+    """Ends a fit that has called all functions."""
+
+
+def _record(patch: pytest.MonkeyPatch, most: int) -> dict[str, list[tuple[Any, ...]]]:
+    """Record the arguments of the first `most` calls of each function of `_FUNCTIONS`.
+
+    A call raises _AllCalled when all functions have been called `most` times.
+    """
     calls: dict[str, list[tuple[Any, ...]]] = {name: [] for _, name, _ in _FUNCTIONS}
     for module, name, _ in _FUNCTIONS:
         function = getattr(module, name)
 
         def called(*arguments: Any, function: Any = function, held: Any = calls[name]) -> Any:
-            if len(held) < _MOST_CALLS:
+            if len(held) < most:
                 held.append(copy.deepcopy(arguments))
+                if all(len(each) == most for each in calls.values()):
+                    raise _AllCalled
             return function(*arguments)
 
         patch.setattr(module, name, called)
-    settings = LikelihoodSettings(saturation=SATURATION)
-    for length, growth in _FRAMES:
-        turn = turn_of(1.1, length, 0.4, _SMALL)
-        one = taken(np.random.default_rng(8), turn, growth * turn, 0.2, _SMALL)
-        found = estimate_motion(one.pixels, _SMALL.pinhole, one.exposure, settings, one.rate, 1e-3)
-        assert found.stars.size
     return calls
 
 
+def _fit(camera: StarCameraModel, length: float, growth: float) -> None:
+    """Fit the motion of a frame with streaks of `length` px whose rate grows by the fraction `growth`."""
+    turn = turn_of(1.1, length, 0.4, camera)
+    one = taken(np.random.default_rng(8), turn, growth * turn, 0.2, camera)
+    settings = LikelihoodSettings(saturation=SATURATION)
+    found = estimate_motion(one.pixels, camera.pinhole, one.exposure, settings, one.rate, 1e-3)
+    assert found.stars.size
+
+
 def test_the_compiled_forms_equal_those_in_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        calls = _calls(patch)
+    with monkeypatch.context() as patch, suppress(_AllCalled):
+        calls = _record(patch, _MOST_CALLS)
+        for length, growth in _FRAMES:
+            _fit(_SMALL, length, growth)
     for module, name, relative in _FUNCTIONS:
         assert calls[name], f"the fit does not call {name}"
         smallest, *_, largest = sorted(calls[name], key=_size) * 2
         hot = getattr(module, name)
         assert_forms_agree(hot, *largest, relative=relative, interpreted=False)
         assert_forms_agree(hot, *smallest, relative=relative, interpreted=_size(smallest) < 60_000)
+
+
+def test_the_loops_return_the_same_as_numpy_without_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first steps of a fit of streaks without ends call all functions.
+
+    A single-precision number plus a constant has double precision in compiled code, but not in Python.
+    """
+    monkeypatch.setattr(polar_grid, "_ROUND", np.float64(polar_grid._ROUND))
+    with monkeypatch.context() as patch, suppress(_AllCalled):
+        calls = _record(patch, 1)
+        _fit(replace(CAMERA, columns=160, rows=140), 160.0, 0.0)
+    for module, name, relative in _FUNCTIONS:
+        assert calls[name], f"the fit does not call {name}"
+        assert_forms_agree(getattr(module, name), *calls[name][0], relative=relative, compiled=False)
