@@ -185,8 +185,8 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
 _BOX = 3.0
 # Largest cumulative sum of samples that can be represented, in units of the rounding step.
 _HIGHEST = 2.0**30
-# Number that rounds a sample to an integer if it is added and then subtracted (float32).
-_ROUND = 1.5 * 2.0**52
+# Number that rounds a sample (float32) to an integer if it is added and then subtracted in double precision.
+_ROUND = np.float64(1.5 * 2.0**52)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -109,11 +109,7 @@ def test_the_compiled_forms_equal_those_in_numpy(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_loops_return_the_same_as_numpy_without_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first steps of a fit of streaks without ends call all functions.
-
-    A single-precision number plus a constant has double precision in compiled code, but not in Python.
-    """
-    monkeypatch.setattr(polar_grid, "_ROUND", np.float64(polar_grid._ROUND))
+    """The first steps of a fit of streaks without ends call all functions."""
     with monkeypatch.context() as patch, suppress(_AllCalled):
         calls = _record(patch, 1)
         _fit(replace(CAMERA, columns=160, rows=140), 160.0, 0.0)
