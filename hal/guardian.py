@@ -172,7 +172,7 @@ class Guardian:
                 self._zero()
 
     def _listen(self) -> bool:
-        """Wait for a message until a write of zero is due, and return whether a goodbye message arrived."""
+        """Wait for messages until zero currents are due; return whether the flight process said goodbye."""
         left = max(0, self._watch.due_ns - self._now_ns()) * 1e-9
         sockets = [] if self._watch.orphaned else [self._flight]
         if not select.select(sockets, [], [], left)[0]:

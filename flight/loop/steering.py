@@ -176,7 +176,7 @@ class CoilDrive:
     def send(
         self, currents: FloatArray, field: Callable[[], FloatArray | None], *, testable: bool = False
     ) -> None:
-        """Command effective currents (3,) A, or those of a self-test if the coils are `testable`.
+        """Command the currents (3,) A per axis. If the coils are `testable`, a self-test may replace them.
 
         The function `field` returns the magnetic field (3,), T, in body axes, for the reallocation of
         currents.

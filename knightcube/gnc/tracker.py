@@ -72,8 +72,8 @@ class MotionModel:
     Attributes:
         rate: initial standard deviation of each component of the angular rate, rad/s.
         closing: initial standard deviation of the ratio (range rate) / range, 1/s.
-        wander: noise density of the tidal acceleration divided by the range, 1/s^3. In a low orbit with the
-            orbital rate n, the tidal acceleration divided by the range reaches 1.5 n^2 = 1.8e-6 1/s^2. With
+        wander: noise density of the tidal acceleration divided by the range, 1/s^3. Between two low orbits
+            with the rate n, its component across the line of sight is at most 1.5 n^2 = 1.8e-6 1/s^2. With
             the default density, the errors of direction and rate agree with the covariance in passes with
             angular rates of 0.05 to 0.6 deg/s and ranges of up to 5,000 km.
         residual_wander: noise density of the residual acceleration divided by the range if the gravity

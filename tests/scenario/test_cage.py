@@ -46,7 +46,7 @@ def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) ->
     """By the table of `OrbitField`, the initial field, 0.225 mT, is 67 deg from -z. The body is at 23 deg."""
     field = flown["imu"]["field"][0].astype(float)
     assert np.hypot(field[0], field[2]) == pytest.approx(2.25e-4, rel=0.05)
-    # In the axes of a body rotated by +angle, the field direction rotates by the same angle.
+    # In the axes of the body, the direction of the field changes by the angle by which the body rotated.
     towards = np.degrees(np.arctan2(field[0], -field[2]))
     assert towards == pytest.approx(67.0 + np.degrees(2.0 * np.arcsin(0.2)), abs=3.0)
 

@@ -275,7 +275,7 @@ def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
     position = np.array(around.position)
     assert sunlit_ground_angle(position, ABOVE, to_camera[2]) == pytest.approx(math.radians(25.0), abs=1e-9)
     assert sunlit_ground_angle(position, -ABOVE, to_camera[2]) == math.pi
-    # With the Sun at the horizon, the ground is lit from 6 deg (0.1 rad) beyond the sub-satellite point on.
+    # If the Sun is at the satellite's horizon, the lit ground begins 6 deg (0.1 rad) from the point below it.
     ground = EARTH_RADIUS * np.array([math.cos(0.1), math.sin(0.1), 0.0])
     away = ground - position
     expected = math.acos(away @ to_camera[2] / float(np.linalg.norm(away)))

@@ -81,7 +81,7 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """Use by a limited group: throttled and total periods, largest memory (bytes), refused allocations.
+    """Resources that a control group with limits used: periods (throttled, total), memory (bytes), refusals.
 
     The memory is NaN with a kernel before Linux 5.19, whose cgroup v2 does not record the largest use.
     """

@@ -1,8 +1,8 @@
 """Results of estimators and planners, compared with a record of their numbers.
 
-A test module with records has a function for each case. `check(__file__, name, result)` compares a result
-with the file `recorded_results.json` beside the module. `KNIGHTCUBE_RECORD=1 python -m pytest -n 0 MODULE`
-writes the record, after an intended change of the results.
+A test module that compares results with a record has one test function for each case. `check(__file__, name,
+result)` compares a result with the file `recorded_results.json` beside the module. `KNIGHTCUBE_RECORD=1
+python -m pytest -n 0 MODULE` writes the record, after an intended change of the results.
 
 For an array, the record has its shape, the number of finite values, and their mean, root mean square and
 weighted mean. Texts are not recorded, because their wording may change.

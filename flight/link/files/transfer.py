@@ -6,8 +6,8 @@ repeated EOFs.
 
 A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next
 protocol data unit (PDU) whenever one can be sent. Replies are sent first, followed by PDUs of the open
-transfers in round-robin order. An entity never blocks; its caller passes the time. State that survives
-a restart of the process is kept in the store.
+transfers in round-robin order. No method of an entity waits, and the caller states the current time. State
+that survives a restart of the process is kept in the store.
 """
 
 from __future__ import annotations

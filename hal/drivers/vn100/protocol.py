@@ -118,7 +118,7 @@ def crc16(data: bytes | bytearray) -> int:
 
 
 def layout_of(words: Mapping[int, int]) -> OutputLayout:
-    """Return the packet layout for the given field words by group bit, such as {0: 0x0131, 2: 0x0100}.
+    """Return the packet layout for a mapping from group bits to field masks, such as {0: 0x0131, 2: 0x0100}.
 
     Raises ValueError for an unknown group or field.
     """

@@ -456,7 +456,7 @@ def _limb_table() -> FloatArray:
 
 
 def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
-    """Return a profile (m,) blurred by k Gaussians of standard deviations `widths` (k,), m, as (k, m).
+    """Return k copies (k, m) of a profile (m,), each blurred by a Gaussian of standard deviation `widths`, m.
 
     The profile is extended at both ends by repeating its end values.
     """

@@ -77,8 +77,8 @@ class Indicators:
     """The three indicators of n streaks, in the order of `INDICATORS`.
 
     Attributes:
-        endpoints: ends of the streaks (n, 2, 2), px, in the order in which a star at the same position
-            reaches them.
+        endpoints: start and end of each streak (n, 2, 2), px, in the direction in which the stars around it
+            move.
         deviations: differences of the three indicators from those of a star at the same position (n, 3), in
             standard deviations.
         fired: which of the three indicators of each streak exceed their thresholds (n, 3).

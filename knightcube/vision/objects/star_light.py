@@ -513,8 +513,8 @@ def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[
     """Return the non-negative least-squares coefficients (k,) of k images, and the chi-square.
 
     Args:
-        normal: products of the weighted images (k, k).
-        right: products of the weighted images and the weighted pixels (k,).
+        normal: scalar products (k, k) of the weighted images of the stars with one another.
+        right: scalar products (k,) of the weighted images with the weighted pixels of the frame.
         power: sum of the squares of the weighted pixels.
 
     Raises:

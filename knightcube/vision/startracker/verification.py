@@ -858,7 +858,7 @@ def _same_shift(
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
     """Return the indices of observed stars (k,) and guide stars (k,) that have a common displacement.
 
-    The returned stars are the largest set of pairs that one displacement explains.
+    The returned pairs of stars are the largest set that one displacement explains.
     """
     reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)

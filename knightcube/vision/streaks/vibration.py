@@ -300,7 +300,7 @@ def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
 
 
 def _functions(values: FloatArray, slopes: FloatArray, at_ends: FloatArray) -> FloatArray:
-    """Return n functions of time as one array (n, b, 4), where b is the number of time bins.
+    """Return n functions of time as one array (n, b, 4) of four values in each of b time bins.
 
     The four elements of the last axis are the value of the function in a bin, its derivative in the bin, and
     its values at the start and at the end of the exposure. The values at the start and the end are repeated

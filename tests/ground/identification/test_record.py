@@ -93,7 +93,7 @@ def test_without_commands_the_coil_falls_to_zero_as_the_driver_lets_it(short: Ru
 
 
 def test_the_field_is_taken_only_while_the_coils_are_off(short: Run) -> None:
-    """A driven coil is beside the magnetometer, so a field that is 10 % stronger must have no effect."""
+    """Samples of the magnetometer while a coil is driven are not used, so an error of 10 % has no effect."""
     control, imu = short["control"], short["imu"]
     quiet = control["current_written"].copy()
     quiet[800:, 0] = 0.0

@@ -298,7 +298,7 @@ def test_the_thesis_kernel_appears_around_a_star_in_the_middle_of_a_pixel() -> N
 
 
 def test_the_thesis_placement_shares_a_star_among_four_pixels() -> None:
-    """By 2.5 and 2.6 at (30.25, 20.4).
+    """The expected shares follow from equations (2.5) and (2.6) for a star at (30.25, 20.4).
 
     The kernel is so narrow (sigma 0.2) that only 3.7e-6 leaves a pixel.
     """

@@ -75,7 +75,7 @@ TURNS = tuple((craft, share) for share in (0.1, 1.0) for craft in ("cubesat_3u",
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each cell, with the same orbits and initial states; the targets alternate."""
+    """Return `runs` flights of each group, with the same orbits and initial states; the targets alternate."""
     found = []
     for run in range(runs):
         turn = float(np.random.default_rng([seed, run, 0x7E]).uniform(30.0, 180.0))

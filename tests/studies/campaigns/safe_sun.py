@@ -151,7 +151,7 @@ def _rms(values: FloatArray) -> float | None:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return the pointing errors of the axis by craft and share."""
+    """Return the errors of the axis towards the Sun, by satellite and by share of the worst torques."""
     facts: dict[str, Any] = {}
     for craft in CRAFT:
         for share in SHARES:

@@ -629,8 +629,8 @@ def check(task: SlewTask) -> None:
             raise PlanningError(
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
             )
-        # The cones move by some degrees during a slew. An end attitude deep inside a cone is therefore inside
-        # the cone for every duration of the slew.
+        # The cones move by some degrees during a slew. An end attitude that is deep inside a
+        # cone therefore remains inside it, whatever the duration of the slew.
         if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
             clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
             if float(clearance[0]) >= -_DEEP:

@@ -227,8 +227,8 @@ _COSINES = 6
 """Number of cosine terms that describe the time dependence of the torque about each axis."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights in the momentum fit of the end error (per rad), of the depth inside a cone (per unit of cosine),
-and of the mode amplitudes."""
+"""Weights in the fit of the momentum path: of the error of the end attitude (per rad), of the depth inside an
+exclusion cone (per unit of cosine), and of the mode amplitudes."""
 _ROOM = 0.03
 """Margin between a guess and an exclusion cone, as a difference of cosines."""
 _DAMPED = 1.0

@@ -162,7 +162,7 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
 
 
 def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) -> None:
-    """The emulated IMU replaces a GPS receiver that sends without request; an unconnected port is silent."""
+    """The emulated IMU, which sends unasked, stands for a GPS receiver; an unconnected port is silent."""
     strings = [
         {"normal": normal, "address": address, "channel": channel}
         for normal, address, channel in (

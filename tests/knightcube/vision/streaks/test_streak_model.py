@@ -135,7 +135,7 @@ def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: fl
         np.minimum(apart, np.hypot(column - x, row - y), out=apart)
     assert times.max() == 1
     assert np.count_nonzero(times[apart <= width - 0.1]) > 0.995 * np.count_nonzero(apart <= width - 0.1)
-    # At 45 deg a line is longer by the square root of two; near the ends, lines are even more oblique.
+    # A row of pixels crosses a streak at 45 deg over sqrt(2) times its width, and more obliquely at its ends.
     assert strips.index.shape[2] <= 2.0 * np.sqrt(2.0) * width + 4.0
 
 

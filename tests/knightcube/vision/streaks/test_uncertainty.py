@@ -31,7 +31,7 @@ _TURN = np.array([0.02, 0.03, 0.0])
 
 
 def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[FloatArray, FloatArray]:
-    """Return each star's apparent rotation (n, 3, m), and the information (n, 3, 3) of its ends alone."""
+    """Return the apparent rotation (n, 3, m) of n stars for m errors, and their information (n, 3, 3)."""
     x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
     stars = np.stack([x.ravel(), y.ravel()], axis=1)
     ones = np.ones(len(stars))

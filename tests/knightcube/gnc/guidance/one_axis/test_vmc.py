@@ -352,7 +352,7 @@ def test_a_horizon_just_long_enough_is_kept_or_stretched_by_less_than_a_percent(
 def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price: float) -> None:
     """With cos(theta) = 1 the minimum energy is 12 R (a/g)^2 / T^3.
 
-    At the optimum the time cost equals its slope.
+    At the optimum duration, the energy falls as fast as the price of the time rises.
     """
     gain = KNIGHTCUBE.torque_constant / KNIGHTCUBE.inertia
     expected = (36.0 * KNIGHTCUBE.resistance * (angle / gain) ** 2 / price) ** 0.25

@@ -85,7 +85,7 @@ def test_few_bright_pixels_do_not_determine_the_noise() -> None:
 
 
 def test_the_variance_of_a_pixel_is_the_sum_of_sky_photons_and_mismatch() -> None:
-    """Noise of 3 counts, photon noise of 0.5 counts^2 per count and 10 % of 20 counts give 9 + 10 + 4.
+    """A signal of 20 counts has the variance 3^2 (noise) + 0.5 * 20 (photons) + (0.1 * 20)^2 (mismatch).
 
     Negative counts add no variance.
     """
