@@ -165,7 +165,7 @@ def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
         (("--altitude", "20000"), "--altitude 20000: give a number from 200 to 2000 km"),
         (
             ("--altitude", "500", "--eccentricity", "0.1"),
-            "the perigee is at -188 km, below 150 km: at 500 km give",
+            "the perigee is at -188 km, below 150 km: for a mean altitude of 500 km give",
         ),
         (
             ("--altitude", "450x900", "--eccentricity", "0.03"),
