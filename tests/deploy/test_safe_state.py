@@ -107,7 +107,7 @@ def test_the_process_zeroes_the_coils_answers_and_ends_when_the_flight_is_to_be_
         process.wait()
     assert process.returncode == 0
     assert (tmp_path / "calls").read_text(encoding="ascii") == "off\n"
-    assert "start 1 in 30 s" in said
+    assert "start number 1 follows in 30 s" in said
     assert "coils at zero" in said
     assert "the flight software is started again, start 1" in said
     assert (tmp_path / "tries").read_text(encoding="ascii").startswith("1 ")
