@@ -1,4 +1,4 @@
-"""Tests of the check of real devices: what it opened is closed, whether or not the device answers."""
+"""Tests that the check of real devices closes each opened device, whether or not the device answers."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ MINUTE_NS = 60_000_000_000
 
 
 class Board:
-    """Onboard parameters with a state keeper and a recorder that only store what they are given."""
+    """Onboard parameters with a state keeper and a recorder that only store the passed values."""
 
     def __init__(self, table: KeptTable | None = None, keeps: bool = True) -> None:
         self.noted: list[KeptTable] = []

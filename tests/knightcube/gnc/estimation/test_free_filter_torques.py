@@ -81,16 +81,22 @@ def errors(found: FreeFilter, craft: Craft) -> FloatArray:
 
 
 def fly(
-    craft: Craft, found: FreeFilter, seconds: int, dipole: FloatArray, noise: float, variation: float = 0.0
+    craft: Craft,
+    found: FreeFilter,
+    seconds: int,
+    dipole: FloatArray,
+    noise: float,
+    variation: float = 0.0,
+    every: int = 20,
 ) -> None:
     """Simulate with a gyro mean every second and stars every ten.
 
     The true dipole of each coil deviates from the command by the standard deviation `variation`, and changes
-    every 20 s.
+    after `every` seconds.
     """
     true = dipole
     for second in range(1, seconds + 1):
-        if variation and second % 20 == 1:
+        if variation and second % every == 1:
             true = dipole * (1.0 + np.sqrt(3.0) * variation * craft.rng.uniform(-1.0, 1.0, 3))
         mean = craft.second(true, noise)
         found.begin_mean()
@@ -222,7 +228,9 @@ def test_currents_that_scatter_in_each_cycle_are_in_the_claim() -> None:
     assert nees[0.0] > 1.7
 
 
-def test_coils_that_vary_over_tens_of_seconds_are_in_the_claim() -> None:
+@pytest.mark.parametrize("every", [5, 20, 60])
+def test_coils_that_vary_over_tens_of_seconds_are_in_the_claim(every: int) -> None:
+    """The filter assumes a correlation time of 20 s; the true interval is shorter, equal or longer."""
     honest = FreeFilterSettings(errors=NO_ERRORS, dipole=(1e-6, 0.0), sunlit=(1e-6, 0.0), field=1e-9)
     nees = {}
     for settings in (honest, dataclasses.replace(honest, coil_error=0.0)):
@@ -231,13 +239,14 @@ def test_coils_that_vary_over_tens_of_seconds_are_in_the_claim() -> None:
             craft = Craft(np.zeros(3), np.array([0.0, -1.1e-3, 0.0]), seed)
             found = started(craft, settings)
             dipole = 0.15 * craft.rng.choice((-1.0, 1.0), 3)
-            fly(craft, found, 24, dipole, 0.0, honest.coil_error)
+            fly(craft, found, 24, dipole, 0.0, 0.005, every)
             pick = np.r_[ATTITUDE, RATE]
             error = errors(found, craft)[:6]
             squares.append(error @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], error) / 6.0)
         nees[settings.coil_error] = float(np.mean(squares))
     assert 0.5 < nees[honest.coil_error] < 1.7, "36 errors: 99.9 % of a chi-square over 36"
-    assert nees[0.0] > 3.0
+    # Independent variations in shorter intervals partly cancel each other.
+    assert nees[0.0] > (3.0 if every >= 20 else 2.0)
 
 
 def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> None:
