@@ -492,7 +492,7 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the best circle (x, y, radius) through three of the points, or None if the points give no circle.
+    """Return the best circle (x, y, radius) through three of the points, or None if they give none.
 
     The best circle is the smallest of the circles that have nearly the most points within the distance
     `gate`. The three points of a circle have equal spacings, between an eighth and a third of the rim.

@@ -94,9 +94,7 @@ def _flight(
     config = configuration.replace(config, elements=None, duration=duration, targets=config.targets[:1])
     place = float(np.random.default_rng(seed).uniform(0.0, 360.0))
     assert world.free_body is not None
-    varying = configuration.replace(
-        world.free_body.disturbances, coil_variation=COIL_VARIATION
-    )
+    varying = configuration.replace(world.free_body.disturbances, coil_variation=COIL_VARIATION)
     body = configuration.replace(
         world.free_body,
         disturbances=varying,
