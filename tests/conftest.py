@@ -1,11 +1,11 @@
-"""Marks as slow the tests listed in tests/slow.txt, and collects the files in the order of tests/order.txt.
+"""Marks the tests of tests/slow.txt as slow, and sorts the test files by their durations in tests/order.txt.
 
 `make slow-list` measures and writes both lists. A test is slow if all its cases together take more than
-`LIMIT_S` of processor time. The time includes fixtures, but no compiled functions, which only runs with slow
-tests compare (`tests.support.compiled_forms`). `make quick` leaves slow tests out; a listed test that was
-renamed is not slow until the list is made again. Files that last longer than `LONG_S` come first, in order of
-falling duration, so that the workers of `make test` finish at nearly the same time. The duration of a file
-that waits for processes or sockets exceeds its processor time.
+`LIMIT_S` of processor time. This time includes fixtures, and excludes the compilation of functions, because
+only runs with slow tests compile functions (`tests.support.compiled_forms`). `make quick` omits slow tests. A
+test that was renamed is not marked as slow until the list is measured again. Test files that last longer than
+`LONG_S` run first, in the order of decreasing duration, so that the workers of `make test` finish at nearly
+the same time. The duration of a file that waits for processes or sockets exceeds its processor time.
 """
 
 from __future__ import annotations
@@ -21,16 +21,18 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# `python -m flight` sets the same value: otherwise OpenBLAS's waiting threads would take a third of the
-# processor time. No test imports numpy before this file is read, and started programs inherit the setting.
+# `python -m flight` sets the same number of threads. With more threads, the idle threads of OpenBLAS would
+# use a third of the processor time. No test imports numpy before this file is imported, and programs that
+# tests start inherit the setting.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # The tests check the numpy implementations of functions that numba can compile. The compiled implementations
-# are compared with the numpy implementations. So recorded results are the same byte for byte, and started
-# programs do not load numba.
+# are compared with the numpy implementations. With the numpy implementations, results equal recorded results
+# byte for byte, and programs that tests start do not load numba.
 os.environ.setdefault("KNIGHTCUBE_COMPILED", "0")
 
 # No test may fail because the machine is busy, or because hypothesis draws a rare example in one of many
-# runs. Each run has the same examples, so more examples would take time in each run without new findings.
+# runs. All runs use the same examples, so a larger number of examples would slow each run without new
+# findings.
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=40)
 settings.register_profile("explore", deadline=None, max_examples=100)
 settings.load_profile("repeatable")
@@ -44,7 +46,7 @@ ORDER = Path(__file__).with_name("order.txt")
 _spent: dict[str, float] = {}
 """Processor time (s) of each test."""
 _lasted: dict[str, float] = {}
-"""Duration (s) of each test file, or its processor time if that is longer."""
+"""Duration (s) of each test file, or its processor time (s) if the processor time is longer."""
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +60,7 @@ def session_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return the number of workers for `-n auto`: one more than the cores, because many tests wait."""
+    """Return the number of workers for `-n auto`, one more than the cores, because many tests wait."""
     return len(os.sched_getaffinity(0)) + 1
 
 
@@ -66,8 +68,8 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection() -> Iterator[None]:
     """Import the tests in one worker process after another, without garbage collection.
 
-    In a new clone the first worker compiles each module and stores its bytecode, which the others load.
-    Otherwise each worker would compile all modules.
+    In a new clone, the first worker compiles each module and stores the bytecode, and the other workers load
+    it. If all workers imported at once, each worker would compile all modules.
     """
     gc.disable()
     with Path(__file__).open(encoding="utf-8") as turn:
@@ -78,17 +80,17 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that measures the times of the tests."""
+    """Add the option `--write-slow-list`, which writes the durations of the tests."""
     parser.addoption("--write-slow-list", action="store_true", help=f"write {LIST.name} from this run")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Leave the compilation of functions out of runs without slow tests."""
+    """Disable the compilation of functions in runs without slow tests."""
     compiled_forms.compiles = config.getoption("markexpr") != "not slow"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the listed tests as slow, and put the files that take longest first."""
+    """Mark the listed tests as slow, and sort the files by decreasing duration."""
     listed, of_file = _seconds(LIST), _seconds(ORDER)
     for item in items:
         if _function(item) in listed:
@@ -97,7 +99,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _seconds(path: Path) -> dict[str, float]:
-    """Return the time (s) of each test or test file of a list."""
+    """Return the times (s) in a list, by the name of the test or test file."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     return {name: float(spent) for name, _, spent in (line.rpartition(" ") for line in lines)}
 
@@ -114,7 +116,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write both lists if requested."""
+    """Write tests/slow.txt and tests/order.txt if the option `--write-slow-list` is set."""
     if session.config.getoption("--write-slow-list"):
         slow = sorted(f"{name} {spent:.1f}" for name, spent in _spent.items() if spent > LIMIT_S)
         LIST.write_text("\n".join(slow) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Configurations of boards for runs with emulated devices, and the requirements on such a run."""
+"""Configurations of boards for runs with emulated devices, and checks of the packets of such runs."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from sim_hal.serving.device_link import RemoteI2cBus
 from tests.deploy.scripts import ROOT
 
 WORLDS = {"board_testbed": "step_demo", "board_orbit": "orbit"}
-"""Configurations of boards, each with the simulated world for its emulated devices."""
+"""Name of each board configuration, with the simulated world of its emulated devices."""
 
 
 def board_text(name: str, folder: Path) -> str:
-    """Return a board's configuration for devices in `folder`, a busy machine and a short flight.
+    """Return a board's configuration for devices in `folder`, with timeouts for a busy machine.
 
-    The inhibit after separation is shortened. The testbed rotates to a new angle every 10 s, so that the
-    frames have streaks.
+    The inhibit after separation lasts 0.5 s. The testbed rotates to a new angle every 10 s, so that its
+    frames contain streaks.
     """
     text = (ROOT / "config" / f"{name}.yaml").read_text(encoding="utf-8")
     text = re.sub(r"/dev/knightcube-(camera|wide-\d)", rf"{folder}/knightcube-\1/camera", text)
@@ -53,21 +53,24 @@ def has_arrived(archive: Path, orbit: bool) -> bool:
 
 
 def everything_arrived(run: Run, orbit: bool) -> bool:
-    """Return whether readings of every device have arrived, with a rate and an attitude from a frame."""
+    """Return whether a run has readings of every device, a rate from streaks and an attitude from stars."""
     of_body = ("fix", "directions") if orbit else ("plan",)
     every = all(len(run[name]) for name in ("imu", "housekeeping", *of_body))
     return every and len(frames_with_rate(run)) > 0 and b"solved" in run["stars"]["status"]
 
 
 def frames_with_rate(run: Run) -> PacketArray:
-    """Return the packets of frames whose streaks gave a rate, possibly with unknown sign."""
+    """Return the packets of frames whose streaks gave a rate. The sign of the rate may be unknown."""
     frames = run["streak"]
     found: PacketArray = frames[np.isfinite(frames["rate"]).all(axis=1)]
     return found
 
 
 def coil_currents(bus: RemoteI2cBus) -> list[float]:
-    """Return the currents (A) of the emulated coils, also if a busy machine responds late."""
+    """Return the currents (A) of the emulated coils.
+
+    The query is repeated if a busy machine responds late.
+    """
     for _ in range(100):
         with suppress(TimeoutError):
             found: list[float] = bus.call("currents")

@@ -1,7 +1,4 @@
-"""Flights of the boards' configurations in the container, accepted and started by systemd in the sandbox.
-
-`tests.deploy.scenario` calls `fly_board` for each configuration, after the steps of the simulated flight.
-"""
+"""Flights of the boards' configurations in the container, started by systemd in the service's sandbox."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from tests.deploy.scenario import SERVICE, systemctl, wait
 from tests.deploy.scripts import ROOT
 
 PATIENCE_S = 150.0
-"""Longest time (s) until every device has been read, on a busy machine."""
+"""Timeout (s) until every device has been read on a busy machine."""
 _CONFIG, _RUNS = Path("/etc/knightcube/flight.yaml"), Path("/var/lib/knightcube/runs")
 _FOLDER, _FACTS = Path("/run/knightcube-board"), Path("/run/knightcube-board.json")
 _BOARD = "knightcube-board.service"

@@ -1,9 +1,9 @@
-"""Files of a board whose releases are built in a second, because its Python makes empty environments.
+"""Files of a board whose releases are installed within a second, because its Python makes empty environments.
 
 The installer is given a script instead of a Python interpreter. The script makes virtual environments that
 contain the script itself as Python interpreter, "installs" by writing one file, and prints its release
-instead of starting a flight. All other programs, such as the installer's own modules, are run by the real
-Python.
+instead of starting a flight. The script passes all other programs, such as the modules of the installer, to
+the real Python.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ esac
 
 
 def starts_record(starts: dict[str, int], *proven: str) -> bytes:
-    """Return the record of the starts of releases that are not accepted yet, and of the accepted releases."""
+    """Return a release record with the numbers of starts of new releases, and the accepted releases."""
     return to_record(json.dumps({"starts": starts, "proven": proven}).encode())
 
 
@@ -59,11 +59,14 @@ class FakeBoard:
 
     @property
     def prefix(self) -> Path:
-        """Folder of the software."""
+        """Installation folder of the software, `opt/knightcube`."""
         return self.root / "opt/knightcube"
 
     def python(self, label: str) -> Path:
-        """Return a script that acts as a Python whose environments contain the release `label`."""
+        """Return a script that acts as a Python interpreter.
+
+        Its virtual environments contain the release `label`.
+        """
         home = self.root.parent / f"python-{label}"
         path = home / "bin/python"
         if not path.exists():
@@ -90,16 +93,17 @@ class FakeBoard:
         return done.stdout
 
     def unit_words(self, unit: str, setting: str = "ExecStart") -> list[str]:
-        """Return a unit's command up to the launcher's program, with the file paths of this board."""
+        """Return the command of a unit, as words, up to the launcher, with the file paths of this board."""
         text = (DEPLOY / unit).read_text(encoding="utf-8").replace("\\\n", "")
         (line,) = re.findall(rf"^{setting}=-?(/bin/sh -c '.*)$", text, re.MULTILINE)
         return shlex.split(line.replace("$$", "$").replace("/opt/knightcube", str(self.prefix)))[:4]
 
     def fly(self, *program: str) -> tuple[str, str]:
-        """Start the flight, and return the label of the started release ("" for none) and the error output.
+        """Start the flight; return the label of the started release ("" for none) and the error output.
 
         The error output omits the line that reports an ordinary start of the current release. By default, the
-        first copy of the launcher starts the flight; `program` gives another command line, such as a unit's.
+        first copy of the launcher starts the flight; `program` replaces its command line, for example by the
+        command of a unit.
         """
         state = self.root / "state"
         state.mkdir(exist_ok=True)

@@ -1,9 +1,9 @@
-"""Boots systemd by nspawn on an overlay of the machine's files, as a separate machine for the service.
+"""Boots a systemd-nspawn container on an overlay of the machine's files, to test the service.
 
-`boot` runs `python -m tests.deploy.container FOLDER SCENARIO` in a mount namespace of its own, so that its
-mounts are not seen outside and end with it. The program installs the service by `deploy/install.sh` and
-boots. Inside, the unit `scenario` runs the module SCENARIO, which writes its observations into FOLDER, and
-the machine is switched off.
+`boot` runs `python -m tests.deploy.container FOLDER SCENARIO` in a separate mount namespace, so that the
+mounts of this program are not visible to other programs and end with it. The program installs the service by
+`deploy/install.sh` and boots the container. In the container, the unit `scenario` runs the module SCENARIO,
+which writes its observations into FOLDER, and the container is shut down.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from knightcube.vision.startracker.index.sky_index import PATH
 from tests.hal.guardian.live_flight import ROOT, write_config
 
 LIMIT_S = 1500.0
-"""Longest time (s) of a scenario in the container, on a busy machine."""
+"""Timeout (s) of a scenario in the container on a busy machine."""
 SERVICES, RENEWALS = "tests.deploy.scenario", "tests.deploy.renewal_scenario"
-"""Modules of the scenarios: faults of the services, and updates by the ground over the link."""
+"""Modules of the two scenarios: faults of the services, and updates by the ground over the link."""
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"
 COMMANDS = "/run/knightcube/commands"
 """Path of the socket on which the service receives commands."""
 LINK, KEYS = "127.0.0.1:5010", "/var/lib/knightcube-link/keys"
-"""Address of the link, and its keys on board, of the scenario `RENEWALS`."""
+"""Address of the link, and folder of its keys on board, in the scenario `RENEWALS`."""
 
 _OPENED = f"""[Service]
 ProtectHome=no
@@ -44,7 +44,7 @@ _TOOLS = ("systemd-nspawn", "unshare", "systemctl", "mount", "useradd")
 
 
 def why_not() -> str:
-    """Return the reason why this machine cannot boot such a container, or ""."""
+    """Return the reason why this machine cannot boot a container, or "" if it can."""
     if os.environ.get("CI"):
         return "takes minutes: not in continuous integration"
     if os.geteuid() != 0:
@@ -88,7 +88,10 @@ def _mounted() -> list[Path]:
 
 
 def boot(folder: Path, scenario: str = SERVICES) -> dict[str, Any]:
-    """Boot, run a scenario and return its observations. Raises AssertionError with the log on a failure."""
+    """Boot the container, run a scenario and return its observations.
+
+    Raises AssertionError with the log on a failure.
+    """
     words = ["unshare", "--mount", "--propagation", "private", sys.executable, "-m", "tests.deploy.container"]
     done = subprocess.run(
         [*words, str(folder), scenario],
@@ -108,7 +111,7 @@ def boot(folder: Path, scenario: str = SERVICES) -> dict[str, Any]:
 
 
 def main(folder: Path, scenario: str) -> None:
-    """Build and boot the machine, and remove everything afterwards."""
+    """Build and boot the container, and remove its files and mounts afterwards."""
     root = _overlay()
     _furnish(root, folder, scenario)
     home = _enter_cgroup()
@@ -122,8 +125,8 @@ def main(folder: Path, scenario: str) -> None:
                 "--register=no",
                 "--keep-unit",
                 "--private-network",
-                # Without these mounts, the device policy and address filter of the units would not be active
-                # in the container.
+                # Without these mounts, the device policy and the address filter of the units would have no
+                # effect in the container.
                 "--system-call-filter=bpf",
                 "--capability=CAP_BPF,CAP_PERFMON",
                 "--console=pipe",
@@ -154,7 +157,7 @@ def main(folder: Path, scenario: str) -> None:
 
 
 def _overlay() -> Path:
-    """Mount the machine's files with an overlay in memory that receives all writes."""
+    """Mount the machine's files below an overlay in memory, which receives all writes."""
     _do("mount", "-t", "tmpfs", "tmpfs", "/mnt")
     for name in ("upper", "work", "root"):
         Path("/mnt", name).mkdir()
@@ -166,8 +169,8 @@ def _overlay() -> Path:
             folder.mkdir()
         layers = f"lowerdir={place},upperdir={upper},workdir={work}"
         _do("mount", "-t", "overlay", "overlay", "-o", layers, str(shown))
-        # This mount is for the installer. At the boot, the container's own mounts hide it, and nspawn mounts
-        # it again.
+        # The installer needs this mount. At the boot, the container's own mounts hide it, and nspawn mounts
+        # the folder again.
         Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
         _do("mount", "--bind", str(shown), f"/mnt/root{place}")
     # nspawn stores its files here; they are removed with the mount.
@@ -176,7 +179,7 @@ def _overlay() -> Path:
 
 
 def _furnish(root: Path, folder: Path, scenario: str) -> None:
-    """Install the service as a user would, and add the emulated devices and the scenario."""
+    """Install the service as a user would, and add the emulated devices and the scenario to the container."""
     (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", encoding="ascii")
     config = write_config(folder)
     with config.open("a", encoding="utf-8") as file:
@@ -185,7 +188,7 @@ def _furnish(root: Path, folder: Path, scenario: str) -> None:
             file.write(f"link: {{keys: {KEYS}, spacecraft: 0x1A5, udp: {LINK}, rate: 100000}}\n")
     installer = ["chroot", str(root), str(ROOT / "deploy/install.sh")]
     options = ["--config", str(config)]
-    if scenario == RENEWALS:  # a release can only be updated from its own packages
+    if scenario == RENEWALS:  # a release can only be updated from packages that are on the board
         options += ["--python", f"{sys.base_prefix}/bin/python3"]
         _make_keys(root, folder)
     else:
@@ -245,7 +248,7 @@ ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl -
 
 
 def _make_keys(root: Path, folder: Path) -> None:
-    """Make the keys of the link and of the updates, and copy the board's part of them to the board."""
+    """Make the keys of the link and of the updates, and copy the satellite's keys to the board."""
     for words in (["keys", "keys"], ["renewal", "keys", "signing"]):
         subprocess.run(
             [sys.executable, "-m", "flight", *words], cwd=folder, check=True, stdout=subprocess.DEVNULL
@@ -258,14 +261,14 @@ def _make_keys(root: Path, folder: Path) -> None:
 
 
 def _opened() -> str:
-    """Return the paths that the sandbox must permit, including those that a private /tmp would hide."""
+    """Return the paths that the sandbox must permit, including paths that a private /tmp would hide."""
     return "\n".join([_OPENED, *(f"BindReadOnlyPaths={place}" for place in _mounted())])
 
 
 def _write_i2cset(folder: Path) -> None:
     """Put a replacement of i2cset first in the services' PATH.
 
-    It writes to the emulated chip and records why it ran.
+    The replacement writes to the emulated chip, and records the reason for each call.
     """
     (folder / "bin").mkdir()
     printed = folder / "result.txt"
@@ -291,7 +294,7 @@ with open("/share/result.txt", "a") as result:
 
 
 def _enter_cgroup() -> Path:
-    """Move into a new cgroup, in the pure cgroup2 hierarchy that systemd needs; return the former one."""
+    """Move this process into a new cgroup of the cgroup2 hierarchy, for systemd; return the former cgroup."""
     _do("umount", "--recursive", "/sys/fs/cgroup")
     _do("mount", "-t", "cgroup2", "cgroup2", "/sys/fs/cgroup")
     before = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
@@ -316,7 +319,7 @@ def _leave_cgroup(home: Path) -> None:
             try:
                 Path(inside).rmdir()
                 break
-            except OSError:  # killed processes are still ending
+            except OSError:  # killed processes have not ended yet
                 subprocess.run(["sleep", "0.05"], check=True)
 
 

@@ -2,9 +2,10 @@
 
 `python -m tests.deploy.emulated_board CONFIG WORLD FOLDER` emulates the devices of CONFIG in the world that
 the section `simulation` of WORLD describes. The device files of serial devices in CONFIG become links to
-pseudo-terminals. With the printed environment, programs open the I2C bus by its device file, by the preload
-library of `sim_hal emulate i2c`. Frames are supplied by `tests.deploy.emulated_video`. The true state is
-logged in FOLDER. The program prints one JSON object when the devices respond, and ends at SIGTERM.
+pseudo-terminals. Programs that run with the printed environment variables open the I2C bus by its device
+file, through the preload library of `sim_hal emulate i2c`. Frames are supplied by
+`tests.deploy.emulated_video`. The true state is logged in FOLDER. The program prints one JSON object when the
+devices respond, and ends at SIGTERM.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from sim_hal.serving.server import DeviceServer
 from sim_hal.settings import Simulation
 
 TUMBLE = 0.05
-"""Body rate (rad/s) of a satellite at the start, at which its star camera takes frames with streaks."""
+"""Initial body rate (rad/s) of a satellite, at which the frames of its star camera contain streaks."""
 
 
 def serve(path: Path, world: Path, folder: Path) -> None:
@@ -41,7 +42,7 @@ def serve(path: Path, world: Path, folder: Path) -> None:
         body = msgspec.structs.replace(section.free_body, release=release)
         section = msgspec.structs.replace(section, free_body=body)
     server = DeviceServer(config, section, folder)
-    with suppress(PermissionError):  # real devices do not wait for the programs of a busy machine
+    with suppress(PermissionError):  # a real device does not wait for programs on a busy machine
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     signal.signal(signal.SIGTERM, server.stop)
     bus_socket = folder / "bus.sock"

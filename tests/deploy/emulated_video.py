@@ -1,9 +1,9 @@
 """Runs commands of the flight software with Video for Linux cameras whose frames are rendered.
 
-`python -m tests.deploy.emulated_video CONFIG SOCKET WORDS... [-- WORDS...]` runs `knightcube WORDS...`, and
-after a success the next command. The cameras of CONFIG are those of the device server at SOCKET, numbered in
-the order of CONFIG. Only the kernel's side of /dev/videoN, which performs the driver's ioctls, is replaced;
-the memory maps of the driver are real.
+`python -m tests.deploy.emulated_video CONFIG SOCKET WORDS... [-- WORDS...]` runs the commands `knightcube
+WORDS...` in order until a command fails. The device server at SOCKET renders the frames for the cameras of
+CONFIG, which are numbered in the order of CONFIG. The program replaces only the kernel's side of /dev/videoN,
+which performs the driver's ioctls. The memory maps of the driver are real.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ STAR_INTERVAL_NS, WIDE_INTERVAL_NS = 500_000_000, 1_000_000_000
 Each frame is rendered, even if the driver selects a later frame.
 """
 PATIENCE_NS = 3_000_000_000
-"""Time (ns) after an exposure at which a frame that has not arrived counts as lost."""
+"""Time (ns) after an exposure at which a frame that has not arrived is counted as lost."""
 
 
 class ServedVideo(IoctlCamera):
     """A free-running camera whose frames are rendered by a device server.
 
-    A frame is exposed after the previous frame has arrived, so that the interval of the frames depends on the
-    duration of the rendering.
+    The exposure of a frame begins when the previous frame has arrived, so the interval between frames depends
+    on the rendering time.
     """
 
     def __init__(self, camera: Camera | WideCamera, source: RemoteFrameSource, clock: SystemClock) -> None:
-        """Create the device file of `camera`, with the name `camera` in a separate folder."""
+        """Create the device file of `camera` in a separate folder, which has the same name."""
         device = camera.device
         assert isinstance(device, V4l2Device)
         folder = Path(device.path).parent
@@ -64,7 +64,7 @@ class ServedVideo(IoctlCamera):
         self._abandoned_ns = 0
 
     def _run(self) -> None:
-        """Finish the frame that has arrived, and begin the next exposure at its time."""
+        """Deliver the frame that has been rendered, and begin the next exposure at the time of this frame."""
         if not self._streaming:
             return
         frame, now_ns = self._source.poll(), self._now_ns()
@@ -81,7 +81,7 @@ class ServedVideo(IoctlCamera):
 
 
 def plug(path: Path, socket: Path) -> None:
-    """Plug in the cameras of a configuration, so that the driver for Video for Linux finds them."""
+    """Create the cameras of a configuration, so that the driver for Video for Linux finds them."""
     config, clock = reader.load(path), SystemClock()
     cameras = [camera for camera in (config.camera, *config.wide_cameras) if camera is not None]
     videos = [
@@ -93,7 +93,7 @@ def plug(path: Path, socket: Path) -> None:
     def ioctl(descriptor: int, request: int, argument: Any) -> int:
         return by_inode[os.fstat(descriptor).st_ino](descriptor, request, argument)
 
-    vars(v4l2)["ioctl"] = ioctl  # the kernel's side
+    vars(v4l2)["ioctl"] = ioctl  # replaces the ioctls of the kernel
 
 
 def run(words: Sequence[str]) -> int:

@@ -18,13 +18,14 @@ from tests.deploy.scripts import ROOT
 LINK_SERVICE = "knightcube-link.service"
 CONFIG, STATUS = Path("/etc/knightcube/flight.yaml"), Path("/var/lib/knightcube-renewal/status")
 TRIAL = ("--timeout", "600", "--despite-faults")
-"""Options of the command that activates an update, with which reported faults do not end its trial.
+"""Options of the command that activates an update. Reported faults do not end the trial of the update.
 
 On a busy machine the emulated devices respond late, which a flight reports as a fault.
 """
 FUTURE = "from __future__ import annotations\n"
 FAULT = "import sys\nif '--archive' in sys.argv:\n    raise SystemExit('broken on purpose')\n"
-"""Fault that the self-test of a release cannot show: it ends every flight of the service."""
+"""Code of a faulty release. The self-test does not detect the fault, and each flight of the service ends at
+once."""
 VERSION = re.compile(r'(?m)^version = "(\d+\.\d+)\.(\d+)"')
 
 
@@ -47,7 +48,7 @@ class Ground:
         return done.returncode, done.stdout + done.stderr
 
     def call(self, command: str, *words: object) -> tuple[int, str]:
-        """Run a command for the satellite. `command` has the words before the link's options."""
+        """Run a command for the satellite. `command` contains the words that precede the link's options."""
         return self.run(*command.split(), *self._satellite, *words)
 
     def renew(self, kind: str, artefact: Path, version: int) -> dict[str, Any]:
@@ -60,7 +61,8 @@ class Ground:
             "activate": self.call("renewal activate", kind, bundle, *TRIAL),
         }
         if steps["activate"][0] == 0:
-            # A command is lost while the link restarts for the trial; an operator sends the command again.
+            # A command is lost if the link restarts for the trial at that time. An operator sends the command
+            # again.
             for _ in range(6):
                 steps["confirm"] = self.call("renewal confirm", kind, "--timeout", "30")
                 if steps["confirm"][0] == 0:
@@ -74,7 +76,7 @@ def _are_up() -> bool:
 
 
 def flown_release() -> list[str]:
-    """Return the names of the releases whose Python flight and link run."""
+    """Return the names of the releases from which the flight and the link run."""
     names = []
     for unit in (SERVICE, LINK_SERVICE):
         pid = int(systemctl("show", "--value", "-p", "MainPID", unit))
@@ -108,7 +110,7 @@ def play(folder: Path, facts: Path) -> dict[str, Any]:
     wait(facts.exists, 20.0)
     systemctl("start", SERVICE, LINK_SERVICE, "knightcube-renewal.timer")
     wait(_are_up, 60.0)
-    wait(STATUS.exists, 60.0)  # the link refuses updates until the privileged program has run once
+    wait(STATUS.exists, 60.0)  # the link refuses updates before the first run of the privileged program
     ground = Ground(folder)
     seen: dict[str, Any] = {
         "first": flown_release(),

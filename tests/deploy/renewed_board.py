@@ -46,10 +46,10 @@ _SCRIPT_BOARD: Any = renewal.Board
 
 
 class _Board(_SCRIPT_BOARD):  # type: ignore[misc]  # the script is imported without types
-    """Files and services of a board whose bundles are opened in this process."""
+    """Files and services of a board. The bundles are opened in the process of the test."""
 
     def run(self, words: Sequence[object], limit_s: float = 1800.0) -> subprocess.CompletedProcess[str]:
-        """Run a program; the Python of a release is started only to show that it starts."""
+        """Run a program. The Python of a release is only started to show that it starts."""
         python, *options = words
         if len(options) < 3 or Path(str(options[2])).name != "open_bundle.py":
             found: subprocess.CompletedProcess[str] = super().run(words, limit_s)
@@ -59,16 +59,16 @@ class _Board(_SCRIPT_BOARD):  # type: ignore[misc]  # the script is imported wit
 
 
 class RenewedBoard:
-    """A board with the release `old`, and the ground that signs for it.
+    """A board with the release `old`, and the signing keys of its ground station.
 
     The privileged program runs in this process, because a separate process would spend most of its time on
-    imports. With `processes` it runs as on a board.
+    imports. If `processes` is set, the privileged program runs in a process of its own, as on a board.
     """
 
     processes = False
 
     def __init__(self, place: Path) -> None:
-        """Use a folder that `make` has created."""
+        """Use the files in a folder that `make` has created."""
         self.place, self.root, self.now = place, place / "root", 1000.0
         self.files = FakeBoard(self.root, place / "flight.yaml")
         self.own, self.link = self.root / "var/lib/knightcube-renewal", self.root / "var/lib/knightcube-link"
@@ -104,7 +104,7 @@ class RenewedBoard:
         return cls(place)
 
     def set_active(self, unit: str, active: bool) -> None:
-        """Set whether a unit is active."""
+        """Set whether a unit of systemd is active."""
         path = self.place / "active" / unit
         path.touch() if active else path.unlink(missing_ok=True)
 
@@ -114,12 +114,12 @@ class RenewedBoard:
         return {**os.environ, "PATH": path, "BOARD": str(self.place)}
 
     def words(self) -> list[str]:
-        """Return the command of one step of the privileged part."""
+        """Return the command line of one step of the privileged program."""
         program = self.files.prefix / "bin/renewal.py"
         return [sys.executable, "-I", "-S", str(program), "--root", str(self.root), "--now", str(self.now)]
 
     def step(self, seconds: float = 10.0) -> str:
-        """Advance the clock, run one step, and return its error output."""
+        """Advance the clock, run one step of the privileged program, and return its error output."""
         self.now += seconds
         return self.run()
 
@@ -139,21 +139,21 @@ class RenewedBoard:
         return done.stderr
 
     def bundle(self, kind: str, path: Path, version: int, *, unchecked: bool = False, **changes: Any) -> Path:
-        """Sign an artefact, without the checks of the ground if `unchecked`."""
+        """Sign an artefact. If `unchecked` is set, the checks of the ground are omitted."""
         options = {"back": False, "expires": None, "least": 1, "out": self.place} | changes
         data = path.read_bytes() if unchecked and path.is_file() else artefact(kind, path)
         signing = self.place / "signing"
         return sign(Namespace(folder=signing, kind=kind, version=version, **options), data)
 
     def put(self, bundle: Path, kind: str = "configuration") -> str:
-        """Store a bundle as the link stores a selected bundle, and return its SHA-256."""
+        """Store a bundle as the link stores an uplinked bundle, and return its SHA-256 digest."""
         place = self.link / "files/chosen" / kind / bundle.name
         place.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(bundle, place)
         return hashlib.sha256(bundle.read_bytes()).hexdigest()
 
     def request(self, word: str, kind: str = "configuration", **values: Any) -> str:
-        """Write a request of the link, and return its name."""
+        """Write a request as the link does, and return the name of the request."""
         self.count += 1
         name = f"1-{self.count}-0-0"
         (self.link / "renewal" / name).write_bytes(encoded({"do": word, "kind": kind, **values}))
@@ -170,7 +170,7 @@ class RenewedBoard:
         (self.link / "renewal/contact").write_bytes(encoded(values))
 
     def changed(self, name: str) -> Path:
-        """Return the present configuration with another name."""
+        """Return the present configuration under a new name."""
         path = self.place / f"{name}.yaml"
         lines = self.config.read_text(encoding="utf-8").splitlines(keepends=True)
         text = "".join(f"name: {name}\n" if line.startswith("name:") else line for line in lines)
@@ -178,25 +178,25 @@ class RenewedBoard:
         return path
 
     def flown(self) -> str:
-        """Return the name in the installed configuration, whose checksum must be right."""
+        """Return the name in the installed configuration, and check the checksum of this configuration."""
         data = self.config.read_bytes()
         accepted = self.config.with_name("flight.yaml.sha256").read_text(encoding="ascii").split()[0]
         assert accepted == hashlib.sha256(data).hexdigest()
         return next(line[6:] for line in data.decode().splitlines() if line.startswith("name: "))
 
     def restarted(self) -> bool:
-        """Return whether flight and link must be restarted, and restart them."""
+        """Return whether flight and link must be restarted, and mark both as restarted."""
         path = self.own / "restart"
         found = path.exists()
         path.unlink(missing_ok=True)
         return found
 
     def release(self) -> str:
-        """Return the label of the release that would start at present."""
+        """Return the label of the release that would start now."""
         return self.files.fly()[0]
 
     def reports(self, request: str) -> list[tuple[str, str]]:
-        """Return results and texts of the reports about a request."""
+        """Return the result and text of each report about a request."""
         status = decoded((self.own / "status").read_bytes())
         return [(result, text) for _, name, result, _, text in status["reports"] if name == request]
 

@@ -1,4 +1,4 @@
-"""An updated board, its link and its ground in one process, with services that start as on a board."""
+"""A board that is updated, its link and its ground station in one process. Services start as on a board."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def linked_text() -> str:
 
 
 class RenewedEnds(FiledEnds):
-    """A satellite that can be updated, and its ground.
+    """A satellite whose software can be updated, and its ground station.
 
     Attributes:
         board: files of the satellite.
-        reacts: name of the configuration whose flight changes to SAFE by a reaction to an event.
-        crashes: label of the release whose flight ends at once.
+        reacts: name of the configuration whose flight enters the mode SAFE because of an event.
+        crashes: label of the release whose flight crashes at its start.
     """
 
     def __init__(self, board: RenewedBoard, seed: int) -> None:
-        """Use a copy of a board."""
+        """Use a copy of the files of a board."""
         self.board, self.reacts, self.crashes = board, "", "crashes"
         self.renewal = board.own / "status"
         place = board.place / "link"
@@ -60,11 +60,11 @@ class RenewedEnds(FiledEnds):
         self.turn(0.5)
 
     def answers(self) -> bool:
-        """Return whether the link executes a command."""
+        """Return whether the link executes a test command."""
         return self.up[LINK] and self.command(Listing()) == "completed"
 
     def services(self) -> None:
-        """Start flight and link as systemd does, if they are to be restarted."""
+        """Start flight and link as systemd does, if a restart of them is requested."""
         if not self.board.restarted():
             return
         name = self._flown()
@@ -77,12 +77,12 @@ class RenewedEnds(FiledEnds):
             self.record(self.mode_packet(Mode.SAFE, "reaction safe"))
 
     def flown_release(self) -> str:
-        """Return the label of the running release, or an empty string if its flight ends at once."""
+        """Return the label of the running release, or an empty string if its flight crashes at its start."""
         label = self.board.release()
         return "" if label == self.crashes else label
 
     def _flown(self) -> str:
-        """Return the name of the configuration in use, or an empty string if the flight ends at once."""
+        """Return the name of the configuration in use, or "" if the flight crashes at its start."""
         state = self.board.place / "state"
         state.mkdir(exist_ok=True)
         if not self.flown_release():
@@ -99,7 +99,7 @@ class RenewedEnds(FiledEnds):
         return parse(chosen.text, str(path)).name
 
     def _linked(self) -> bool:
-        """Return whether the link opens."""
+        """Return whether the link opens its line."""
         try:
             chosen = accepted_config(self.board.config, {"STATE_DIRECTORY": str(self.board.place / "state")})
             link = parse(chosen.text, "flight.yaml").link

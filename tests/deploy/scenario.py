@@ -1,4 +1,4 @@
-"""The steps and observations of the service's test in the container; `tests.deploy.container` runs it."""
+"""Steps and observations of the service's test in the container; run by `tests.deploy.container`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ExecStart=/bin/sh -c ": </dev/net/tun"
 
 
 class Service:
-    """State of the service by systemctl, and the coils of the emulated devices."""
+    """State of the service as systemctl reports it, and currents of the emulated coils."""
 
     def __init__(self, bus: RemoteI2cBus) -> None:
         self._bus = bus
@@ -39,14 +39,14 @@ class Service:
         return int(self.show("MainPID"))
 
     def driven(self) -> bool:
-        """Return whether a coil carries current; the result may be delayed on a busy machine."""
+        """Return whether a coil carries current. The query is repeated if a busy machine responds late."""
         for _ in range(50):
             with contextlib.suppress(TimeoutError):
                 return any(self._bus.call("currents"))
         raise TimeoutError("the emulated devices do not answer")
 
     def hurt(self, act: Callable[[int], None]) -> dict[str, Any]:
-        """Disturb the running service, and return the times to zero current and to the next start."""
+        """Disturb the running service; return the times until zero coil current and until the next start."""
         wait(self.driven, 20.0)
         old = self.pid()
         begun = time.monotonic()
@@ -54,7 +54,7 @@ class Service:
         zero = again = None
         while (since := time.monotonic() - begun) < 30.0 and again is None:
             if self.driven():
-                # The next process may drive the coils again from its first cycle on.
+                # The restarted flight process may drive the coils from its first cycle on.
                 if self.pid() in (old, 0):
                     zero = None
                 elif self.show("ActiveState") == "active":
@@ -71,7 +71,7 @@ def systemctl(*words: str) -> str:
 
 
 def wait(condition: Callable[[], bool], patience: float) -> float:
-    """Wait for a condition, and return the duration. Raises TimeoutError."""
+    """Wait until a condition is true, and return the duration (s). Raises TimeoutError."""
     begun = time.monotonic()
     while not condition():
         if time.monotonic() - begun > patience:
@@ -81,7 +81,7 @@ def wait(condition: Callable[[], bool], patience: float) -> float:
 
 
 def _last_words() -> str:
-    """Return the reason for the last ExecStopPost that the replacement of i2cset has recorded."""
+    """Return the reason of the most recent ExecStopPost, as the replacement of i2cset recorded it."""
     results = [
         word for word in Path("/share/result.txt").read_text(encoding="ascii").split() if word != "before"
     ]
@@ -125,7 +125,7 @@ def _flight(*words: str) -> str:
 
 
 def _renewal(service: Service) -> dict[str, Any]:
-    """Return whether the privileged update program runs in its sandbox, and restarts the flight."""
+    """Return whether the privileged update program runs in its sandbox and restarts the flight."""
     own, unit, old = Path("/var/lib/knightcube-renewal"), "knightcube-renewal.service", service.pid()
     systemctl("start", unit)
     before = service.pid() == old
@@ -145,7 +145,7 @@ def _renewal(service: Service) -> dict[str, Any]:
 def _damaged(service: Service) -> dict[str, Any]:
     """Flip one bit of the configuration while the board has no accepted copy of it.
 
-    The service waits until the file is intact.
+    The service must wait until the file is intact.
     """
     systemctl("reset-failed", SERVICE)
     shutil.rmtree("/var/lib/knightcube/flown", ignore_errors=True)
@@ -164,7 +164,7 @@ def _damaged(service: Service) -> dict[str, Any]:
 
 
 def _devices_closed() -> bool:
-    """Return whether the service's device policy refuses a device that other processes may open."""
+    """Return whether the device policy of the service refuses a device that other processes may open."""
 
     def opens(policy: str) -> bool:
         Path("/run/systemd/system/probe.service").write_text(_PROBE.format(policy), encoding="ascii")
@@ -176,9 +176,9 @@ def _devices_closed() -> bool:
 
 
 def _broken(service: Service) -> dict[str, Any]:
-    """Remove the releases, so that the safe state starts.
+    """Remove the releases so that the safe-state unit starts, and restore them so that it starts the flight.
 
-    Restore them, so that it starts the flight again.
+    The coils must carry no current while the releases are missing.
     """
     systemctl("reset-failed", SERVICE)
     systemctl("start", SERVICE)
@@ -212,6 +212,6 @@ if __name__ == "__main__":
     for name in WORLDS:
         try:
             facts_seen["boards"][name] = fly_board(name)
-        except (OSError, ValueError) as error:  # the other observations are kept
+        except (OSError, ValueError) as error:  # store the observations that were made before the error
             facts_seen["boards"][name] = {"problem": repr(error)}
     (place / "seen.json").write_text(json.dumps(facts_seen, indent=1), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The scripts of deploy/ as a user calls them, and their configurations."""
+"""The scripts of deploy/, called as a user calls them, and the configurations for these scripts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def script(name: str) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules.setdefault(name, module)  # dataclasses look up the module of a class here
+    sys.modules.setdefault(name, module)  # `dataclass` looks up the module of a class here
     spec.loader.exec_module(module)
     return module
 
@@ -31,17 +31,20 @@ board_dropin = script("board_dropin")
 
 
 def dropin(config: Path) -> str:
-    """Return the drop-in that a configuration needs."""
+    """Return the systemd drop-in that the service needs for a configuration."""
     return str(board_dropin.dropin(load(config)))
 
 
 def safe_dropin(config: Path) -> str:
-    """Return the drop-in of the safe-state unit."""
+    """Return the systemd drop-in of the safe-state unit."""
     return str(board_dropin.safe_dropin(load(config)))
 
 
 def link_dropin(config: Path, root: Path = Path("/")) -> str:
-    """Return the drop-in of the link's unit for a board whose /proc and /sys are in `root`."""
+    """Return the systemd drop-in of the link's unit.
+
+    The folder `root` contains the board's /proc and /sys.
+    """
     return str(board_dropin.link_dropin(load(config), root))
 
 

@@ -1,4 +1,4 @@
-"""Tests that board configurations name real devices and are refused with the reasons of `check`."""
+"""Tests that board configurations name real devices, and that faulty configurations are refused."""
 
 from __future__ import annotations
 

@@ -37,8 +37,8 @@ class Board:
     def install(self) -> None:
         """Install with the dependencies of the interpreter that runs the tests."""
         python = self.folder / "python"
-        # A line in a .pth file adds a folder, but not the folders of .pth files within it, such as this
-        # checkout.
+        # A line in a .pth file adds a folder to the search path. Python ignores .pth files in the added
+        # folder, so the packages of this checkout are not found.
         python.write_text(
             f"""#!/bin/sh
 if [ "$2" = venv ]; then
@@ -62,7 +62,7 @@ fi
         assert done.returncode == 0, done.stdout + done.stderr
 
     def python(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run the board's Python outside of any checkout."""
+        """Run the board's Python in a folder that is not a checkout."""
         return subprocess.run(
             [str(self.venv / "bin/python"), *words],
             cwd=self.folder,

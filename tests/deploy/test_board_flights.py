@@ -1,10 +1,10 @@
-"""Tests of the configurations of boards, checked and started as on a board with emulated devices.
+"""Tests that the configurations of boards pass the check and fly, with emulated devices.
 
-The flight software uses its drivers of real devices: serial ports are pseudo-terminals, the I2C bus is
-/dev/i2c-N or a name made by udev, through the preload library, and cameras perform the ioctls of Video for
-Linux with rendered frames. No virtual camera of the kernel replaces the rendered frames: `vivid` and
-`v4l2loopback` have no control of the exposure time, and the driver refuses a camera without this control
-(`tests/hal/cameras/test_v4l2_camera.py` reads frames of `vivid` where the kernel has this module).
+The flight software uses its drivers of real devices. Serial ports are pseudo-terminals. A preload library
+emulates the I2C bus at /dev/i2c-N or at a name made by udev. Emulated cameras perform the ioctls of Video for
+Linux and deliver rendered frames. The kernel's virtual cameras `vivid` and `v4l2loopback` are not used,
+because they have no control of the exposure time, and the driver refuses a camera without this control.
+`tests/hal/cameras/test_v4l2_camera.py` reads frames of `vivid` if the kernel has this module.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ pytestmark = [
     ),
 ]
 PATIENCE_S = 120.0
-"""Longest time (s) until every device has been read, on a busy machine."""
+"""Timeout (s) until every device has been read on a busy machine."""
 DEVICES = {
     "board_testbed": {"inertial_unit", "coils", "power_monitor", "camera", "commands.socket"},
     "board_orbit": {
@@ -61,12 +61,12 @@ DEVICES = {
 }  # fmt: skip
 """Devices that `knightcube check` must find."""
 GYRO_NOISE = 5e-4
-"""Standard deviation (rad/s) of the norm of a reading of the gyro, rounded up."""
+"""Standard deviation (rad/s) of the norm of a gyro reading, rounded up."""
 
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight process that was started by the unit's commands and ended by SIGTERM.
+    """Results of a flight process that was started by the unit's commands and ended by SIGTERM.
 
     Attributes:
         found: devices that `knightcube check` found before the flight.
@@ -109,7 +109,7 @@ def unit_environment(config: Path, folder: Path, notifications: socket.socket) -
 
 @contextmanager
 def emulated(config: Path, name: str, folder: Path) -> Iterator[dict[str, Any]]:
-    """Emulate the devices of a configuration; yield the facts that the program prints."""
+    """Emulate the devices of a configuration; yield the JSON object that the emulator prints."""
     words = ["tests.deploy.emulated_board", config, ROOT / "config" / f"{WORLDS[name]}.yaml", folder]
     with subprocess.Popen(
         [sys.executable, "-m", *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, text=True
@@ -163,7 +163,7 @@ def fly(name: str, folder: Path) -> Flown:
 def watch(
     flight: subprocess.Popen[str], notifications: socket.socket, bus: RemoteI2cBus, runs: Path, orbit: bool
 ) -> bool:
-    """Wait until the flight is ready and every device was read; return whether the coils were driven."""
+    """Wait until the flight is ready and every device was read; return whether the coils carried current."""
     ready = driven = False
     deadline = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline and flight.poll() is None:
@@ -202,7 +202,7 @@ def test_packets_of_every_device_arrive(flown: Flown) -> None:
 
 
 def test_the_rates_of_the_frames_are_those_of_the_gyro(flown: Flown) -> None:
-    """The rate depends on exposure time, time stamp and field of view; its sign may be unknown."""
+    """The rates in streak packets agree with the gyro within 4 sigma plus 2 %. Their signs may be unknown."""
     imu, frames = flown.run["imu"], frames_with_rate(flown.run)
     middle = frames["exposure_start_ns"] + 0.5e9 * frames["exposure"]
     gyro = np.linalg.norm([np.interp(middle, imu["time_ns"], axis) for axis in imu["rate"].T], axis=0)

@@ -1,4 +1,4 @@
-"""Tests that `coils-off` zeroes the coils without the flight software, at known addresses and as a unit."""
+"""Tests that `coils-off` zeroes the coils without the flight software, by hand and as a systemd unit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ from tests.deploy.scripts import DEPLOY
 
 
 class Tools:
-    """Test doubles of i2cset and python3 that record their calls and succeed or fail as set."""
+    """Test doubles of i2cset and python3.
+
+    Each test double records its calls, and succeeds or fails as set.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -113,7 +116,7 @@ def test_an_address_that_the_unit_and_the_note_share_is_written_once(tools: Tool
 
 
 def test_every_write_of_a_unit_and_of_a_note_is_executed_whatever_another_chip_does(tools: Tools) -> None:
-    """Bridges with an I2C interface have one chip per coil, and each chip has a register to be cleared."""
+    """H-bridges with an I2C interface have one chip per coil, and one register is cleared in each chip."""
     (tools.folder / "bin/i2cset").write_text(
         f'#!/bin/sh\necho "$*" >>"{tools.folder}/calls"\n[ "$3" != 0x61 ]\n', encoding="utf-8"
     )
@@ -158,7 +161,7 @@ def test_an_address_that_hangs_keeps_the_other_from_nothing(tools: Tools) -> Non
 
 
 class Chips:
-    """Two PWM chips that drive all their channels, on an emulated bus which programs open as /dev/i2c-7."""
+    """Two PWM chips that drive all their channels, on an emulated bus that programs open as /dev/i2c-7."""
 
     ADDRESSES = (0x40, 0x41)
 
@@ -171,7 +174,7 @@ class Chips:
         self.server = I2cServer(self.bus, folder / "bus.sock")
 
     def driving(self) -> list[int]:
-        """Return the addresses of the chips of which an output is on."""
+        """Return the addresses of the chips with at least one active output."""
         return [chip.address for chip in self._chips if any(map(chip.duty, range(CHANNELS)))]
 
 

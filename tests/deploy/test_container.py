@@ -1,4 +1,4 @@
-"""Tests of the installed service under systemd: the coils are at zero after each induced failure."""
+"""Tests of the installed service under systemd: after each induced failure, the coils carry no current."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def seen(folder: Path) -> dict[str, Any]:
 
 def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
     assert seen["active"] == "active"
-    # Real-time limits depend on the machine: without CAP_SYS_RESOURCE, systemd cannot raise them.
+    # Without CAP_SYS_RESOURCE, systemd cannot raise the real-time limits of the service.
     granted, *refused = seen["status"].removeprefix("flying; ").split("; ")
     assert granted == "SCHED_FIFO 50, memory locked" or refused
 
@@ -37,9 +37,10 @@ def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
 def test_the_coils_are_at_zero_and_it_comes_back(
     seen: dict[str, Any], act: str, result: str, limit: float
 ) -> None:
-    """If guardian and flight are killed together, ExecStopPost acts. A stopped flight ends by the watchdog.
+    """ExecStopPost zeroes the coils if guardian and flight are killed together.
 
-    systemd needs longer on a busy machine, so its limit is larger than the guardian's.
+    The watchdog ends a stopped flight. On a busy machine systemd responds later than the guardian, so the
+    limit is 1.5 s instead of 0.5 s.
     """
     facts = seen[act]
     assert facts["zero_after"] is not None
@@ -95,7 +96,7 @@ def test_a_second_installation_changes_nothing(seen: dict[str, Any], folder: Pat
     assert seen
     printed = (folder / "second_install.txt").read_text(encoding="utf-8").splitlines()
     changes = [line for line in printed if line.startswith("would ")]
-    # The symbolic link to the release is set again to its present target.
+    # The installer always creates the symbolic link to the release, even if its target does not change.
     assert [line.endswith("switch current") for line in changes] == [True]
 
 

@@ -1,4 +1,4 @@
-"""Tests that folders which the container would hide are detected and mounted before it boots."""
+"""Tests that folders that would be hidden in the container are mounted before the container boots."""
 
 from __future__ import annotations
 

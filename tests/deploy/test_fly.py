@@ -119,7 +119,7 @@ def test_without_a_usable_answer_of_releases_py_the_current_release_flies_and_sa
 
 
 def test_an_answer_counts_although_releases_py_does_not_end(board: FakeBoard) -> None:
-    """The program that counts the start waits for a disk, which may hang."""
+    """A release starts once releases.py has printed its choice, even if releases.py hangs afterwards."""
     _chooser(board).write_text(
         f"import time\nprint('{FIRST} as asked', flush=True)\ntime.sleep(600)", encoding="ascii"
     )
@@ -171,7 +171,7 @@ def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_giv
 
 
 _NO_IMPORT = '    *"import flight"*) exit 1 ;;'
-"""Line of the replacement of Python that makes the import of the flight fail."""
+"""Line of the replacement of Python that makes the import of the flight software fail."""
 
 PYTHONS: dict[str, Callable[[Path], None]] = {
     "missing": Path.unlink,
@@ -202,7 +202,7 @@ def test_a_release_that_cannot_start_gives_way_to_the_other(
 
 
 def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
-    """Starts of an accepted release are not counted, but a failed start must also lead to another release."""
+    """The starts of an accepted release are not counted. If it cannot start, the previous release starts."""
     (board.root / "state" / TRIALS).write_bytes(starts_record({}, SECOND))
     PYTHONS["cannot import the flight"](_python(board, "current"))
     assert [board.fly()[0] for _ in range(4)] == ["old"] * 4
@@ -309,7 +309,7 @@ def test_sigterm_ends_the_choice(board: FakeBoard, tmp_path: Path) -> None:
 
 
 def _flips(content: bytes, count: int) -> list[bytes]:
-    """Return copies of a content, each with one flipped bit."""
+    """Return copies of some bytes, each with one flipped bit."""
     places = np.random.default_rng(SEED).choice(8 * len(content), count, replace=False)
     flipped = []
     for place in places.tolist():
@@ -330,7 +330,10 @@ def test_a_whole_release_flies_after_any_flipped_bit_of_releases_py(board: FakeB
 
 
 def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBoard) -> None:
-    """Every bit is flipped for releases.py in this process, and a few of them for the whole launcher."""
+    """For every flipped bit of the record, releases.py still chooses an intact release.
+
+    A few of the damaged records are also given to the whole launcher.
+    """
     whole, state = starts_record({SECOND: 2}, FIRST), board.root / "state"
     for number, damaged in enumerate(_flips(whole, 8 * len(whole))):
         (state / TRIALS).write_bytes(damaged)
@@ -341,7 +344,7 @@ def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBo
 
 
 def _damaged_copy(board: FakeBoard, name: str) -> str:
-    """Start the flight as its unit does, and return the release and whether a damaged file was reported."""
+    """Start the flight as its unit does; return the label of the release, and whether damage was reported."""
     (board.root / "state" / TRIALS).unlink(missing_ok=True)
     label, said = board.fly(*board.unit_words("knightcube.service"))
     folder = board.prefix / name.partition("/")[0]
@@ -368,7 +371,7 @@ def test_any_damaged_file_of_the_launcher_leaves_the_current_release_flying(
             path.unlink()
         else:
             _fifo(path)
-        if damage != "a FIFO" or name == "fly":  # sha256sum is killed after 10 s at a FIFO
+        if damage != "a FIFO" or name == "fly":  # sha256sum never ends at a FIFO and is killed after 10 s
             assert _damaged_copy(board, f"{copy}/{name}") == "new"
         path.unlink(missing_ok=True)
         path.write_bytes(whole)

@@ -33,7 +33,7 @@ def call(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 class Image:
-    """The files of a board that is not running."""
+    """Files of a board, in an image that is not running."""
 
     def __init__(self, root: Path, environment: Path | None = None) -> None:
         self.root = root
@@ -47,7 +47,7 @@ class Image:
         return done.returncode, done.stdout + done.stderr
 
     def install(self, *words: str) -> tuple[int, str]:
-        """Install with an environment that runs the code of this folder."""
+        """Install from this folder, without making a new virtual environment."""
         python = self.environment / "bin" / "python"
         if not python.exists():
             python.parent.mkdir(parents=True)
@@ -168,7 +168,7 @@ def test_device_names_that_were_edited_survive_an_update(image: Image) -> None:
     image.rules.write_text(mine, encoding="utf-8")
     assert image.install()[0] == 0
     assert image.rules.read_text(encoding="utf-8") == mine
-    # An update with new udev rules replaces unedited rules, and keeps and reports edited rules.
+    # If the udev rules of an update are new, unedited rules are replaced. Edited rules are kept and reported.
     copy = image.root / "opt/knightcube/share/99-knightcube.rules"
     copy.write_text(shipped + "# of yesterday\n", encoding="utf-8")
     status, output = image.install()
@@ -215,7 +215,7 @@ def test_a_dry_run_prints_every_step_and_touches_nothing() -> None:
 
 
 def _pins(path: Path) -> dict[str, str]:
-    """Return the versions in a lock, by the normalised names of the packages."""
+    """Return the versions in a lock file, by the normalised names of the packages."""
     found = re.findall(r"^([\w.-]+)==([^\s\\]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
 

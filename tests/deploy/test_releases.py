@@ -1,4 +1,4 @@
-"""Tests of releases: built separately, switched by one rename, chosen at the start, and reverted."""
+"""Tests of releases: built in separate folders, activated by a rename, chosen at the start, and reverted."""
 
 from __future__ import annotations
 

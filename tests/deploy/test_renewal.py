@@ -1,4 +1,4 @@
-"""Tests of updates in orbit: a confirmed version stays, and all others revert to the former version."""
+"""Tests of updates in orbit: a version that is not confirmed is replaced by the former version."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_without_confirmation_the_time_with_power_decides(board: RenewedBoard) -
     before, request = board.flown(), activated(board, hours=1.0)
     board.step(3500.0)
     assert board.flown() == "second"
-    board.now = 0.0  # new boot, whose powered time starts at zero
+    board.now = 0.0  # reboot: the powered time restarts at zero
     board.step(60.0)
     assert board.flown() == "second"
     board.step(200.0)
@@ -336,7 +336,7 @@ def test_a_release_is_built_from_the_packages_of_the_present_one_and_tried(board
 
 @contextlib.contextmanager
 def running_the_old_release(board: RenewedBoard, unit: str) -> Iterator[None]:
-    """Make a unit run the release that was in use at first."""
+    """Make a unit run the release that was installed first."""
     place = board.files.prefix / "releases" / FIRST / "venv/bin/python"
     with subprocess.Popen([str(place), "60"], executable="/bin/sleep") as process:
         (board.place / f"pid-{unit}").write_text(f"{process.pid}\n", encoding="ascii")
@@ -361,7 +361,7 @@ def test_a_trial_begins_when_the_release_is_built_even_after_a_kill(board: Renew
     request = board.activate(board.bundle("release", board.source("new"), 1), "release")
     _kill_at(board, "python3")
     assert not (board.own / "status").exists() or not board.reports(request)
-    with running_the_old_release(board, "knightcube.service"):  # the unit restarts only after the step
+    with running_the_old_release(board, "knightcube.service"):  # the unit restarts after the step
         board.step()
     assert board.release() == "new"
     assert [result for result, _ in board.reports(request)] == ["started"]
@@ -372,7 +372,7 @@ def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> No
     library.write_text(library.read_text(encoding="ascii").upper(), encoding="ascii")
     request = board.activate(board.bundle("release", board.source("new"), 1), "release")
     board.step()
-    assert not board.restarted()  # the flight continues undisturbed
+    assert not board.restarted()  # the flight is not restarted
     assert board.release() == "old"
     result, text = board.reports(request)[-1]
     assert (result, "add the folder wheels, because venv/lib" in text) == ("failed", True), text
@@ -446,7 +446,7 @@ def test_silence_leads_back_to_release_configuration_and_ground(board: RenewedBo
     board.contact(7, limit_s=86_400.0)
     board.step()
     board.step(80_000.0)
-    board.now = 0.0  # a restart of the board keeps the time
+    board.now = 0.0  # a reboot does not change the time
     board.step(7_000.0)
     assert (board.release(), board.flown()) == ("old", "second")
     board.step(86_500.0)

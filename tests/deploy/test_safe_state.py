@@ -1,4 +1,4 @@
-"""Tests that the safe state zeroes the coils, answers commands, and restarts the flight process."""
+"""Tests that the safe-state unit zeroes the coils, answers commands, and restarts the flight process."""
 
 from __future__ import annotations
 

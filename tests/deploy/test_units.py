@@ -1,4 +1,4 @@
-"""Tests of the systemd units, their drop-ins and the device names, without booting."""
+"""Tests of the systemd units, their drop-ins and the device names, without booting a machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.flights import CONFIG
 
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"
-"""Link sections: in addition to the network, a serial line that is built in or not plugged in."""
+"""Link sections: a network alone, and a network with a serial line that is built in or not connected."""
 CAMERA = "{device: {driver: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
@@ -37,7 +37,7 @@ needs_systemd = pytest.mark.skipif(
 
 
 def put_units(folder: Path, config: Path) -> Path:
-    """Copy the units into a folder, with the present paths of their commands and the drop-ins appended."""
+    """Copy the units into a folder with the drop-ins, and change the paths of commands to this machine's."""
     for name, added in zip(UNITS, (dropin(config), safe_dropin(config), link_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
         (folder / name).write_text(text + "\n" + added, encoding="utf-8")
@@ -46,7 +46,7 @@ def put_units(folder: Path, config: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the units of a board with all features: persistent names, a camera and a ground link."""
+    """Return the units of a board with persistent device names, a camera and a ground link."""
     folder = tmp_path_factory.mktemp("units")
     config = changed_testbed(
         folder,
@@ -77,7 +77,7 @@ def exposure(unit: Path) -> float:
 @needs_systemd
 @pytest.mark.parametrize("name", UNITS)
 def test_the_sandbox_leaves_an_exposure_of_at_most_1(units: Path, name: str) -> None:
-    """The rating holds for any address of the link's other end, and also with a radio on a serial line."""
+    """The rating of each unit by systemd is 1 or less, also with a radio on a serial line."""
     assert exposure(units / name) <= 1.0
 
 
@@ -146,7 +146,10 @@ def test_the_watchdog_leaves_room_for_four_meals() -> None:
 
 
 def test_the_link_is_watched_restarted_and_does_not_wait_for_the_flight() -> None:
-    """A flight that waits at its start is not active, so a link that is ordered after it would not start."""
+    """A flight that waits at its start is not active.
+
+    A link that systemd orders after the flight would not start.
+    """
     text = (DEPLOY / "knightcube-link.service").read_text(encoding="utf-8")
     for line in ("Type=notify", "NotifyAccess=main", "Restart=always"):
         assert f"{line}\n" in text
@@ -255,7 +258,7 @@ def test_the_coils_bus_may_have_a_lasting_name_everywhere(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("bus", ["-1", "knightcube-i2c", "/dev/a b", "/dev/100%", "true", "1.5", "'1'"])
 def test_a_bus_that_is_neither_number_nor_path_is_refused(tmp_path: Path, bus: str) -> None:
-    """A path is written into units and into a note of ASCII words, where blanks or % have other meanings."""
+    """A path is written into units and into a note of ASCII words, where blanks and % have other meanings."""
     with pytest.raises(ConfigError, match=r"`coils\.bus`"):
         dropin(changed_testbed(tmp_path, coils_bus=bus))
 
@@ -267,7 +270,7 @@ def test_the_flight_opens_the_bus_by_its_lasting_name(tmp_path: Path) -> None:
 
 
 def board(folder: Path, below: str) -> Path:
-    """Return a folder with copies of /proc and /sys in which /dev/null appears as a serial device.
+    """Return a folder with a /proc and a /sys of a board on which /dev/null appears as a serial device.
 
     The device has the numbers 1:3 of /dev/null, and its folder is `below` in sys/devices.
     """
@@ -285,9 +288,9 @@ def board(folder: Path, below: str) -> Path:
 
 
 def test_what_hangs_on_usb_is_let_through_whatever_number_it_comes_back_with(tmp_path: Path) -> None:
-    """DeviceAllow of a file permits one device number, found at the start of the unit.
+    """`DeviceAllow` with a file permits only the device number of this file at the start of the unit.
 
-    A class permits all devices of a driver.
+    `DeviceAllow` with a class, such as char-ttyUSB, permits all devices of a driver.
     """
     node = "DeviceAllow=/dev/null rw"
     usb = board(tmp_path, "pci0000:00/0000:00:14.0/usb1/1-3/1-3:1.0/ttyUSB0/tty/ttyUSB0")

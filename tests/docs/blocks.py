@@ -18,7 +18,10 @@ _MARK = re.compile(r"<!-- (?P<kind>run by|not run): (?P<text>.+) -->")
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block: `line` is that of its fence; `mark` is empty, "run by" or "not run"."""
+    """One fenced code block.
+
+    `line` is the line number of its fence; `mark` is empty, "run by" or "not run".
+    """
 
     page: str
     line: int
@@ -29,7 +32,7 @@ class Block:
 
     @property
     def commands(self) -> list[str]:
-        """Commands of a block, without prompts, comments and continuations; empty for another language."""
+        """Commands of a shell block without prompts, comments and continuations; empty for other blocks."""
         if self.language not in {"sh", "console"}:
             return []
         lines = self.text.replace("\\\n", " ").splitlines()
@@ -40,7 +43,7 @@ class Block:
 
 
 def pages() -> list[Path]:
-    """Return every page of the documentation for readers."""
+    """Return the paths of all pages of the documentation."""
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 

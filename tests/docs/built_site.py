@@ -1,8 +1,9 @@
-"""Checks the built site: `python -m tests.docs.built_site build/site`; the exit status is 1 for any fault.
+"""Checks the built site by `python -m tests.docs.built_site build/site`.
 
-The pages must be readable without a network, so no page may load a file from another host. Links are allowed.
-If Chromium is installed, the search of the site is tested on a page that is opened as a file and
-on a page from a server: guides must come before pages of modules.
+The exit status is 1 if a fault is found. The pages must be readable without a network, so no page may load a
+file from another host. Links are allowed. If Chromium is installed, the search of the site is tested on a
+page that is opened as a file and on a page from a server. The search must list guides before pages of
+modules.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ FIRST_FOUND = {
     "detumble": "fly/orbit.html",
     "solve pictures": "library/star-tracker.html",
 }
-"""Searched words, and the page that must be the first result."""
+"""Search words, and the page that must be the first result."""
 _LATEST_MS = 180_000
-"""Longest time (ms) to wait for the page; a busy machine reads the index of the search in half a minute."""
+"""Timeout (ms) for a page. A busy machine needs half a minute to load the search index."""
 _LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href", "object": "data"}
 _OTHER_HOST = re.compile(r"^(https?:)?//")
 _STYLE_URL = re.compile(r"(?:url\(|@import)\s*[\"']?((?:https?:)?//[^\"')\s]+)")
@@ -43,7 +44,7 @@ _STILL_OPEN = {"decisions/libraries-tried.html", "search/search_index.json"}
 
 
 class _Loads(HTMLParser):
-    """Parser that collects what a page loads, and its code blocks that a script would have to render."""
+    """Parser that collects the files that a page loads, and the code blocks that only a script can render."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -59,7 +60,7 @@ class _Loads(HTMLParser):
 
 
 def problems_of(site: Path) -> list[str]:
-    """Return the problems of a site, one line each."""
+    """Return the problems of a site, one text per problem."""
     found: list[str] = []
     for page in sorted(site.rglob("*.html")):
         name, text = str(page.relative_to(site)), page.read_text(encoding="utf-8")
@@ -75,7 +76,7 @@ def problems_of(site: Path) -> list[str]:
 
 
 class _Quiet(SimpleHTTPRequestHandler):
-    """Serves files without a line for each request."""
+    """HTTP request handler that does not log requests."""
 
     def log_message(self, *_: object) -> None:
         pass
@@ -83,7 +84,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @contextmanager
 def _served(site: Path) -> Iterator[str]:
-    """Yield the address of a server of the site on this machine."""
+    """Yield the address of a web server on this machine that serves the site."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -95,7 +96,7 @@ def _served(site: Path) -> Iterator[str]:
 
 
 def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> list[str]:
-    """Return a line for each search whose first result is not the expected page. Needs Chromium.
+    """Return a text for each search whose first result is not the expected page. This check needs Chromium.
 
     On a page that is opened as a file, all entries of `first_found` are searched. On a page from a server,
     only the first three entries are searched.
@@ -109,7 +110,8 @@ def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> 
             for words, right in list(first_found.items())[:most]:
                 page.goto(f"{address}/index.html")
                 page.click(".md-search__input")
-                # All words are entered at once. Otherwise the results of the first letters would remain.
+                # All words are entered at once. If they were typed, results of the first letters could remain
+                # on the page.
                 page.fill(".md-search__input", words)
                 page.keyboard.press("End")  # the page reads the search words when a key is released
                 page.wait_for_selector(item)

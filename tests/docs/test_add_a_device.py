@@ -1,4 +1,4 @@
-"""Tests that the page "Add a device" builds a driver from an empty file and uses it in a run."""
+"""Tests that the code on the page "Add a device" makes a working driver, which is then used in a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EXAMPLES = ROOT / "docs" / "examples"
 
 
 def snippet(name: str) -> str:
-    """Return what the page shows for an inclusion: a marked part of a file, or the file."""
+    """Return the text that the page includes: a file, or a marked section of a file."""
     path, _, part = name.partition(":")
     text = (ROOT / "docs" / path).read_text(encoding="utf-8")
     if not part:
@@ -36,7 +36,7 @@ def snippet(name: str) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder with the files as a reader writes them who has only the page."""
+    """Return a folder with the files that a reader writes who follows the page."""
     blocks = [block for block in blocks_of(PAGE) if "--8<--" in block.text and "ina226" in block.text]
     shown = {language: "" for language in ("python", "yaml")}
     for block in blocks:
@@ -50,7 +50,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def run_commands(name: str) -> None:
-    """Run the commands of the page that name a file."""
+    """Run the commands of the page that contain a file name."""
     (block,) = (block for block in blocks_of(PAGE) if block.mark == "run by" and name in block.text)
     first, *commands = block.commands
     assert first == "export PYTHONPATH=."

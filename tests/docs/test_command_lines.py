@@ -1,4 +1,4 @@
-"""Tests that each command line in the documentation works, or that its block states why it is not run."""
+"""Tests that each command line in the documentation works, or that its block says why it is not run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RUNNABLE = {block.page for block in blocks() if block.commands and not block.mar
 
 
 def shortened(line: str) -> str:
-    """Return the command to run for a line: a short flight with early faults, a report without pictures."""
+    """Return a quicker command: a short flight with early faults, or a report without plots."""
     if line.startswith("knightcube run ") and "--help" not in line:
         early = re.sub(r"@ \d+", "@ 0.3", re.sub(r" for \d+", " for 0.3", line))
         return re.sub(r" --duration \d+", "", early) + f" {SHORT}"
@@ -45,9 +45,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(line: str, folder: Path) -> None:
-    """Run a line: `knightcube` without shell characters in this process, every other line in a shell.
+    """Run a `knightcube` command without shell characters in this process, and other lines in a shell.
 
-    A line that ends in `|| true` may fail.
+    A command that ends in `|| true` may fail.
     """
     plain = line.removesuffix(" || true")
     words = shlex.split(plain)
@@ -72,9 +72,9 @@ def run(line: str, folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted(RUNNABLE))
 def test_the_command_lines_of_a_page_work(page: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the command lines in the order of the page.
+    """The command lines of a page succeed in their order on the page.
 
-    The fixture has already run the demonstration's flight.
+    The fixture runs the flight of the demonstration once, so the page's command for it is skipped.
     """
     draw_coarsely(monkeypatch)
     for block in blocks():
@@ -105,9 +105,9 @@ def test_commands_in_a_block_without_a_language_are_found() -> None:
 
 
 def test_the_collector_finds_commands_and_their_marks() -> None:
-    """The first code block must be run.
+    """Commands are found in plain blocks and in blocks of lists, without comments, prompts and outputs.
 
-    The second code block is in a list, and its mark says that it is not run.
+    The mark "not run" before the second block, which is in a list, is found with its reason.
     """
     text = "```sh\nmake a  # why\n# only a remark\nmake b \\\n  c\n```\n\n1. x\n\n"
     text += "    <!-- not run: no need -->\n    ```console\n    $ make d\n    output\n    ```\n"
@@ -117,7 +117,7 @@ def test_the_collector_finds_commands_and_their_marks() -> None:
 
 
 def mentions() -> set[tuple[str, str]]:
-    """Return (module, first argument) of every `python -m ...` on the pages, also within text."""
+    """Return (module, first argument) of every `python -m ...` on the pages, in code blocks and in text."""
     found = set()
     for path in pages():
         for module, word in re.findall(r"python -m ([\w.]+)(?: ([\w-]+))?", path.read_text(encoding="utf-8")):

@@ -27,17 +27,20 @@ ENVIRONMENT = {
 }
 READY_S = 100.0
 BLIND = "camera: null\nwide_cameras: []\n"
-"""Settings without cameras, about which no command of the page asks, to save processor time."""
+"""Settings without cameras. No command of the page uses a camera, and a flight without cameras is faster."""
 FIXES_S = 20.0
 """Mission time (s) from which the log has enough GPS fixes to determine orbital elements.
 
-A person who follows the page reaches the step that needs them later.
+A reader of the page types the command that needs the fixes later than 20 s after the start.
 """
 
 
 @contextlib.contextmanager
 def in_background(line: str, folder: Path, is_ready: Callable[[Path], bool]) -> Iterator[None]:
-    """Run a command until the end of the context, which begins when `is_ready`, given its output, is true."""
+    """Run a command in the background until the context ends.
+
+    The context begins when `is_ready` accepts the output.
+    """
     log = folder / f"{line.split()[1]}.log"
     with (
         log.open("wb") as file,
@@ -57,7 +60,7 @@ def in_background(line: str, folder: Path, is_ready: Callable[[Path], bool]) -> 
 
 
 def run(line: str, folder: Path, satellite: str) -> str:
-    """Return the output of a command of the ground. Most commands run in this process, to save time."""
+    """Return the output of a ground command. Most commands run in this process, to save time."""
     words = shlex.split(line.replace("$SATELLITE", satellite))
     if words[0] == "knightcube" and not {"|", ">"} & set(words):
         done = command(*words[1:], folder=folder)

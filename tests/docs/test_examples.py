@@ -26,7 +26,7 @@ EXAMPLES = ROOT / "docs" / "examples"
 
 
 def run(words: list[str], tree: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run Python in a tree, with the tree's packages."""
+    """Run Python code with the packages in a folder."""
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     words = [sys.executable, *words]
     done = subprocess.run(
@@ -37,7 +37,7 @@ def run(words: list[str], tree: Path, status: int = 0) -> subprocess.CompletedPr
 
 
 def patched(name: str, folder: Path) -> Path:
-    """Return a copy of the packages with `name`.diff applied, with the bytecode of all other modules."""
+    """Return a copy of the packages with `name`.diff applied, and the bytecode of all unchanged modules."""
     for package in ("knightcube", "flight", "hal", "sim_hal", "ground", "config"):
         shutil.copytree(ROOT / package, folder / package)
     words = ["git", "apply", "-C1", "--unidiff-zero", str(EXAMPLES / f"{name}.diff")]
@@ -48,7 +48,7 @@ def patched(name: str, folder: Path) -> Path:
 
 
 def files_of(name: str) -> list[str]:
-    """Return the files that a diff changes."""
+    """Return the files that a diff file changes."""
     return re.findall(
         r"^\+\+\+ b/(.+)$", (EXAMPLES / f"{name}.diff").read_text(encoding="utf-8"), re.MULTILINE
     )
@@ -56,7 +56,10 @@ def files_of(name: str) -> list[str]:
 
 @cache
 def printed_by(script: str, *arguments: str) -> str:
-    """Return the output of an example that needs no other tree. It runs in this process, to save imports."""
+    """Return the output of an example that changes no package.
+
+    It runs in this process, to avoid repeated imports.
+    """
     output = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output):
         patch.chdir(ROOT)
@@ -79,7 +82,7 @@ def test_the_star_tracker_solves_the_image_of_its_example() -> None:
 
 
 def test_own_pictures_of_any_kind_are_solved_or_refused_with_a_reason(tmp_path: Path) -> None:
-    """Test the same stars in four formats, a picture without stars, and a text file."""
+    """The command is given the same stars in four file formats, an image without stars, and a text file."""
     pillow = pytest.importorskip("PIL.Image", reason="needs Pillow, the extra `images`")
     frame = sky_frame(np.random.default_rng(31), 0.0, 0.2)
     bright = (frame.pixels / frame.pixels.max() * 255.0).astype(np.uint8)
@@ -158,7 +161,7 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> None:
-    """With feedback alone, the thread deflects the body by the angle k theta / (J w^2)."""
+    """Under PD control, the torsion of the thread deflects the body by the angle k theta / (J w^2)."""
     printed = printed_by("pointing_body")
     found = re.search(r"pointing error ([\d.]+) deg", printed)
     assert found is not None
@@ -179,7 +182,7 @@ NUMBER = re.compile(r"[+-]?\d+\.?\d*")
     ],
 )
 def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script: str) -> None:
-    """The words are equal, and the numbers agree to two units of their last digit (rounding)."""
+    """The words of the output equal those on the page. Numbers agree within two units of their last digit."""
     printed = printed_by(script).rstrip()
     text = (ROOT / "docs" / "library" / f"{page}.md").read_text(encoding="utf-8")
     shown = text.partition("It prints:\n\n```\n")[2].partition("\n```")[0]
@@ -190,7 +193,7 @@ def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script:
 
 
 def test_the_examples_find_what_they_have_drawn() -> None:
-    """Each script prints its result beside the true value of the image."""
+    """The estimates that the examples print agree with the true values of the drawn images."""
     streaks = printed_by("streak_rate")
     rate, true = (np.array(text.split(), dtype=float) for text in re.findall(r"\[([^\]]+)\]", streaks)[:2])
     sigma = np.array(re.findall(r"1 sigma +\[([^\]]+)\]", streaks)[0].split(), dtype=float)

@@ -1,4 +1,4 @@
-"""Tests that each measured value is stated on one page only."""
+"""Tests that each measured value is stated on exactly one page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that the page of licences names each locked package with the licence that the package states."""
+"""Tests that the page of licences lists each locked package with the licence that its metadata states."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STATED = {
     "LGPL-3.0": "LGPLv3",
     "Unlicense or MIT-0": "Unlicense|Public Domain",
 }
-"""Pattern by licence, as packages state it in their metadata."""
+"""Pattern of each licence's text in package metadata."""
 
 
 def _rows() -> dict[str, list[list[str]]]:

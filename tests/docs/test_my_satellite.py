@@ -1,4 +1,4 @@
-"""Tests of the page about the user's own satellite: its blocks are valid and its commands run."""
+"""Tests of the page "My satellite": its code blocks are valid and its commands run."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_example_prints_what_the_page_shows(tmp_path: Path) -> None:
 
 
 def newcomer() -> tuple[list[str], list[str]]:
-    """Return the tutorial's commands that install the software and that simulate the user's satellite."""
+    """Return the commands of the tutorial that install the software and simulate the reader's satellite."""
     install, fly = (
         next(one.commands for one in blocks() if one.page == "docs/tutorial.md" and word in one.text)
         for word in ("git clone", "new-satellite")
@@ -82,7 +82,10 @@ def test_a_newcomer_needs_at_most_ten_commands() -> None:
 
 @pytest.mark.slow
 def test_the_commands_of_a_newcomer_describe_and_detumble_a_satellite(tmp_path: Path) -> None:
-    """The flight of 150 s is ended soon after the detumbling, which lasts 106 s."""
+    """The satellite of the tutorial is detumbled after 106 s.
+
+    The flight of 150 s is ended shortly afterwards.
+    """
     _, (new, check, run, judge) = newcomer()
     assert "--duration 150" in run
     for line in (new, check, run.replace("150", "112"), f"{judge} --json --no-figures"):
