@@ -1,4 +1,4 @@
-"""Tests that instead of a configuration with a wrong checksum, the last accepted one is used, or none."""
+"""Tests that a configuration with a wrong checksum is replaced by the last accepted configuration, if any."""
 
 from __future__ import annotations
 
@@ -72,7 +72,10 @@ def test_no_single_bit_that_flips_is_flown(accepted: Path, service: dict[str, st
 def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
     accepted: Path, service: dict[str, str]
 ) -> None:
-    """The characters 3 and 7 differ by one bit."""
+    """The characters 3 and 7 differ by one bit.
+
+    A flipped bit can change an inertia from 1.05e-3 to 1.05e-7.
+    """
     assert ord("3") ^ ord("7") == 4
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7", 1), encoding="utf-8")
     assert as_testbed(configuration.load(accepted)).plant.inertia == 1.05e-7
@@ -197,7 +200,7 @@ def test_a_configuration_is_kept_after_a_good_start_and_mended_where_it_was_dama
 def test_a_crash_anywhere_while_one_is_kept_leaves_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The calls that change the disk fail one after the other, as if the process ended there."""
+    """A crash at any change of the disk leaves the accepted configuration intact while another is stored."""
     FlownConfig(TEXT, tmp_path).keep()
     for name in ("open", "write", "fsync", "rename", "unlink"):
         folder = tmp_path.parent / f"{tmp_path.name}-{name}"

@@ -23,9 +23,9 @@ from tests.support.damaged import chances, damage
 from tests.support.flights import TEXT
 
 SERVING = {"console", "files", "gateway", "link", "watch", "camera"}
-"""Commands that serve or wait until they are ended."""
+"""Commands that run until they are stopped, such as servers."""
 SLOW = {"index", "identify", "samples", "run"}
-"""Slow commands, which compute for seconds or simulate a run."""
+"""Commands that compute for seconds or simulate a run."""
 NAMES = sorted({**cli.COMMANDS, **GROUND_COMMANDS}.keys() - SERVING - SLOW)
 PATHS = (
     "good.yaml", "bad.yaml", "notes.txt", "run", "empty", "nowhere/run", "nowhere.png", ".", "..",
@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def words_of(chance: Random, name: str) -> list[str]:
-    """Return a command line with options of the command and often invalid values."""
+    """Return a random command line: options of the command with values that are often invalid."""
     parser = cli._parser([name])
     [commands] = [each for each in parser._actions if isinstance(each, argparse._SubParsersAction)]
     words = [name]
@@ -97,7 +97,7 @@ def words_of(chance: Random, name: str) -> list[str]:
 
 
 def refused(*_: Any) -> list[Path]:
-    """Refuse to draw a plot, which would take most of the time."""
+    """Refuse to draw a plot, because drawing would take most of the time of the test."""
     raise UsageError("no pictures are drawn in this test")
 
 

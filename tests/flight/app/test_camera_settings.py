@@ -20,7 +20,7 @@ S = 1_000_000_000
 
 
 def body(streak_estimator: Any = None) -> Any:
-    """Return a body whose functions are distinct dummy objects."""
+    """Return a body whose functions are distinguishable dummy objects."""
     estimation = SimpleNamespace(angular_acceleration_psd="psd", velocity="velocity", knowledge="knowledge")
     control = SimpleNamespace(follows_objects="follows", exposure_start="calm")
     return cast(
@@ -102,7 +102,7 @@ def test_the_lens_is_learned_from_the_last_boot_unless_it_is_exact_or_switched_o
     assert found.usable
     assert np.array_equal(found.learned[0], moved)
     assert problems == []
-    moved[1] += 15.0  # the configuration states 2 px
+    moved[1] += 15.0  # the configuration states an accuracy of 2 px
     other = lens_knowledge(configured(), {"lens": Learned.of(moved, 0.01 * covariance)}, problems)
     assert other is not None
     assert not other.usable

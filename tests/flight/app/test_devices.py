@@ -1,4 +1,4 @@
-"""Tests that the check of real devices closes each opened device, whether or not the device answers."""
+"""Tests that the check of real devices closes each opened device, whether or not the device responds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hal.interfaces.errors import NotResponding
 def test_sensors_that_were_opened_to_be_checked_are_closed(
     answers: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The driver's thread would otherwise continue to read the sensors."""
+    """If the check did not close the sensors, the driver's thread would continue to read them."""
     unit = Mock()
     unit.configure.side_effect = None if answers else NotResponding("lis3mdl", "no acknowledge")
     monkeypatch.setattr(devices, "open_sensors", lambda *_: unit)

@@ -1,4 +1,4 @@
-"""Tests that a run composed by the application equals the recorded run."""
+"""Tests that a run of the flight application equals the recorded run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that the separation inhibit lasts for its powered time, also with restarts or a failing disk."""
+"""Tests that the separation inhibit lasts for its powered time, even with restarts or a failing disk."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_time_without_power_does_not_count_and_a_restart_begins_nothing_again(tm
         clock.advance(30 * SECOND)
         assert left(inhibit, tmp_path / "state") == expected
         clock.advance(500 * SECOND)  # this time is not counted, because the power fails before the next check
-    clock = ManualClock()  # the next start, years later
+    clock = ManualClock()  # a new start, years later
     assert left(SeparationInhibit(clock), tmp_path / "state") == 0.0
 
 

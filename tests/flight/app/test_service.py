@@ -1,4 +1,4 @@
-"""Tests that only a wrong configuration ends the start on a board; other faults are waited for."""
+"""Tests that a wrong configuration ends the start on a board, while other faults are waited out."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def test_it_waits_twice_as_long_each_time_up_to_half_a_minute() -> None:
 
 
 class Attempts:
-    """Attempts that fail one after another.
+    """Attempts to start, which fail one after another.
 
-    The objects that an attempt opened are closed before the next one.
+    The test double checks that the objects of an attempt are closed before the next attempt.
     """
 
     def __init__(self, *failures: BaseException) -> None:
@@ -92,7 +92,7 @@ def test_a_signal_ends_the_wait() -> None:
 
 @pytest.fixture
 def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the command line of a run on a board with short pauses."""
+    """Return the command line of a run on a board, with short pauses between attempts."""
     monkeypatch.setattr(patient_start, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(patient_start, "LONGEST_PAUSE_S", 0.05)
     config = write_config(tmp_path)
@@ -105,7 +105,7 @@ def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_the_wait(
     board: list[str], tmp_path: Path
 ) -> None:
-    """Without an archive, the same fault is an error at once."""
+    """A board waits for a missing socket folder. A run that has no archive ends at once with an error."""
     bench = [*board[:2], "--out", str(tmp_path / "bench"), "--duration", "1"]
     assert main(bench) == 2
     timer = threading.Timer(0.3, (tmp_path / "later").mkdir)

@@ -1,4 +1,4 @@
-"""Tests of parts of the flight service with test doubles: signals, release, memory and supervision."""
+"""Tests of parts of the flight service with test doubles: signals, releases, memory and supervision."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MS = 1_000_000
 
 
 def loop(said: list[str]) -> Any:
-    """Return a test double of the loop that stores the reasons for which it is stopped."""
+    """Return a test double of the loop that stores the reasons of the calls that stop it."""
     return cast(Any, SimpleNamespace(stop=said.append))
 
 
@@ -78,7 +78,7 @@ def test_a_flight_in_another_thread_leaves_the_signals_alone() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the folder of the service."""
+    """Return the state folder of the service."""
     monkeypatch.setattr(service, "service_folder", lambda _: tmp_path)
     return tmp_path
 
@@ -155,7 +155,7 @@ def test_garbage_is_collected_from_the_second_call_on(monkeypatch: pytest.Monkey
 
 
 class Bench:
-    """The flight's supervision with test doubles of guardian and service manager."""
+    """The supervision of a flight, with test doubles of the guardian and the service manager."""
 
     def __init__(self) -> None:
         self.now = 1_000 * MS

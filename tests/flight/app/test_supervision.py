@@ -1,4 +1,4 @@
-"""Tests of the heartbeats of the loop, which guardian and service manager receive."""
+"""Tests that the guardian and the service manager receive the heartbeats of the loop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Watchers:
 
 
 class Events(Recorder):
-    """Keeps the events in a list instead of writing them."""
+    """Event sink that keeps the events in a list."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, str]] = []
@@ -43,7 +43,7 @@ class Events(Recorder):
 
 
 class CoilJob:
-    """A job of the coils that fails as soon as `broken` is set."""
+    """Coil task that fails while `broken` is set."""
 
     def __init__(self, clock: ManualClock) -> None:
         self.broken = False

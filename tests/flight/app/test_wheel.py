@@ -1,4 +1,4 @@
-"""Tests that installed wheels run a configuration and a report, and that the library needs no other wheel."""
+"""Tests that installed wheels run a configuration and a report, and that the library's wheel works alone."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _installed(home: Path, wheels: list[Path], packages: Path) -> Path:
     python = home / "bin" / "python"
     install = [*PIP, "--python", python, "install", "--no-compile", *ALONE, *wheels]
     subprocess.run(install, check=True, timeout=60)
-    # Python ignores .pth files in a folder that a .pth file adds, so an editable installation is not found.
+    # Python ignores .pth files in a folder that a .pth file has added, so no editable installation is found.
     (site,) = home.glob("lib/python*/site-packages")
     (site / "others.pth").write_text(f"{packages}\n", encoding="utf-8")
     return home
@@ -75,7 +75,7 @@ def environment(wheels: Path) -> Path:
 
 
 def _type(environment: Path, folder: Path, *words: str) -> str:
-    """Run a command in a folder and return its output."""
+    """Run a command line in a folder, and return its output."""
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     program = environment / "bin" / words[0]
     done = subprocess.run(

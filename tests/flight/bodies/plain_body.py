@@ -1,4 +1,4 @@
-"""A body of a third party, which a configuration can name: the testbed with its own PD controller."""
+"""A third-party body that a configuration can name: the testbed with its own PD controller."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STIFFNESS, DAMPING = 4e-4, 1e-3
 
 
 class PlainTracker:
-    """PD control about three axes, whose torque is caused by a dipole normal to the field."""
+    """PD control about three axes. The torque is produced by a dipole normal to the field."""
 
     def __init__(self, field: FloatArray, limit: float, dipole_per_ampere: float) -> None:
         self._field, self._limit, self._dipole_per_ampere = field, limit, dipole_per_ampere

@@ -48,7 +48,7 @@ def test_the_attitude_packet_is_the_control_packet_in_three_axes(flown: Run) -> 
 def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
     """The third-party PD controller holds the target in the testbed world.
 
-    The loop has no code for this body.
+    The loop contains no code for this body.
     """
     config = structs.replace(demo_config(40.0, camera=False), body="tests.flight.bodies.plain_body:PLAIN")
     run = fly(config, tmp_path)
@@ -74,7 +74,7 @@ def test_a_body_that_is_not_there_is_one_clear_line(name: str, complaint: str) -
 def test_a_step_that_the_configuration_may_ask_for_is_one_that_the_loop_accepts(
     q2: float, tmp_path: Path
 ) -> None:
-    """The configuration check and the loop must use the same limit: 0.695 must be refused by the check."""
+    """The check of a configuration accepts a step of `q2` exactly if the loop accepts it."""
     text = CONFIG.read_text(encoding="utf-8")
     config = as_testbed(reader.parse(text.replace("q2: -0.3", f"q2: {q2}", 1)))
     config = structs.replace(demo_config(3.0, camera=False), steps=config.steps[:1])

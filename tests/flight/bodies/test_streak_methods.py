@@ -11,7 +11,7 @@ from knightcube.reference.corner_streaks.settings import StreakSettings
 
 
 def estimator(**values: object) -> CornerEstimator:
-    """Return the estimator of a camera with the given values."""
+    """Return the rate estimator that a camera section with the given values selects."""
     made = corner_estimator(Camera(**{"columns": 512, "rows": 512, "field_of_view_deg": 20.0, **values}))  # type: ignore[arg-type]
     assert isinstance(made, CornerEstimator)
     return made

@@ -1,6 +1,6 @@
-"""Published tables of events, commands, directives and parameters.
+"""Published numbers of events, commands, directives and parameters.
 
-Ground stations, archives and documents use these numbers. A row may change only if the interface changes.
+Ground stations, archives and documents use these numbers, so a row may change only with the interface.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _WITH_REACTION = {
 
 
 def published_events() -> dict[int, tuple[str, str, str]]:
-    """Return name, severity and reaction of each event by its code."""
+    """Return (name, severity, reaction) of each event, by the code of the event."""
     rows = dict(_WITH_REACTION)
     for severity, text in _PLAIN.items():
         words = text.split()
@@ -84,7 +84,7 @@ PARAMETERS: tuple[tuple[str, str, float, float], ...] = (
     ("health.temperature", "degree C", -40.0, 150.0),
     ("health.hottest", "degree C", -40.0, 150.0),
 )
-"""Key, unit and bounds of each parameter, in the order of the packets."""
+"""Key, unit and bounds of each parameter, in the order in which packets contain them."""
 
 _ENTITY = "entity:u2{2=ground,3=another-ground-station}"
 _NAME = "name:S96"
@@ -104,7 +104,7 @@ COMMANDS: tuple[tuple[str, int, str, bool], ...] = (
     ("load-parameters", 0x210, "replaced:u4 crc:u4 PARAMETERS", True),
     ("dump-parameters", 0x211, "", False),
 )
-"""Name, APID, fields, and whether a hazard is stated, of each command."""
+"""Name, APID and fields of each command, and whether the command has a stated hazard."""
 
 _KINDS = "{0=configuration,1=elements,2=catalogue,3=release}"
 DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
@@ -127,4 +127,4 @@ DIRECTIVES: tuple[tuple[str, int, str, bool], ...] = (
     ("new-key", 0x2A2, "spi:u2 generation:u4 key:32u1", False),
     ("portion", 0x2A3, "total:u1 number:u1 data:72u1", False),
 )
-"""Name, APID, fields, and whether a hazard is stated, of each directive."""
+"""Name, APID and fields of each directive, and whether the directive has a stated hazard."""

@@ -39,7 +39,7 @@ def telecommand(length: int, seed: int) -> bytes:
 
 
 def noisy(data: bytes, bits: list[int]) -> bytes:
-    """Return data with some bits inverted."""
+    """Return a copy of the data with some inverted bits."""
     value = int.from_bytes(data, "big")
     for bit in bits:
         value ^= 1 << bit
@@ -66,14 +66,14 @@ def test_a_sequence_begins_as_published_and_repeats_after_255_bits(kind: str, be
 
 
 def test_the_long_sequence_follows_its_polynomial_from_the_published_state() -> None:
-    """By CCSDS 131.0-B-5, 10.4, the state 11000111000111000 of x^17 + x^14 + 1 is sent from its right end."""
+    """The state 11000111000111000 of x^17 + x^14 + 1 is sent from its right end (CCSDS 131.0-B-5, 10.4)."""
     bits = [int(bit) for byte in pseudo_random("long") for bit in f"{byte:08b}"]
     assert bits[:17] == [int(bit) for bit in reversed("11000111000111000")]
     assert all(bits[n + 17] == bits[n + 14] ^ bits[n] for n in range(len(bits) - 17))
 
 
 def test_symbols_have_the_published_dual_basis() -> None:
-    """By CCSDS 131.0-B-5, annex F, the rows of the matrix T are the images of alpha^7 to alpha^0."""
+    """The rows of the matrix T are the images of alpha^7 to alpha^0 (CCSDS 131.0-B-5, annex F)."""
     rows = bytes.fromhex("8DEFEC86FA99AF7B")
     code = ReedSolomon(1)
     assert bytes(code._dual[1 << (7 - i)] for i in range(8)) == rows
@@ -147,7 +147,7 @@ def test_a_marker_with_wrong_bits_is_accepted_only_behind_a_codeblock() -> None:
 
 @given(data=st.binary(min_size=7, max_size=7))
 def test_parity_is_the_remainder_by_the_generator_of_the_standard(data: bytes) -> None:
-    """By CCSDS 231.0-B-4, 3.3, the inverted parity of x^7 + x^6 + x^2 + 1 is followed by a fill bit of 0."""
+    """The inverted parity by x^7 + x^6 + x^2 + 1 is followed by a fill bit of 0 (CCSDS 231.0-B-4, 3.3)."""
     rest = int.from_bytes(data, "big") << 7
     for bit in reversed(range(7, 63)):
         if rest >> bit & 1:
@@ -221,7 +221,10 @@ def test_yamcs_makes_the_same_cltus_and_random_sequence(tmp_path: Path, length: 
 
 
 def test_kiss_escapes_as_its_specification_and_skips_other_frames() -> None:
-    """In the specification's example, C0 and DB are sent as DB DC and DB DD."""
+    """As in the example of the specification, C0 and DB are sent as DB DC and DB DD.
+
+    Frames of other types are skipped.
+    """
     assert kiss_frame(b"\xc0a\xdb") == b"\xc0\x00\xdb\xdca\xdb\xdd\xc0"
     stream = KissStream(bytes, ax25=False)
     line = b"\xc0\x01\x32\xc0" + kiss_frame(b"one") + b"\xc0\xc0" + kiss_frame(b"\xdb\xdc\xc0")
@@ -231,7 +234,7 @@ def test_kiss_escapes_as_its_specification_and_skips_other_frames() -> None:
 
 
 def test_an_ax25_header_is_that_of_the_specification() -> None:
-    """By AX.25 2.2, figure 3.5: N7LEM to NJ7P, last address marked, then a UI frame without layer 3."""
+    """A UI frame from N7LEM to NJ7P has the header of AX.25 2.2, figure 3.5, without a layer-3 protocol."""
     header = ax25_header("NJ7P", "N7LEM")
     assert header.hex(" ") == "9c 94 6e a0 40 40 e0 9c 6e 98 8a 9a 40 61 03 f0"
     assert ax25_header("A-15", "B-3")[6:14] == bytes.fromhex("fe 84 40 40 40 40 40 67")

@@ -1,4 +1,4 @@
-"""Tests of commands over real sockets, with clients that flood, vanish or send garbage."""
+"""Tests of commands over real sockets, with clients that flood, disappear or send garbage."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_an_answer_of_a_mode_that_there_is_not_is_none(
 
 
 BEGINS = IDENTIFIERS[0].to_bytes(2, "big")
-"""Return a datagram with the header of a command, because the kernel drops all others."""
+"""First two bytes of a command. The kernel drops all datagrams without them."""
 
 
 def flood(to: Path, count: int, data: bytes) -> None:
@@ -174,7 +174,7 @@ def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_n
 
 
 def test_only_commands_of_a_peer_take_a_place_in_the_queue(place: Path) -> None:
-    """More datagrams than a queue can hold come from an unknown address and from an accepted one."""
+    """Datagrams from unknown addresses, and datagrams without a command, do not fill the command queue."""
     ping = CommandPacker().pack(Ping(5), 1)
     channels = [open_udp("127.0.0.1:0", [IPv4Network("127.0.0.9"), IPv4Network("127.1.0.0/16")])]
     to = channels[0]._socket.getsockname()
@@ -225,7 +225,7 @@ def test_the_socket_is_for_owner_and_group_only(place: Path) -> None:
 
 @pytest.mark.skipif(not os.access("/run", os.W_OK), reason="/run may not be written to: be root")
 def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
-    """The service has a private /tmp, in which files of the test's /tmp are not visible."""
+    """A service with a private /tmp gets its answer at a socket that the flight can reach."""
     with tempfile.TemporaryDirectory(dir="/run", prefix="knightcube-test-") as folder:
         channel = open_unix(Path(folder) / "commands")
         senders: list[str] = []
@@ -244,7 +244,7 @@ def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
 
 
 def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(place: Path) -> None:
-    open_unix(place)._socket.close()  # as after a kill: the socket file remains
+    open_unix(place)._socket.close()  # as after a kill, the socket file remains
     second = open_unix(place)
     with pytest.raises(UsageError, match="another flight listens there"):
         open_unix(place)

@@ -1,4 +1,4 @@
-"""Tests that commands are unchanged by their packets, and that other packets are refused with a reason."""
+"""Tests that commands survive packing and unpacking, and that other packets are refused with a reason."""
 
 from __future__ import annotations
 
@@ -80,9 +80,9 @@ def test_any_flipped_bit_is_found(command: Command, draw: st.DataObject) -> None
 
 
 def test_a_command_is_a_ccsds_telecommand_and_no_telemetry() -> None:
-    """By CCSDS 133.0-B-2, 4.1.3.3, packet type and secondary header flag are 1.
+    """Packet type and secondary header flag of a command are 1 (CCSDS 133.0-B-2, 4.1.3.3).
 
-    The APID is not one of telemetry.
+    No telemetry packet has the APID of a command.
     """
     data = CommandPacker().pack(Slew(0.25), 77)
     word = int.from_bytes(data[:2], "big")
@@ -114,7 +114,7 @@ def test_values_that_cannot_be_obeyed_are_refused_before_they_are_sent(
 
 
 def test_and_refused_again_where_they_arrive() -> None:
-    """A sender with different limits makes a complete packet that is out of range."""
+    """A complete packet with a value out of range is refused on arrival, whatever its sender accepts."""
     for packet, fields in (("slew", {"q2": math.nan}), ("mode", {"mode": 99}), ("mode", {"mode": 0})):
         layout = LAYOUTS[packet]
         head = (layout.identifier, 0xC000, layout.length - 7, 1, 0)
@@ -132,7 +132,7 @@ def test_a_packet_cut_short_or_grown_is_refused(cut: int) -> None:
 
 
 def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
-    """A random sample of 20,000 packets (seed 7), half of them with a valid header."""
+    """None of 20,000 random packets (seed 7), half of them with a valid header, is accepted as a command."""
     generator = np.random.default_rng(7)
     heads = [layout.identifier.to_bytes(2, "big") for layout in LAYOUTS.values()]
     for k in range(20_000):
@@ -164,7 +164,7 @@ def test_a_target_that_nothing_can_point_to_is_refused(
 
 
 def test_each_command_is_printed_with_its_values() -> None:
-    """A ping has the number 0 by default."""
+    """The text of a command contains all its values. The default number of a ping is 0."""
     table = LoadParameters(0x1234, tuple(float(k + 1) for k in range(len(PARAMETER_FIELDS))))
     assert [
         Ping().text,

@@ -73,7 +73,10 @@ def test_a_key_or_counter_that_was_never_written_is_not_read(folder: Path, chanc
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**32))
 def test_only_new_genuine_frames_are_admitted(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    """The draws are determined by a seed, because hypothesis cannot replay them with new keys."""
+    """Only new authentic frames are admitted.
+
+    Hypothesis draws only the seed, because new keys change each run.
+    """
     attacker, chance = LinkAttacker(tmp_path_factory.mktemp("link")), Random(seed)
     for _ in range(60):
         attacker.attack(chance)
@@ -111,7 +114,7 @@ def test_a_damaged_telecommand_is_refused_or_can_be_obeyed(chance: Random) -> No
 def test_units_damaged_on_the_way_make_no_other_file(
     tmp_path_factory: pytest.TempPathFactory, chance: Random
 ) -> None:
-    """Each end sends a file; data units are damaged, lost, repeated and reordered."""
+    """Damaged, lost, repeated and reordered data units never produce a file with wrong contents."""
     place = tmp_path_factory.mktemp("units")
     fill(place / "files", CONTENTS)
     other = {SATELLITE: GROUND, GROUND: SATELLITE}

@@ -1,4 +1,4 @@
-"""Tests that frames carry their packets, and that other bytes are refused or skipped."""
+"""Tests that frames contain their packets, and that bytes of any other kind are refused or skipped."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_each_bit_of_the_header_stands_where_the_standard_puts_it() -> None:
         lambda frame: frame[:-1],
         lambda frame: frame[:3],
         lambda frame: bytes([frame[0] ^ 0x10]) + frame[1:],  # a control frame
-        lambda frame: frame[:1] + bytes([frame[1] ^ 1]) + frame[2:],  # another spacecraft
+        lambda frame: frame[:1] + bytes([frame[1] ^ 1]) + frame[2:],  # the identifier of another spacecraft
     ],
 )
 def test_only_whole_frames_of_this_spacecraft_are_opened(change: object) -> None:

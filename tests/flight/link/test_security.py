@@ -51,7 +51,10 @@ def cause(entrance: Gate, frame: bytes) -> Refusal:
 
 
 def test_the_frame_is_that_of_the_standard_byte_by_byte(ground: Vault) -> None:
-    """The bytes are header 5, SPI 2, IV 12, ciphertext, MAC 16 (over VCID, SPI and data) and CRC 2."""
+    """A protected frame has 5 bytes of header, 2 of SPI, 12 of IV, ciphertext, 16 of MAC and 2 of CRC.
+
+    The MAC covers VCID, SPI and data.
+    """
     maker = Ground(ground)
     maker.frame(b"first")
     frame = maker.frame(b"second")
@@ -85,7 +88,10 @@ def gmac(key: bytes, nonce: bytes, data: bytes) -> bytes:
 def test_a_frame_that_is_only_authenticated_has_readable_data_and_the_mac_of_the_standard(
     ground: Vault,
 ) -> None:
-    """The first tag is a test vector of NIST (gcmEncryptExtIV256, no plaintext, 128 bits of data)."""
+    """A frame without encryption contains its data in clear, and the MAC of the standard.
+
+    The first tag is a NIST test vector (gcmEncryptExtIV256, no plaintext, 128 bits of data).
+    """
     key = bytes.fromhex("78dc4e0aaf52d935c3c01eea57428f00ca1fd475f5da86a49c8dd73d68c8e223")
     data = bytes.fromhex("b96baa8c1c75a671bfb2d08d06be5f36")
     assert (
@@ -108,12 +114,12 @@ def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vau
     third = maker.frame(b"three")
     assert cause(entrance, third[:-1] + bytes([third[-1] ^ 1])) is Refusal.CRC
     assert cause(entrance, close_frame(third[:20] + bytes([third[20] ^ 1]) + third[21:-2])) is Refusal.MAC
-    # A frame with another SPI.
+    # The following frames have a wrong SPI, header or spacecraft.
     assert cause(entrance, close_frame(third[:6] + b"\2" + third[7:-2])) is Refusal.MAC
     assert cause(entrance, close_frame(third[:6] + b"\7" + third[7:-2])) is Refusal.SPI
     assert cause(entrance, close_frame(third[:2] + bytes([third[2] ^ 4]) + third[3:-2])) is Refusal.MAC
     assert cause(entrance, close_frame(b"\x25" + third[1:-2])) is Refusal.HEADER
-    assert entrance.admit(third).counter == 2  # none of these frames advanced a counter
+    assert entrance.admit(third).counter == 2  # none of the refused frames has advanced the counter
     assert sum(entrance.refused.values()) == 8
     assert entrance.admitted == 2
 
@@ -144,7 +150,7 @@ def test_a_restart_lets_nothing_in_again_and_one_copy_is_enough(
         torn.write_bytes(torn.read_bytes()[:30])
         assert sky.copies(1) == 1
         assert cause(gate(sky), frame) is Refusal.REPEATED
-        assert sky.copies(1) == 2  # one copy was written again from the other
+        assert sky.copies(1) == 2  # the missing copy was restored from the other copy
 
 
 def test_both_copies_lost_refuse_that_spi_and_its_reserve_changes_the_key(
@@ -260,7 +266,7 @@ def test_a_fifo_or_an_endless_file_instead_of_a_copy_is_a_lost_copy(sky: Vault, 
     first.unlink()
     os.mkfifo(first)
     assert sky.copies(1) == 1
-    gate(sky)  # the next call tries to write the copy again
+    gate(sky)  # this call tries to restore the missing copy
     with second.open("r+b") as file:
         file.truncate(1 << 40)
     assert sky.read(1) is None
@@ -281,7 +287,7 @@ def test_a_block_of_counters_ends_when_another_sender_has_reserved_counters(grou
 
 
 def test_a_block_of_counters_ends_when_the_key_was_changed(ground: Vault) -> None:
-    """Keys are also replaced if the counters of the new key are at the end of their block."""
+    """A sender does not use the rest of a reserved block of counters after the key was changed."""
     sealer = Sealer(ground, 1, bytes(5), 64, shared=True)
     sealer.seal(bytes(5), b"x")
     old = ground.read(1)

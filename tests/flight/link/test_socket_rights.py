@@ -1,4 +1,4 @@
-"""Tests that opening a command socket does not change the permissions of the process's new files."""
+"""Tests that opening a command socket does not change the permissions of files that the process creates."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def test_a_label_of_no_mode_is_refused_with_the_list_of_modes() -> None:
 
 
 def described(packet: Packet) -> tuple[int, int, str, bool]:
-    """Return APID, version, field types with ranges and states, and whether the command is hazardous."""
+    """Return APID, version, field types with ranges and states, and hazard flag of a command."""
     fields = []
     for field in packet.fields:
         text = f"{field.name}:{field.count if field.count > 1 else ''}{field.kind}"
@@ -87,7 +87,10 @@ def test_every_directive_has_its_published_packet() -> None:
 
 
 def test_a_command_begins_with_version_0_type_1_and_its_apid() -> None:
-    """By CCSDS 133.0-B-2 4.1.3, a telecommand has version 000, type 1, secondary header flag 1, APID."""
+    """A telecommand begins with version 000, type 1, secondary header flag 1 and its APID.
+
+    This is the primary header of CCSDS 133.0-B-2, 4.1.3.
+    """
     for layouts in (commands.LAYOUTS, directives.LAYOUTS):
         for layout in layouts.values():
             assert layout.identifier == 0x1800 | layout.packet.apid

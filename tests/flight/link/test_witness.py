@@ -1,6 +1,6 @@
-"""Tests that a restored backup of the key folder is detected, and that old commands are then refused.
+"""Tests that a restored backup of the key folder is detected, and that repeated old commands are refused.
 
-The satellite detects it by the reference folder (`witness`), which is not part of backups.
+The satellite detects the backup by the reference folder (`witness`), which backups do not contain.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def keys(tmp_path: Path) -> Path:
 
 
 def opened(keys: Path) -> Vault:
-    """Return the satellite's associations, as the link opens them."""
+    """Return the satellite's security associations, as the link opens them."""
     return Vault(keys, keys.parent / "witness")
 
 
 def refusal(at: Vault, frame: bytes) -> Refusal | None:
-    """Return the reason for which a frame is refused."""
+    """Return the reason of the refusal of a frame."""
     try:
         gate(at).admit(frame)
     except RefusedError as error:
@@ -55,7 +55,7 @@ def test_a_restored_folder_refuses_all_commands_until_the_reserve_sets_a_key(
     old = [Ground(ground, spi).frame(b"old") for spi in (1, 1, 2, 2)]
     assert [refusal(opened(keys), frame) for frame in old] == [None] * 4
     restore(keys)
-    for _ in range(2):  # also after a second start
+    for _ in range(2):  # the frame is also refused after a restart
         at = opened(keys)
         assert at.restored
         assert [refusal(at, frame) for frame in old] == [Refusal.LOST] * 2 + [Refusal.REPEATED] * 2
@@ -82,7 +82,7 @@ def test_a_replaced_key_stays_refused_and_a_new_one_is_accepted(keys: Path, grou
         found = at.read(spi)
         assert found is not None
         assert found.key == bytes([spi + 10]) * 32
-    # Keys that were made on the ground start again with generation 1.
+    # Keys that are made on the ground start at generation 1.
     shutil.rmtree(keys)
     vault(keys, {spi: bytes([spi + 20]) * 32 for spi in KEYS})
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""Folders of security associations for both ends of a link."""
+"""Key folders of security associations for both ends of a link."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def gate(at: Vault) -> Gate:
 
 
 def frame_with(at: Vault, iv: int, data: bytes, spi: int = 1) -> bytes:
-    """Return an authentic telecommand frame with any IV of 96 bits, also one that a sender would not use."""
+    """Return an authentic telecommand frame with any IV of 96 bits, even a value that no sender would use."""
     entry = at.read(spi)
     assert entry is not None
     header = TelecommandHeader(SPACECRAFT, 0, 0)

@@ -15,22 +15,22 @@ Names = dict[Path, int]
 
 
 class PowerLostError(BaseException):
-    """Simulated power loss. It is not an OSError, so that no software can catch it."""
+    """Simulated power loss. It is no OSError, so that the tested code cannot catch it."""
 
 
 @dataclass
 class _Inode:
     durable: bytes | None
-    """The content at the last sync, or None for a file that was never synced."""
+    """Content at the last sync, or None if the file was never synced."""
     cached: bytes
 
 
 class Disk(LinuxFiles):
     """A file system in which only synced content and names survive a power loss.
 
-    `calls` counts the calls that change something. The power fails before call number `stop_before`. If
-    `failure` is an errno, that call and all later calls fail with this errno instead. `forget` names a call
-    that does nothing.
+    `calls` counts the calls that change the disk. The power fails before call number `stop_before`. If
+    `failure` is an errno, the power stays on, but this call and all later calls fail with the errno. `forget`
+    is the name of a call that has no effect.
     """
 
     def __init__(
@@ -45,14 +45,15 @@ class Disk(LinuxFiles):
         self._open: dict[int, int] = {}
         self._names: Names = {}
         self._steps: list[Names] = [{}]
-        """Possible file names after a power loss: the durable names, and those after each later change."""
+        """Sets of file names that are possible after a power loss: the durable names, and the names after
+        each change."""
 
     def start(self, stop_before: int | None, failure: int = 0) -> None:
-        """Reset the count of calls, and set the call that fails or stops."""
+        """Reset the count of calls, and set the call that fails or that the power loss precedes."""
         self.calls, self._stop_before, self._failure = 0, stop_before, failure
 
     def read(self, path: Path) -> bytes | None:
-        """Return the content as seen while the power is on."""
+        """Return the content that a program reads while the power is on."""
         return self._inodes[self._names[path]].cached if path in self._names else None
 
     def create(self, path: Path) -> int:
@@ -71,7 +72,7 @@ class Disk(LinuxFiles):
         return descriptor
 
     def write(self, file: int, data: bytes) -> int:
-        """Write at most `bite` bytes."""
+        """Write at most `bite` bytes of the data."""
         self._count()
         taken = data[: self._bite]
         self._inodes[self._open[file]].cached += taken
@@ -126,7 +127,10 @@ NO_SPACE = errno.ENOSPC
 
 
 def _possible(inode: _Inode) -> list[bytes]:
-    """Return what a file may hold after power loss: blocks not synced are old, new, torn, or zeros."""
+    """Return the possible contents of a file after power loss.
+
+    Blocks without sync are old, new, torn or zero.
+    """
     if inode.durable == inode.cached:
         return [inode.cached]
     half = len(inode.cached) // 2

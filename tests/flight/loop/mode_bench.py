@@ -1,4 +1,4 @@
-"""Test bench with a mode control and a body with one angle, in which tests set each condition."""
+"""Test bench of the mode control and a body with one angle. Tests set each condition."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SATELLITE = frozenset({Mode.BOOT, Mode.SAFE, Mode.DETUMBLE, Mode.ACQUIRE, Mode.S
 
 
 def target(name: str) -> Any:
-    """Return a target that is only a name."""
+    """Return a target that has only a name."""
     return SimpleNamespace(index=0, law=SimpleNamespace(text=name))
 
 
 class OneAngle:
-    """Test double of the targets of a body with one angle; a test sets the values that it reports."""
+    """Test double for the targets of a body with one angle. Tests set the values that it reports."""
 
     def __init__(self) -> None:
         self.rate, self.off, self.holdable = 0.0, 0.0, True
@@ -57,7 +57,10 @@ class OneAngle:
 
 @dataclass
 class ModeBench:
-    """The mode control with a record of its requests; `step` advances by a second and runs a cycle."""
+    """The mode control with a record of its requests.
+
+    `step` advances the clock by a second and runs a cycle.
+    """
 
     modes: frozenset[Mode] = TESTBED
     settings: Modes = field(default_factory=Modes)

@@ -1,4 +1,7 @@
-"""Jobs for worker processes, in a module of their own because a worker imports only this module."""
+"""Jobs for worker processes.
+
+They have a module of their own, because a worker imports only the job's module.
+"""
 
 from __future__ import annotations
 
@@ -34,5 +37,5 @@ def cores(_: Any) -> list[int]:
 
 
 def function(_: Any) -> Any:
-    """Return a function, which a worker cannot send."""
+    """Return a function, a type of result that a worker cannot send."""
     return function

@@ -1,4 +1,4 @@
-"""Passes a value through a worker's message, and returns the received value."""
+"""Passes values through the message format between control process and worker."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from flight.loop.worker import SLAB_BYTES, pack_values, unpack_values
 
 @functools.cache
 def slab() -> mmap.mmap:
-    """Return the memory that worker and control process share."""
+    """Return shared memory of a worker and the control process."""
     return mmap.mmap(-1, SLAB_BYTES)
 
 
 def passed(value: Any) -> Any:
-    """Return the value that arrives at the other end."""
+    """Return a value after it was packed and unpacked."""
     return unpack_values(pack_values(value, slab()), slab())

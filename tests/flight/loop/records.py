@@ -1,4 +1,4 @@
-"""Records of events for several tests of the loop."""
+"""Event records for several tests of the loop."""
 
 from __future__ import annotations
 

@@ -31,11 +31,11 @@ ALLOWED = {
     "hal/drivers/ina219.py:Ina219.error": ("_thread.", _LOCK),
     "hal/drivers/ina219.py:Ina219.latest": ("_thread.", _LOCK),
 }
-"""Functions whose calls may wait on the control thread: start of the call's name, and reason."""
+"""Functions whose calls may block on the control thread, by the start of the call's name, with the reason."""
 
 
 def test_the_control_thread_waits_nowhere_else() -> None:
-    with tempfile.TemporaryDirectory(prefix="kc-") as name:  # the name of a socket must be short
+    with tempfile.TemporaryDirectory(prefix="kc-") as name:  # the path of a UNIX socket must be short
         place = Path(name)
         (place / "devices").mkdir()
         config = write_config(place)

@@ -1,4 +1,4 @@
-"""Tests of the times from which the coil currents are known."""
+"""Tests of the times at which the coil currents are known."""
 
 from __future__ import annotations
 
@@ -52,5 +52,8 @@ def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None
 
 
 def test_no_guardian_acts_in_a_gap_that_is_not_seen() -> None:
-    """The interval between heartbeats may exceed the interval between checks by nearly two cycles."""
+    """The guardian never acts in a heartbeat gap that the loop fails to detect.
+
+    The gap may be nearly two cycles longer than the interval between the loop's checks.
+    """
     assert STOOD_NS + 2 * 25 * MS < SILENCE_NS

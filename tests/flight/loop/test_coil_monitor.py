@@ -1,4 +1,4 @@
-"""Tests that broken coils are identified from supply current and motion, and healthy coils never are."""
+"""Tests that faulty coils are found by supply current and motion, and healthy coils are not suspected."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ BOUNDS = Bounds((FULL, FULL, FULL), 3.5e-3, 0.2, 1.5e-3)
     [
         ("coil-x: open", {"OPEN", "UNCERTAIN"}, 3.5),
         ("coil-x: shorted", {"SHORTED"}, 4.0),
-        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # the current is beyond the range of the monitor
+        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # the current exceeds the range of the monitor
         ("bridge-x: a-low", {"A_LOW", "UNCERTAIN"}, 3.5),
         ("bridge-x: a-high", {"HIGH"}, 4.0),
         ("bridge-y: a-high", {"HIGH"}, 3.0),
@@ -57,7 +57,7 @@ def test_a_broken_axis_is_found_and_named(fault: str, names: set[str], within: f
 
 
 def full(time: float, _: ImuReading) -> FloatArray:
-    """Return currents of all three coils at their limit, as in a fast tumble, with a change of sign."""
+    """Return currents at the limit for all coils, as in a fast tumble. The sign of z changes at 4 s."""
     return np.array([FULL, FULL, -FULL if time < 4.0 else FULL])
 
 
@@ -81,7 +81,7 @@ def test_after_a_fault_that_ends_all_coils_are_used_and_not_suspected() -> None:
 
 
 def _alone(axis: int, current: float) -> Predicted:
-    """Return a sample of the supply current (A) while one axis alone is commanded 40 mA."""
+    """Return a sample of the supply current (A) while only one axis is commanded, to 40 mA."""
     commands = np.zeros((12, 3))
     commands[:, axis] = 0.04
     return predict(current, commands, BOUNDS, NEWEST)
@@ -116,7 +116,7 @@ def test_cleared_evidence_contains_no_earlier_readings() -> None:
 
 
 def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
-    """While coil x is probed, an open coil y draws as little as a healthy coil y."""
+    """Readings of a probe of coil x do not end the suspicion of coil y, because coil y is then undriven."""
     evidence = Evidence(BOUNDS)
     evidence.add([predict(2 * FULL, np.full((12, 3), FULL), BOUNDS, NEWEST)] * 4)
     evidence.begin_segment()
@@ -131,7 +131,7 @@ def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
 
 
 def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple[CoilMonitor, FloatArray]:
-    """Return a coil monitor that missed the torque of coil z at 4 mA, and the currents (k, 3), A.
+    """Return a coil monitor that suspects coil z for missing torque, and the commanded currents (k, 3), A.
 
     A coil of gain 0 is open. If `silent`, the current monitor gives no readings after the suspicion begins.
     """
@@ -150,7 +150,10 @@ def _probed_for_missing_torque(gains: FloatArray, silent: bool = False) -> tuple
 
 
 def test_coils_that_draw_their_currents_in_the_probes_are_not_isolated_for_missing_torque() -> None:
-    """No axis is isolated by elimination, because the torque may be missing for another reason."""
+    """Coils that draw their currents while they are probed are not isolated for missing torque.
+
+    The torque may be missing for another reason.
+    """
     watch, flown = _probed_for_missing_torque(np.ones(3))
     assert watch.verdicts == ()
     alone = np.flatnonzero(np.abs(flown).max(axis=1) > 0.03)
@@ -208,7 +211,10 @@ def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None
 
 
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
-    """A deviation of 15 % is that of copper at 60 degrees C; all three axes have changing commands."""
+    """Currents 13 % below and 10 % above their nominal values cause no suspicion.
+
+    The resistance of copper at 60 degrees C is 15 % off. All three axes have changing commands.
+    """
     seen = observe(hold(TARGET, noise=0.005, others=0.04), 20.0, gain=(0.87, 1.1, 1.0))
     assert seen.found == []
     assert seen.suspicious == 0
@@ -229,9 +235,9 @@ def test_an_axis_that_is_never_driven_is_not_judged() -> None:
 
 @pytest.mark.parametrize("fault", ["bridge-y: a-high", "bridge-y: b-high"])
 def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> None:
-    """With either leg stuck, the brake sets both ends of the coil high.
+    """The brake sets both ends of the coil high, whichever leg is stuck high.
 
-    Only the broken coil carries current.
+    Coil y carries its full current until the brake is set, and none afterwards.
     """
     seen = observe(hold(0.0), 10.0, [f"{fault} @ {FAULT_AT}"])
     assert seen.watch.braked == {1}
@@ -243,7 +249,7 @@ def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> 
 
 
 def test_braking_that_does_not_help_is_ended() -> None:
-    """The current stays too large if the monitor is wrong, or if a leg is stuck low while the brake is on."""
+    """The brake is released if it does not end the current: the monitor is wrong, or a leg is stuck low."""
     leg = StuckLeg(0.04)
     at_rest = Supplied(0.148, -0.002, 0.002, (0, 1, 2), False)
     asked = []
@@ -272,7 +278,10 @@ def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_
 
 
 def _looks(leg: StuckLeg, stuck: Iterable[int], count: int = 40) -> list[int | None]:
-    """Return results of ADC samples at zero commands; each stuck, unbraked axis draws current."""
+    """Return the results of ADC samples at zero commands.
+
+    Each axis with a stuck leg draws current unless braked.
+    """
     drawing = set(stuck)
     found = []
     for _ in range(count):
@@ -289,7 +298,7 @@ def test_the_stuck_axis_is_the_one_whose_release_lets_the_current_flow_again(axi
     assert leg.is_searching
     assert leg.brake == {0, 1, 2}
     assert leg.suspicion == "supply current 150 mA, expected 0 to 0 mA"
-    # Two normal samples with all bridges braked, and two for each released bridge.
+    # Two normal samples are needed with all bridges braked, and two more for each released bridge.
     assert _looks(leg, {axis}) == [None] * (2 + 2 * axis + 1) + [axis]
     assert (leg.is_searching, leg.brake, leg.rest, leg.suspicion) == (False, frozenset(), False, "")
 
@@ -357,15 +366,15 @@ def test_two_consecutive_samples_confirm_or_refute_that_a_brake_helps(
 
 
 def reading(time: float, current: float) -> PowerReading:
-    """Return a monitor's reading at `time` s of a current in A."""
+    """Return a reading of the current monitor, A, at `time` s."""
     now_ns = round(time * 1e9)
     return PowerReading(now_ns, 5.0, current, 5.0 * current, current, now_ns - 300_000_000)
 
 
 def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_carries_nothing() -> None:
-    """Under an opposing command, a stuck leg draws no supply current, like an open coil.
+    """A stuck leg that opposes the command draws no supply current, like an open coil.
 
-    Zero commands distinguish them.
+    Only samples at zero commands distinguish the two faults.
     """
     drawn = supply_currents(np.array([[-FULL]]), np.array([[FULL]]))
     assert drawn[0, PLACE[CoilFault.A_HIGH]] == pytest.approx(0.0)
@@ -385,12 +394,12 @@ def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_ca
 
 
 def windows(time: float, _: ImuReading) -> FloatArray:
-    """Return the currents (A) of B-dot control during a fast rotation: in each 0.25 s, off and then full."""
+    """Return the currents (A) of B-dot control in a fast rotation: off for 0.1 s and full for 0.15 s."""
     return np.array([0.0 if time % 0.25 < 0.1 else FULL, 0.0, 0.0])
 
 
 def test_a_leg_stuck_high_that_drives_in_the_pauses_of_the_command_is_found() -> None:
-    """No ADC sample can distinguish the equal currents in the pauses and between them."""
+    """A leg stuck high is found if its current in the pauses of the command equals the commanded current."""
     seen = observe(windows, FAULT_AT + 7.0, [f"bridge-x: b-high @ {FAULT_AT}"])
     assert [(axis, name) for _, axis, name in seen.found] == [("x", "HIGH")]
     assert seen.watch.braked == {0}
@@ -405,7 +414,7 @@ def test_a_check_at_rest_does_not_raise_suspicion() -> None:
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
-    """A pause of the coils must end even if the current monitor gives no readings."""
+    """The coils do not rest for longer if the current monitor gives no readings."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     rested = []
     for cycle in range(160):
@@ -435,10 +444,10 @@ def wander(rng: np.random.Generator, samples: int) -> FloatArray:
 def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
     """No coil is suspected in 2,388 driver readings (seed 11).
 
-    The gains are within 15 %. Every driven coil has an error within the thesis's 3.5 mA in every cycle, and
-    the readings have the resolution of the monitor. Single ADC samples differ from the mean of the chopped
-    current by up to 18 %. Without a suspicion in N readings, the rate of suspicions is below 3 / N at 95 %
-    confidence. Only a suspicion of a single axis leads to the decision that a coil is faulty.
+    The current gains are within 15 %. Every driven coil has an error within the thesis's 3.5 mA in every
+    cycle, and the readings have the resolution of the monitor. Single ADC samples differ from the mean of the
+    chopped current by up to 18 %. Without a suspicion in N readings, the rate of suspicions is below 3 / N at
+    95 % confidence. Only a suspicion of a single axis leads to the decision that a coil is faulty.
     """
     rng = np.random.default_rng(11)
     suspected = readings = 0
@@ -448,8 +457,8 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
         errors = rng.uniform(-3.5e-3, 3.5e-3, commands.shape) * driven
         supply = np.abs(rng.uniform(0.85, 1.15) * commands + errors).sum(axis=1)
         in_a_row = 0
-        # An ADC sample is the mean over three PWM cycles; one ends every eight cycles, and a reading is the
-        # mean of five.
+        # An ADC sample is the mean over three PWM cycles. A sample ends every eight cycles, and a reading is
+        # the mean of five samples.
         conversions = np.array([supply[end - 3 : end].mean() for end in range(8, len(supply), 8)])
         chopped = conversions * rng.uniform(0.82, 1.18, len(conversions))
         for last in range(5, len(conversions)):
@@ -504,7 +513,7 @@ def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_
     watch._evidence.add([_alone(1, 0.04 if probed else 0.0)])
     watch._evidence.begin_segment()
     watch._evidence.add([_alone(0, 0.0)])
-    for _ in range(1 if probed else 2):  # by the second time, a different coil has also been probed
+    for _ in range(1 if probed else 2):  # in the second round, coil y has been probed too
         watch._conclude(0, CoilFault.OPEN, 0)
     assert bool(watch.verdicts) is probed
     assert bool(watch.monitor_doubted) is not probed
@@ -514,7 +523,7 @@ def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_
 def test_a_verdict_that_the_motion_contradicts_waits_for_the_probe_of_a_healthy_coil(
     works: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first coil that is probed alone is the open one, so that no reading has shown a working monitor."""
+    """A coil is isolated only after the probe of a healthy coil has shown that the current monitor works."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     monkeypatch.setattr(watch._witness, "contradicts", lambda *_: True)
     gains, fails = np.array([0.0, 1.0, 1.0]), False
@@ -525,7 +534,7 @@ def test_a_verdict_that_the_motion_contradicts_waits_for_the_probe_of_a_healthy_
         wanted = np.full(3, 0.1) if watch.probe is None else watch.probe
         probed += [int(np.argmax(np.abs(wanted)))] * int(np.count_nonzero(wanted) == 1)
         watch.commanded(now_ns, np.where(watch.available, wanted, 0.0))
-        # A monitor that fails during the probe of coil x measures nothing from then on.
+        # The current monitor fails during the probe of coil x, and measures nothing afterwards.
         fails = not works and (fails or np.count_nonzero(wanted) == 1)
         drawn.append(float(np.abs(wanted) @ (np.ones(3) if time < 4.0 else gains)) * (not fails))
         if cycle % 8 == 0:

@@ -1,4 +1,4 @@
-"""Tests of the estimated coil gain across stalls of the loop, and on a free body in the coils' field."""
+"""Tests of the coil gains estimated from the motion, with stalls of the loop, and on a free body."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ FIELD = np.array([0.0, 0.0, 60e-6])
 INERTIA, DIPOLE = 0.02, 60.0
 TICK_NS = 25_000_000
 STAND_EVERY = 176
-"""Number of cycles between two stalls of the loop (4.4 s)."""
+"""Number of cycles between two stalls of the loop; 176 cycles are 4.4 s."""
 STANDS = 36
 STALE = 12
-"""Number of cycles after which the coil driver, or the guardian, zeroes a command."""
+"""Number of cycles after which the coil driver or the guardian zeroes an old command."""
 
 
 def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list[float], int]:
-    """Drive coil x with a loop that stalls repeatedly; the samples arrive in a burst after each stall.
+    """Drive coil x by a loop that stalls repeatedly. The gyro samples of a stall arrive together after it.
 
     During a stall the driver zeroes the coils and reports the time, or a guardian zeroes them without a
     report. With `informed`, the loop knows that the currents of that time are unknown. Returns the trusted
@@ -84,7 +84,10 @@ def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() 
 
 
 class Orbiting:
-    """A tumbling 1U in 37 uT with coils on and off, whose field at the magnetometer is twice the Earth's."""
+    """A tumbling 1U in a field of 37 uT.
+
+    The pulsed coils cause twice the Earth's field at the magnetometer.
+    """
 
     def __init__(
         self,
@@ -93,7 +96,7 @@ class Orbiting:
         tumble_rate: float = math.inf,
         dipoles: FloatArray | None = None,
     ) -> None:
-        """Use the `dipoles` (3, n) per ampere, or else those of coils along the body axes."""
+        """Use the `dipoles` (3, n) per ampere; by default, those of coils along the body axes."""
         self.signs, self.rate = signs, speed * np.array([0.08, -0.1, 0.07])
         self._dipoles = 0.65 * np.eye(3) if dipoles is None else dipoles
         self._allocation = 0.65 * np.linalg.pinv(self._dipoles)
@@ -112,9 +115,9 @@ class Orbiting:
         self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
 
     def fly(self, seconds: float, weak: bool = False) -> None:
-        """Simulate coils that pause for 0.2 s of each second.
+        """Simulate the body with coils that are off for 0.2 s of each second.
 
-        `weak` currents are too small for the monitor.
+        If `weak` is set, the currents are too small for the current monitor.
         """
         begun, self._cycles = self._cycles, self._cycles + round(40 * seconds)
         for cycle in range(begun, self._cycles):
@@ -141,7 +144,10 @@ INERTIAS = np.diag(MOMENTS)
 def _moved(
     rate: FloatArray, field: FloatArray, dipole: FloatArray, moments: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rate and field (3,) after 25 ms, in body axes; plain numbers take a tenth of numpy's time."""
+    """Return rate and field (3,) after 25 ms, in body axes.
+
+    Floats take a tenth of the time of numpy arrays.
+    """
     (x, y, z), (bx, by, bz) = rate.tolist(), field.tolist()
     (mx, my, mz), (jx, jy, jz) = dipole.tolist(), moments.tolist()
     for _ in range(5):
@@ -176,7 +182,7 @@ PYRAMID = 0.4 * np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 
 
 @pytest.mark.parametrize("reversed_coil", [None, 0, 3])
 def test_of_four_coils_the_reversed_one_is_found(reversed_coil: int | None) -> None:
-    """The four currents are those of one common dipole, so they are correlated."""
+    """A reversed coil of four is found, although the four currents are correlated by their common dipole."""
     signs = np.where(np.arange(4) == reversed_coil, -1.0, 1.0)
     flown = Orbiting(signs, dipoles=PYRAMID)
     flown.fly(60.0)
@@ -200,7 +206,7 @@ def test_a_coil_that_makes_no_torque_is_found_at_currents_too_small_for_the_moni
 
 @pytest.mark.parametrize("gain", [0.0, 1.0])
 def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
-    """If all coils seem without effect, a wrong gyro or field is the more likely cause."""
+    """If no coil has an effect, no coil is suspected, because a wrong gyro or field is more likely."""
     body = Orbiting(np.full(3, gain), speed=0.02)
     body.fly(120.0, weak=True)
     assert body.watch.suspicion == ""
@@ -258,7 +264,7 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     assert watch.available.all()
     assert not watch.resting.any()
     assert watch.suspicion == ""
-    watch.tumble_rate = 10.0  # makes the monitor treat the body as slow
+    watch.tumble_rate = 10.0  # the monitor takes any rate for a slow one
     body.fly(40.0)
     assert watch.correction.factors.tolist() == signs.tolist()
     assert watch.correction.unreviewed == frozenset()
@@ -307,7 +313,10 @@ def test_a_weak_coil_is_used_with_its_gain(axis: int) -> None:
 
 @pytest.mark.parametrize(("gain", "found"), [(0.4, [1]), (0.48, [])])
 def test_a_gain_that_misaligned_coils_can_explain_is_not_used(gain: float, found: list[int]) -> None:
-    """In the campaign `unlike-inertia`, a healthy coil of gain 0.8 seemed to have 0.48 +- 0.06."""
+    """A gain of 0.48 +- 0.06 is not used, because misaligned coils can explain it.
+
+    In the campaign `unlike-inertia`, a healthy coil of gain 0.8 had this estimate.
+    """
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     response.gain, response.sigma = np.array([1.0, gain, 1.0]), np.full(3, 0.06)
     for _ in range(3):
@@ -319,7 +328,10 @@ def test_a_gain_that_misaligned_coils_can_explain_is_not_used(gain: float, found
 def test_a_gain_that_changed_within_the_bins_is_not_used(
     newest: float, found: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The mean gain over an interval with a fault is neither the gain before nor that after it."""
+    """A gain is not used if the newest half of its interval shows another gain.
+
+    The mean gain over an interval with a fault is neither the gain before the fault nor the gain after it.
+    """
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     alone, never = (False, True, False), (False, False, False)
     fits = {
@@ -344,9 +356,9 @@ def test_a_coil_assumed_too_weak_gets_its_gain_back() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_coils_within_their_accuracy_on_an_unlike_body_are_flown_as_described(seed: int) -> None:
-    """The gains have errors of 20 %, and the moments of inertia 10 %.
+    """Coils within 20 % and moments of inertia within 10 % of their configured values are not corrected.
 
-    A fit of the coils alone cannot separate them.
+    The motion cannot separate errors of the coils from errors of the inertia.
     """
     noise = np.random.default_rng(seed)
     body = Orbiting(1.0 + 0.2 * noise.choice([-1.0, 1.0], 3))
@@ -427,7 +439,7 @@ class Motion:
         self.asked: list[tuple[int, float, int, int]] = []
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
-        """Return the observed part of the change."""
+        """Return the fraction of the change that was observed."""
         self.asked.append((axis, constant, since_ns, settled_ns))
         return self.share
 
@@ -488,9 +500,9 @@ def test_without_the_motion_nothing_is_contradicted() -> None:
 def _point_in_dense_air(
     disturbance: float | None, seed: int, gains: tuple[int, int, int] = (1, 1, 1)
 ) -> tuple[dict[Finding, int], FloatArray]:
-    """Command coils with the given `gains` for 150 s to hold an attitude against a varying torque.
+    """Simulate coils with the given `gains`, which hold an attitude for 150 s against a varying torque.
 
-    Returns the numbers of fits with each finding by number of axes, and the errors of the gains in standard
+    Returns, for each finding, how many fits had it on how many axes, and the errors of the gains in standard
     deviations.
     """
     settings = ResponseSettings(

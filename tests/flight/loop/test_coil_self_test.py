@@ -1,4 +1,4 @@
-"""Tests that the self-test drives rarely used coils by short currents, and only when it is permitted."""
+"""Tests that the self-test drives idle coils by short currents, and only when it is permitted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TICK_NS = 25_000_000
 INTERVAL = 50.0
 LIMIT = 0.148
 STRONG: FloatArray = np.array([0.02, 0.03, 0.01])
-"""Acceleration (rad/s^2) of each coil per ampere."""
+"""Angular acceleration (rad/s^2) per ampere of each coil."""
 ALL: BoolArray = np.ones(3, dtype=bool)
 
 
@@ -35,7 +35,7 @@ def _fly(
     usable: BoolArray = ALL,
     begin: float = 0.0,
 ) -> FloatArray:
-    """Return the currents (n, 3), A, of a run from `begin` s on; NaN without a test."""
+    """Return the currents (n, 3), A, of the self-test from `begin` s on, or NaN while no test runs."""
     flown = []
     for cycle in range(round(begin * 40), round((begin + seconds) * 40)):
         asked = np.zeros(3) if wanted is None else wanted
@@ -78,7 +78,8 @@ def test_a_weaker_response_is_tested_by_more_current_and_then_for_longer(strengt
     driven = np.count_nonzero(current) / 40
     rate = strength * np.abs(np.cumsum(current)) / 40
     assert np.abs(current).max() <= LIMIT
-    # The information increases with the square of the rate that the test adds, and with its duration.
+    # The information increases with the squared rate that the self-test adds, and with the duration of this
+    # rate.
     assert np.sqrt(np.square(rate).sum()) == pytest.approx(8.0 * 4e-4 / 0.7, rel=0.02)
     assert driven == pytest.approx(4.0, abs=0.1) or np.abs(current).max() == LIMIT
 

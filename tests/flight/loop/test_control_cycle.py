@@ -1,4 +1,4 @@
-"""Tests of the control cycle with test doubles: the calls that each task receives, and the records."""
+"""Tests of the control cycle with test doubles: the calls of each task, and the recorded packets."""
 
 from __future__ import annotations
 
@@ -53,18 +53,18 @@ class Bench:
         self.now_ns = 0
 
     def run(self, slot: int = 0) -> ControlOutput:
-        """Run a cycle in a slot."""
+        """Run the control cycle of a slot."""
         self.now_ns = (100 + slot) * PERIOD_NS
         return self.loop.run(Cycle(slot, self.now_ns, self.now_ns))
 
     def results(self, *workers: str) -> list[Any]:
-        """Make each worker finish a job."""
+        """Make each worker return the result of a job."""
         made = [SimpleNamespace(worker=worker) for worker in workers]
         self.services.jobs.collect.return_value = made
         return made
 
     def recorded(self, packet: Any) -> list[dict[str, Any]]:
-        """Return the values of the recorded packets of a kind."""
+        """Return the values of the recorded packets of a type."""
         calls = self.services.recorder.record.call_args_list
         return [call.kwargs for call in calls if call.args[0] is packet]
 

@@ -1,4 +1,4 @@
-"""Tests with damaged copies of the stored state, and damaged worker messages with valid checksums."""
+"""Tests with damaged copies of the stored state, and with damaged worker messages of valid checksum."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STATES = (
     ),
 )
 HEAD = struct.Struct("<QQI")
-"""Lengths of the two parts of a worker's message, and their CRC-32."""
+"""Lengths of the two sections of a worker message, and the CRC-32 of the message."""
 
 
 @given(chances())
@@ -43,7 +43,10 @@ def test_a_damaged_state_is_refused_or_can_be_stored_again(chance: Random) -> No
 
 @given(chances())
 def test_a_resealed_message_of_a_worker_brings_nothing_to_call(chance: Random) -> None:
-    """A damaged message with a valid checksum must not end the control process in the decoder."""
+    """A damaged worker message with a valid checksum never decodes to a function.
+
+    The decoder must not end the control process.
+    """
     slab = mmap.mmap(-1, 1 << 16)
     values: tuple[object, ...] = (
         {"path": np.linspace(0.0, 1.0, 50), "cost": 1.5},

@@ -1,4 +1,4 @@
-"""Tests that rate groups keep their time grid with any clock, survive failures and never burst."""
+"""Tests that rate groups keep their time grid with any clock, continue after failures and never burst."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Tests of facts, which are monitored conditions such as a silent sensor.
 
-A fact becomes true after N consecutive updates, is reset in modes that do not monitor it, and is reported
-once. Some facts latch.
+A fact becomes true after N consecutive updates, and is reported once. It is reset in modes in which it is not
+monitored. Some facts latch.
 
-Liveness, rate and validity of a stream are checked separately; a stale stream is never good.
+Age, rate and validity of a stream are checked separately. A stale stream is never good.
 """
 
 from __future__ import annotations
@@ -230,7 +230,7 @@ PERIOD = 25_000_000
 def fed(
     seconds: float, every: int = 1, value: float = 0.5, row: StreamLimits = ROW
 ) -> tuple[StreamWatch, int]:
-    """Return a watch that has received every n-th sample for some seconds, and the time at the end."""
+    """Return a watch that has received every n-th sample for some seconds, and the last sample's time."""
     watch = StreamWatch(row, 0)
     count = round(seconds * 40)
     for k in range(0, count, every):
@@ -315,7 +315,7 @@ def test_the_streams_have_the_rates_limits_and_ranges_of_their_devices() -> None
 
 
 def test_the_window_has_two_seconds_or_five_periods() -> None:
-    """The rate is unknown until the window is full."""
+    """The rate of a stream is unknown until two seconds or five periods have passed."""
     for rate_hz, window in ((40.0, 2.0), (2.5, 2.0), (0.1, 50.0)):
         watch = StreamWatch(replace(ROW, rate_hz=rate_hz), 0)
         assert math.isnan(watch.rate(round(window * 1e9) - 1))

@@ -1,4 +1,4 @@
-"""Tests of resources: shares and slopes of samples, limits with persistence, and steps of the wall clock."""
+"""Tests of resource monitoring: means and slopes, persistent excesses, and steps of the wall clock."""
 
 from __future__ import annotations
 
@@ -140,14 +140,14 @@ def test_the_board_shows_of_this_very_process(tmp_path: Path) -> None:
 def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_nothing(tmp_path: Path) -> None:
     process = tmp_path / "proc" / str(os.getpid())
     (process / "task" / "1").mkdir(parents=True)
-    # The process name contains spaces and brackets; utime is 250 and stime 50 ticks (proc(5)).
+    # The process name contains spaces and brackets. utime is 250 ticks and stime is 50 ticks (proc(5)).
     (process / "stat").write_text(f"{os.getpid()} (a ) b) S " + " ".join(["0"] * 10) + " 250 50 " + "0 " * 30)
     (process / "statm").write_text("1000 512 100 1 0 200 0")
     (process / "smaps_rollup").write_text("Rss: 9000 kB\nPss:   4096 kB\nPss_Dirty: 1 kB\n")
     (process / "task" / "1" / "children").write_text("77 78 ")
     (tmp_path / "proc" / "77").mkdir()
     (tmp_path / "proc" / "77" / "smaps_rollup").write_text("Pss: 1024 kB\n")
-    # A worker that has ended and was not waited for has no memory.
+    # A worker that has ended, but whose parent has not waited for it, has no memory.
     (tmp_path / "proc" / "78").mkdir()
     (tmp_path / "proc" / "78" / "stat").write_text("78 (python) Z " + "0 " * 40)
     zone = tmp_path / "thermal" / "thermal_zone0"
@@ -165,7 +165,7 @@ def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_noth
 
 
 def grown(count: int, window: float = 30.0) -> float:
-    """Return the slope of memory that grows by 5 kB/s, from `count` samples 5 s apart, without warm-up."""
+    """Return the measured slope of a memory that grows by 5 kB/s, from `count` samples 5 s apart."""
     monitor = ResourceMonitor(Health(look_period=5.0, warm_up=0.0, slope_window=window))
     for k in range(count):
         monitor.ingest(sample(5.0 * k, proportional=150 * MIB + 5e3 * 5.0 * k))
@@ -180,7 +180,10 @@ def test_a_slope_needs_eight_samples_and_its_window() -> None:
 
 
 def test_an_hour_of_samples_is_kept() -> None:
-    """Memory that was constant for an hour and then grew by 1 MiB in an hour shows the growth alone."""
+    """If a memory is constant for an hour and then grows by 1 MiB in an hour, the slope is 1 MiB/h.
+
+    Only samples of the last hour are kept.
+    """
     monitor = ResourceMonitor(Health(look_period=60.0, warm_up=0.0, slope_window=600.0))
     for k in range(121):
         monitor.ingest(sample(60.0 * k, proportional=150 * MIB + MIB * max(0.0, (k - 60) / 60.0)))
@@ -276,7 +279,7 @@ def test_a_job_on_a_ticker_fails_when_it_raises_or_stands_still() -> None:
 
 
 class Observed:
-    """The performance observer with records of its actions."""
+    """The performance observer, with a record of its actions."""
 
     def __init__(self) -> None:
         self.offs = 0

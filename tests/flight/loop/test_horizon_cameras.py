@@ -24,7 +24,7 @@ SETTINGS = HorizonCameraSettings(
 
 
 class Camera:
-    """Camera that delivers a frame a second after a trigger, or no frame."""
+    """A camera that delivers a frame one second after its trigger, or no frame."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.triggers, self.dead, self.pending = bench, 0, False, False
@@ -47,7 +47,7 @@ class Camera:
 
 
 class Bench:
-    """Two cameras, a body that may need them, a worker that finds the Sun, and the reported events."""
+    """Two cameras, a body that may need their images, a worker that finds the Sun, and reported events."""
 
     def __init__(self) -> None:
         self.now_ns, self.needed, self.busy = 0, True, False
@@ -82,7 +82,7 @@ class Bench:
         return found.sun is not None, False
 
     def fly(self, seconds: int) -> None:
-        """Run the task once a second; the worker returns a result within a second."""
+        """Run the task once a second. The worker returns each result within a second."""
         sun = MeasuredDirection(np.array([1.0, 0.0, 0.0]), 1e-6 * np.eye(3), (1,))
         found = HorizonCameraResult(sun, None, false=self.denied)
         for _ in range(seconds):

@@ -1,4 +1,4 @@
-"""Tests of star camera frames: repeated rows of an earlier frame, pixels without stars, mid-exposure time."""
+"""Tests of star camera frames: repeated rows of an earlier frame, lack of stars, and mid-exposure time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RNG = np.random.default_rng(8)
 
 
 def exposed(noise: float = 10.0, dtype: str = "uint16") -> Image:
-    """Return a frame of sky with read noise, in counts."""
+    """Return a frame of the sky background with read noise, in counts."""
     sky = RNG.poisson(20.0, (240, 320)) + RNG.normal(0.0, noise, (240, 320)) + 100.0
     return np.clip(sky, 0, np.iinfo(dtype).max).astype(dtype)
 
@@ -49,7 +49,10 @@ def test_the_same_frame_again_is_not_torn_but_frozen() -> None:
 
 
 def test_rows_without_noise_say_nothing() -> None:
-    """A dark sensor of 8 bits gives rows of zeros, and hot pixels that never change."""
+    """Rows without noise are not counted as repeated.
+
+    A dark 8-bit sensor gives rows of zeros and constant hot pixels.
+    """
     rows = RepeatedRows()
     for number in range(4):
         frame = np.zeros((240, 320), dtype=np.uint8)

@@ -115,7 +115,7 @@ class Bench:
 
     @staticmethod
     def past(at: int) -> Any:
-        """Return the estimate of a body that rotates about x at 0.01 rad/s."""
+        """Return the past estimate of a body that rotates about x at 0.01 rad/s."""
         quaternion = from_rotation_vector(np.array([0.01 * at * 1e-9, 0.0, 0.0]))
         return SimpleNamespace(quaternion=quaternion, rate=np.array([0.01, 0.0, 0.0]), covariance=COVARIANCE)
 
@@ -142,33 +142,33 @@ class Bench:
         report([self.accepts] * len(late))
 
     def cycle(self, at: int) -> Any:
-        """Return a cycle that starts at a time in ns."""
+        """Return a control cycle that starts at a time in ns."""
         return cast(Any, SimpleNamespace(start_ns=at))
 
     def take(self, sequence: int, start: int, now: int) -> None:
-        """Make a frame arrive that was exposed for 0.2 s from `start`."""
+        """Deliver a frame that was exposed for 0.2 s from `start`."""
         self.frames.append(frame(sequence, start))
         self.task.serve(now)
 
     def finish(self, value: Any, now: int, outcome: str = "done") -> None:
-        """Make the worker end its job."""
+        """Make the worker return a result."""
         result = SimpleNamespace(worker="vision", outcome=outcome, error="why", value=value)
         self.task.finish(cast(JobResult, result), now)
 
     def only(self, packet: Any) -> dict[str, Any]:
-        """Return the values of the only record of a packet."""
+        """Return the values of the only recorded packet of a type."""
         (values,) = [values for kind, values in self.records if kind is packet]
         return values
 
 
 def frame(sequence: int, start: int) -> Frame:
-    """Return a frame of noise, exposed for 0.2 s from `start`."""
+    """Return a frame of noise that was exposed for 0.2 s from `start`."""
     pixels = RNG.integers(90, 130, (64, 80)).astype(np.uint16)
     return Frame(sequence, start, 200 * MS, start + 250 * MS, pixels)
 
 
 def motion(status: StreakStatus = StreakStatus.RATE) -> FrameMotion:
-    """Return a motion from 12 streaks of which 10 were used."""
+    """Return a motion from 12 streaks, of which 10 were used."""
     if status is not StreakStatus.RATE:
         return FrameMotion(status, 98, 0.2)
     return FrameMotion(

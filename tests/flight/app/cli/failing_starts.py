@@ -1,10 +1,11 @@
 """Starts the link repeatedly in one process; in each start, different system calls fail.
 
-Run as `python -m tests.flight.app.cli.failing_starts FOLDER [all]`, in a process of its own: the hook that
-makes calls fail stays for the life of its process. The program prints one JSON object per start.
+`python -m tests.flight.app.cli.failing_starts FOLDER [all]` runs in a separate process, because the audit
+hook that makes calls fail cannot be removed. The program prints one JSON object per start.
 
-Opening files and sockets raises audit events before the call. With `all`, each call fails with each error,
-and calls without an audit event fail too; they are replaced in the modules that contain them.
+Python raises an audit event before it opens a file or a socket. If `all` is given, each call fails with each
+error, and calls without an audit event fail too. These calls are replaced by test doubles in the modules that
+use them.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from flight.link.process.station import Station
 from tests.support.linked_board import write_linked_config
 
 CALLS = frozenset({"open", "os.mkdir", "os.remove", "os.listdir", "os.scandir", "socket.bind"})
-"""Audit events (Python's documentation, "Audit events table"), each raised before its call."""
+"""Audit events (Python documentation, "Audit events table"), which Python raises before the call."""
 REPLACED: tuple[tuple[Any, tuple[str, ...]], ...] = (
     (os, ("read", "pwrite", "fsync", "ftruncate", "fstat", "stat", "lstat", "replace")),
     (fcntl, ("flock",)),
     (socket.socket, ("setsockopt", "listen", "setblocking")),
 )
-"""Calls without an audit event, by the module or class in which the product finds them."""
+"""Calls without an audit event, by the module or class whose attribute the link process calls."""
 ERRORS = (errno.EIO, errno.ENOSPC, errno.ENOENT, errno.EACCES, errno.EROFS)
 NETWORK_ERRORS = (errno.EADDRINUSE, errno.EADDRNOTAVAIL)
 
@@ -44,7 +45,7 @@ class Faults:
     """Injector of failing calls during the starts of a link.
 
     Attributes:
-        seen: the calls of the present start, each with its arguments.
+        seen: calls of the present start, each with its arguments.
         waits: number of times that the present start has waited.
     """
 
@@ -54,9 +55,9 @@ class Faults:
         self._error_of: Callable[[str, str], int] | None = None
 
     def start(self, error_of: Callable[[str, str], int]) -> None:
-        """Begin a start.
+        """Begin to count the calls of a new start.
 
-        `error_of` returns the error number of a call that must fail, and 0 for all others.
+        `error_of` returns the errno with which a call must fail, or 0 if the call must succeed.
         """
         self.seen, self.waits, self._error_of = [], 0, error_of
 
@@ -65,13 +66,13 @@ class Faults:
         self._error_of = None
 
     def hook(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Make the selected calls fail; this is the hook of `sys.addaudithook`. Raises OSError."""
+        """Make the selected calls fail with an OSError; `sys.addaudithook` takes this method as its hook."""
         if self._error_of is None or event not in CALLS:
             return
         self._fail(event, str(arguments[-1] if event == "socket.bind" else arguments[0]))
 
     def failing(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that fails if selected, like an audited call, and otherwise calls `called`."""
+        """Return a function that fails if the call is selected, and calls `called` if it is not."""
 
         def call(*arguments: Any, **named: Any) -> Any:
             if self._error_of is not None:
@@ -88,7 +89,7 @@ class Faults:
 
 
 def cases(faults: Faults, place: Path, complete: bool) -> Iterator[tuple[str, Callable[[str, str], int]]]:
-    """Yield the failing calls of each start, and their error."""
+    """Yield, for each start, a description of the failing calls and the function `error_of`."""
     for _ in range(2):  # the first start is not counted, because it imports modules
         yield "nothing", lambda *_: 0
     calls = list(faults.seen)
@@ -130,7 +131,7 @@ def run(place: Path, complete: bool = False) -> None:
         wait(self, problem, 0.0)
 
     sys.addaudithook(faults.hook)
-    # Only the start is tested, and its pauses are omitted.
+    # Only the start of the link is tested, and its pauses are omitted.
     with ExitStack() as stack:
         stack.enter_context(patch.object(Station, "run", run_shortly))
         stack.enter_context(patch.object(StartRetry, "wait", count_waits))

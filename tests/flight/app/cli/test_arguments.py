@@ -18,5 +18,5 @@ def test_the_commands_are_the_published_ones() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_has_its_published_arguments(name: str) -> None:
-    """Scripts and systemd units of users depend on these arguments."""
+    """The published arguments do not change, because users' scripts and systemd units depend on them."""
     assert arguments_of(f"flight.app.cli.{name}:configure") == PUBLISHED[name]

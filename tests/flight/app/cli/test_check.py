@@ -68,7 +68,7 @@ def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path)
 
 
 def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
-    """The simulated coils carry a hundredth of the configured current."""
+    """The check fails if the simulated coils carry a hundredth of the current that is configured."""
     world = {**yaml.safe_load(DEMO.read_text())["simulation"], "truth": {"resistance": [2300.0] * 3}}
     steps = [{"at": 0.0, "q2": 0.0}]
     done = command("check", write(tmp_path, DEMO, camera="none", duration=6.0, steps=steps, simulation=world))
@@ -114,7 +114,7 @@ def test_what_counts_as_a_problem_of_a_flight(
 
 @pytest.fixture(scope="module")
 def unit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Yield the device file of an emulated unit in a process of its own."""
+    """Yield the device file of an emulated IMU, which a separate process serves."""
     link = tmp_path_factory.mktemp("line") / "unit"
     words = [sys.executable, "-m", "sim_hal", "emulate", "vn100", "--link", str(link), "--duration", "60"]
     with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as server:
@@ -162,7 +162,10 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
 
 
 def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) -> None:
-    """The emulated IMU, which sends unasked, stands for a GPS receiver; an unconnected port is silent."""
+    """The check reads the GPS receiver of an orbit configuration.
+
+    A silent receiver is reported as missing.
+    """
     strings = [
         {"normal": normal, "address": address, "channel": channel}
         for normal, address, channel in (

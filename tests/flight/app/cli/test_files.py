@@ -1,4 +1,4 @@
-"""Tests of the subcommands of `knightcube files` over a real line: list, get, put, use and delete."""
+"""Tests of the subcommands of `knightcube files` over a UDP link: list, get, put, use and delete."""
 
 from __future__ import annotations
 

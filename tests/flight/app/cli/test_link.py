@@ -1,4 +1,4 @@
-"""Tests of `knightcube link` and `knightcube command --link` over real lines, and of their keys."""
+"""Tests of `knightcube link` and `knightcube command --link` over UDP, TCP and serial lines, and of keys."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ from tests.support.linked_board import ROOT, free_ports, write_linked_config
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    """Run a link process and a flight that executes every command; return the link's addresses and folder.
+    """Run a link process and a flight that executes every command; return addresses and folder of the link.
 
-    The addresses are of UDP, TCP and a serial line.
+    The link has a UDP address, a TCP address and a serial line.
     """
     place = tmp_path_factory.mktemp("link")
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
@@ -115,9 +115,10 @@ def test_a_command_goes_by_each_line_and_each_stage_is_shown(
 def test_authentic_frames_with_any_counter_end_no_process(
     lines: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A refused frame is not stored, because its replay would end the link after every restart.
+    """No counter of an authentic frame ends the link.
 
-    The highest counters come first, because only four refusals a second are reported.
+    A stored frame that ends the link would end it at each restart. The highest counters are sent first,
+    because the link reports only four refusals a second.
     """
     assert command(lines, "udp", "ping") == 0  # this command uses counter 0
     vault = Vault(Path(lines["place"]) / "keys" / "ground")
@@ -160,7 +161,8 @@ def test_a_key_is_changed_at_both_ends_also_when_the_answer_was_lost(
     assert new is not None
     assert old is not None
     assert new.generation == old.generation + 1
-    # Before the satellite's reply, the old key is active on the ground, and the new key is the next one.
+    # Emulate the state before the satellite's reply: the old key is active on the ground, and the new key is
+    # stored as the next key.
     vault.write(new, "1-next")
     vault.write(replace(new, generation=1, key=bytes(32)))
     assert command(lines, "udp", "new-key", "1") == 0
@@ -186,7 +188,7 @@ def test_a_ground_station_without_keys_commands_by_the_gateway_and_knows_its_com
     raw[7:15], raw[-CRC_BYTES:] = (
         bytes(8),
         bytes(CRC_BYTES),
-    )  # time and CRC are zero, because XTCE clients do not fill them
+    )  # time and CRC are zero, as in packets of XTCE clients
     reports: list[Report] = []
     came = b""
     with socket.create_connection(("127.0.0.1", gateway.port)) as station:
@@ -232,7 +234,7 @@ def test_wrong_use_is_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(os, "nice", int)  # otherwise all later tests would run with the link's low priority
+    monkeypatch.setattr(os, "nice", int)  # this process keeps its priority for the tests that follow
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     keys = f"{lines['place']}/keys/ground"
     assert main([word.format(keys=keys) for word in words]) == 2
@@ -247,7 +249,7 @@ def test_keys_are_never_overwritten(lines: dict[str, str], capsys: pytest.Captur
 
 
 def test_a_release_tests_its_link_without_a_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sandbox of knightcube-renewal.service allows sockets of the family AF_UNIX only."""
+    """The self-test of a release opens only sockets of AF_UNIX, which its sandbox permits."""
     opened = socket.socket.__init__
 
     def refusing(self: socket.socket, family: int = -1, *words: Any, **named: Any) -> None:

@@ -36,7 +36,7 @@ class Service:
         )
 
     def says(self, words: str) -> str:
-        """Return the next line on standard error, which must contain the given text."""
+        """Return the next line of the standard error, which must contain the given text."""
         assert self.process.stderr is not None
         line = self.process.stderr.readline()
         assert words in line
@@ -132,7 +132,7 @@ def test_no_line_is_opened_during_the_separation_inhibit(
 
 
 def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callable[[Path], Service]) -> None:
-    """The start waits for the configuration, for unmounted keys, and for the end of an old process."""
+    """The start waits for a configuration, for unmounted keys, and for the end of another link process."""
     whole = write_linked_config(place, udp="127.0.0.1:0")
     config = place / "later.yaml"
     keys, away = place / "keys" / "satellite", place / "away"
@@ -170,7 +170,7 @@ def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
 
 
 def test_each_call_of_a_start_fails_once_and_the_whole_disk_for_a_while(tmp_path: Path) -> None:
-    """The test makes calls fail like the campaign `start`, but without pauses."""
+    """The link starts although each of its calls fails once, or the whole disk fails for three attempts."""
     words = [sys.executable, "-m", "tests.flight.app.cli.failing_starts", str(tmp_path)]
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT, timeout=_LONGEST_S)
     starts = [json.loads(line) for line in done.stdout.splitlines()]

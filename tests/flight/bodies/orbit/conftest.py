@@ -19,7 +19,7 @@ from tests.support.held_motion import table_along
 
 @pytest.fixture(scope="module")
 def table() -> PointingTable:
-    """Return a table of the nadir pointing law."""
+    """Return a parameter table of the nadir pointing law."""
     times = STEP * np.arange(1.0, 20.0)
     wanted = references(LAW, ORBIT, times)
     return table_along(wanted, ORBIT.field_at(times), ORBIT.position_at(times), INERTIA, WEIGHTS)

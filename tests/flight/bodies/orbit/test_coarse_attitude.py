@@ -1,4 +1,4 @@
-"""Tests that solar strings and magnetic field start the filter, and that a dead string is reported."""
+"""Tests that solar strings and magnetic field initialise the filter, and that a dead string is reported."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MODEL = SolarCellsModel(np.concatenate([np.eye(3), -np.eye(3)]), np.full(6, 0.5)
 
 
 class Lit:
-    """A slowly rotating satellite at a fixed position, its filter, and its solar strings."""
+    """A slowly rotating satellite at a fixed position, with its filter and its solar strings."""
 
     def __init__(self, seed: int, sunlit: float = 1.0) -> None:
         self._sunlit = sunlit
@@ -59,7 +59,7 @@ class Lit:
         self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(EstimatedEnvironment, self))
         self.wrong: list[str | None] = []
         self.magnet: FloatArray = np.zeros(3)
-        self.begin_ns = 0  # time at which star fixes start the filter
+        self.begin_ns = 0  # time at which star fixes initialise the filter
 
     def at(self, _: int) -> FilterEnvironment:
         nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
@@ -120,7 +120,10 @@ def test_a_star_attitude_that_contradicts_a_coarse_one_replaces_it_at_once() -> 
 
 
 def test_a_filter_that_began_after_a_reading_of_the_strings_is_kept() -> None:
-    """Star fixes restart the filter shortly after the reading at 15.25 s, before this reading is checked."""
+    """A string reading from before a restart of the filter does not change the filter.
+
+    Star fixes restart the filter at 15.4 s, and the reading of 15.25 s is checked afterwards.
+    """
     lit = Lit(1)
     lit.begin_ns = 15_400_000_000
     lit.fly(16)

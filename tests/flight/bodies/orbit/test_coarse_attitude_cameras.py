@@ -1,4 +1,4 @@
-"""Tests that Sun and nadir of the horizon cameras start, update and correct the filter."""
+"""Tests that Sun and nadir from the horizon cameras initialise, update and correct the filter."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CAMERA = MountedCamera(Pinhole.from_field_of_view(64, 64, 1.0), np.array([0.0, 0
 
 
 class Still:
-    """A satellite at rest with a field measurement every 0.1 s, its filter, and its camera measurements."""
+    """A satellite at rest with a filter, a field measurement every 0.1 s, and horizon camera measurements."""
 
     def __init__(self, seed: int) -> None:
         self.attitude = normalise(np.random.default_rng(seed).standard_normal(4))
@@ -144,7 +144,8 @@ def test_one_false_horizon_is_refused_and_three_in_a_row_start_a_coarse_estimate
     for _ in range(CONTRADICTED + 2):
         craft.rest(1)
         rounds.append(craft.look(craft.seen(1e-3)))
-    # The Sun direction agrees because it lies near the axis of the error.
+    # The Sun direction does not contradict the estimate, because the error is a rotation about the Sun
+    # direction.
     assert not any(nadir for _, nadir in rounds[:CONTRADICTED])
     assert rounds[-1] == (True, True)
     assert craft.error < 0.01
@@ -182,7 +183,7 @@ def test_the_worker_gets_what_is_known_in_body_axes() -> None:
 
 
 def test_structure_learned_from_frames_is_known_to_the_next_job() -> None:
-    """The worker returns the structure map after each frame, even while the filter does not run."""
+    """The structure map that the worker returns is part of the next job, even if the filter does not run."""
     craft = Still(3)
     bright = np.full((64, 64), 200, dtype=np.uint8)
     for sequence in range(2):

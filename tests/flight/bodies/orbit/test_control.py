@@ -1,4 +1,4 @@
-"""Tests that Sun acquisition reports a missing Sun once, and that commands use estimated coil gains."""
+"""Tests that Sun acquisition reports a missing Sun once, and that commands account for coil gains."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FIELD = np.array([2e-5, 0.0, 3e-5])
 
 
 class Seen:
-    """The Sun acquisition's control law, with a record of its events."""
+    """The control law of Sun acquisition, with a record of its events."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []
@@ -87,6 +87,6 @@ def test_the_command_for_learned_coils_causes_the_wanted_dipole() -> None:
 
 
 def test_the_command_for_a_coil_that_seems_dead_stays_bounded() -> None:
-    """Until the coil monitor decides on the coil, the amplification of the command is bounded."""
+    """The command of a coil is divided by its estimated gain, but by no less than 0.7."""
     wanted = np.array([0.05, -0.02, 0.01])
     np.testing.assert_allclose(commanded(wanted, np.diag([1.0, 0.0, -1.0])), wanted / [1.0, 0.7, 0.7])

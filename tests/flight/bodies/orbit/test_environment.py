@@ -1,4 +1,4 @@
-"""Tests of the predicted environment: from elements or fixes, interpolation, refusal of false fixes."""
+"""Tests of the predicted environment: its source, its interpolation, and the refusal of false fixes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def elements() -> TwoLineElements:
 
 
 def reading(elements: TwoLineElements, time_ns: int, shift: FloatArray | None = None) -> GpsReading:
-    """Return a GPS fix at `time_ns` of a clock that begins at `UTC_NS`."""
+    """Return a GPS fix at the time `time_ns` of a clock whose zero is at `UTC_NS`."""
     utc_ns = UTC_NS + time_ns
     date = UNIX_EPOCH + utc_ns / (DAY * SECOND_NS)
     state, turn = elements.at(date), celestial_to_terrestrial(date)
@@ -105,7 +105,7 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
 
 @pytest.mark.parametrize("speed", [0.0, 0.9, 1.5])
 def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements, speed: float) -> None:
-    """The orbit would be below the surface or unbound."""
+    """A fix is refused if its orbit would be unbound or below the Earth's surface."""
     for known in (
         EstimatedEnvironment(elements, SimClock(UTC_NS)),
         EstimatedEnvironment(None, SimClock(UTC_NS)),
@@ -127,12 +127,12 @@ def dragged(drag: str) -> TwoLineElements:
 
 
 def ahead(degrees: float) -> TwoLineElements:
-    """Return elements of a satellite that is ahead of FIRST and SECOND on the same orbit."""
+    """Return the elements of a satellite on the same orbit as FIRST and SECOND, ahead of it by an angle."""
     return TwoLineElements(FIRST, summed(f"{SECOND[:43]}{(64.3547 + degrees) % 360.0:8.4f}{SECOND[51:]}"))
 
 
 class Flight:
-    """GPS receiver of a satellite that moves according to its true elements, read every ten seconds.
+    """The GPS receiver of a satellite that follows its true elements. It is read every ten seconds.
 
     The readings start `days` days after the epoch of the elements.
     """
@@ -143,7 +143,7 @@ class Flight:
         self.seconds = 0
 
     def reading(self, shift: FloatArray | None = None, seconds: float = 0.0) -> GpsReading:
-        """Return the present fix, shifted in position and in its UTC."""
+        """Return the fix at the present time, shifted in position and in UTC."""
         sound = reading(self.true, self.days_ns + self.seconds * SECOND_NS, shift)
         time_ns = self.seconds * SECOND_NS + GPS_DELAY_NS
         utc_ns = sound.utc_ns + round(seconds * SECOND_NS)
@@ -152,7 +152,7 @@ class Flight:
     def fly(
         self, duration: int, made: Callable[[], GpsReading], witness: Witness | None = None
     ) -> list[bool]:
-        """Return which of the fixes of the next `duration` seconds are used."""
+        """Return, for each fix of the next `duration` seconds, whether it was used."""
         used = []
         for _ in range(duration // 10):
             used.append(self.environment.fix(made(), witness))
@@ -160,7 +160,7 @@ class Flight:
         return used
 
     def off(self) -> tuple[float, float]:
-        """Return the error (m) of the present position, and its claimed standard deviation (m)."""
+        """Return the error (m) of the predicted present position, and its stated standard deviation (m)."""
         state = self.environment.state(self.seconds * SECOND_NS)
         assert state is not None
         return float(np.linalg.norm(state.position - self.true.at(state.julian_date).position)), state.sigma
@@ -169,9 +169,9 @@ class Flight:
 @pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
 @pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
 def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
-    """The elements have B* 0, but the satellite has a B* of 2.5e-4 or 5e-4.
+    """Good fixes replace elements that are 1 to 60 days old, and then refute a jump of the receiver by 40 km.
 
-    Later fixes are compared with earlier fixes.
+    The elements have B* 0, but the satellite has B* 2.5e-4 or 5e-4. Each fix is compared with earlier fixes.
     """
     flight = Flight(TwoLineElements(FIRST, SECOND), dragged(drag), age)
     off, sigma = flight.off()
@@ -187,7 +187,10 @@ def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(
 @pytest.mark.skipif(not INPUT.is_file(), reason="../shared/data/inputs/tle-bstar0-drag.txt is missing")
 @pytest.mark.parametrize("age", [4, 6, 30])
 def test_the_elements_of_the_report_do_not_outvote_good_fixes(age: int) -> None:
-    """The file has B* 0, the satellite B* 5e-4: the error is 226 km after 6 days, 5,514 km after 30 days."""
+    """Elements with B* 0 are replaced by good fixes of a satellite with B* 5e-4.
+
+    The elements have errors of 226 km after 6 days and 5,514 km after 30 days.
+    """
     first, second = INPUT.read_text(encoding="ascii").splitlines()
     true = TwoLineElements(summed(first[:53] + " 50000-3" + first[61:]), second)
     flight = Flight(TwoLineElements(first, second), true, age)
@@ -204,7 +207,7 @@ def test_the_elements_of_the_report_do_not_outvote_good_fixes(age: int) -> None:
 
 @pytest.mark.parametrize("degrees", [1.0, 15.0, -120.0])
 def test_consistent_fixes_replace_elements_that_they_contradict(degrees: float) -> None:
-    """The elements are those of another satellite or of a time before a manoeuvre."""
+    """Elements of another satellite, or from before a manoeuvre, are replaced by consistent fixes."""
     flight = Flight(ahead(degrees), TwoLineElements(FIRST, SECOND))
     flight.fly(50, lambda: flight.reading(np.array([2e5, 0.0, 0.0])))
     used = flight.fly(600, flight.reading)
@@ -221,7 +224,7 @@ def test_consistent_fixes_replace_elements_that_they_contradict(degrees: float) 
 @pytest.mark.parametrize("shift", [(7e3, 0.0, 0.0), (0.0, -3e4, 0.0), (0.0, 2e5, 3e5)])
 @pytest.mark.parametrize("days", [6, 30])
 def test_a_shifted_receiver_is_not_confirmed(days: int, shift: tuple[float, float, float]) -> None:
-    """These positions and velocities do not belong to an orbit, at any age of the elements."""
+    """Fixes with shifted positions are refused, because shifted positions and velocities form no orbit."""
     flight = Flight(TwoLineElements(FIRST, SECOND), dragged(" 50000-3"), days)
     assert not any(flight.fly(1200, lambda: flight.reading(np.array(shift))))
     off, sigma = flight.off()
@@ -269,7 +272,7 @@ def strength(flight: Flight, elements: TwoLineElements) -> float:
 
 
 def test_the_field_decides_between_elements_and_a_consistent_false_orbit() -> None:
-    """The magnetometer reveals a position error of a quarter of an orbit, and confirms the true position."""
+    """The field strength refutes fixes that are wrong by a quarter of an orbit, and confirms true fixes."""
     there, here = ahead(90.0), TwoLineElements(FIRST, SECOND)
     for known, true, used in ((here, there, False), (there, here, True)):
         flight = Flight(known, true)
@@ -286,7 +289,10 @@ def test_a_magnetometer_that_contradicts_both_orbits_decides_nothing() -> None:
 
 
 def test_the_sun_refutes_an_orbit_in_the_shadow() -> None:
-    """At half past ten the orbit is sunlit at its start, and in the shadow half a revolution later."""
+    """One half of the orbit is in sunlight and the other half in shadow.
+
+    Sunlight refutes an orbit in shadow.
+    """
     lit, dark = TwoLineElements(FIRST, SECOND), ahead(180.0)
     used = {}
     for name, known, true in (("dark", lit, dark), ("lit", dark, lit)):

@@ -25,9 +25,9 @@ DOUBLED = tuple(
         ((0.0, 0.0, -1.0), 30.0, 0.1),
     )
 )
-"""Three axes of which z has two unequal coils, in opposite directions."""
+"""Three axes; the axis z has two unequal coils in opposite directions."""
 SECONDS, BROKEN, FIELD = 20.0, 36.0, 3.0e-5
-"""Duration (s) of a flight with healthy coils, and of a flight with a coil failure after 10 s; field (T)."""
+"""Durations (s) of a flight with healthy coils and of a flight whose coil fails after 10 s, and field (T)."""
 
 
 @pytest.mark.parametrize("name", ["orbit_2u", "orbit_6u", "orbit_12u", "orbit_1u_tilted"])
@@ -44,7 +44,7 @@ def test_an_example_detumbles_with_currents_within_the_limit_of_each_coil(name: 
     removed = (momentum[0] - momentum[-1]) / (SECONDS * FIELD * float(config.coils.map().limits.mean()))
     assert removed > 0.2, "a fifth of what the mean dipole limit across a typical field would remove"
     assert not {row["name"] for row in run["event"]} & {b"coil-broken", b"coil-suspect", b"coil-corrected"}
-    # The true coils differ from the configured ones by their gains and directions only.
+    # The true coils differ from the configured coils only by their gains and directions.
     true = run["true_description"]["coils"][0].reshape(3, 3)
     assert np.abs(true - np.eye(3)).max() < 0.45
 
@@ -53,7 +53,7 @@ def test_an_example_detumbles_with_currents_within_the_limit_of_each_coil(name: 
 def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     windings: tuple[Winding, ...] | None, tmp_path: Path
 ) -> None:
-    """The cases are a pyramid of four rods, and three axes with two different coils along one of them."""
+    """The tested satellites have a pyramid of four rods, or three axes with two unequal coils on one axis."""
     path, broken = FOLDER / "orbit_6u_redundant.yaml", 3
     config = without_cameras(as_orbit(configuration.load(path)), BROKEN)
     if windings is not None:
@@ -68,22 +68,22 @@ def test_a_satellite_with_four_coils_flies_on_when_one_of_them_fails(
     assert np.isnan(told["written"][:, 4:]).all()
     before = true["time_ns"] < 10_000_000_000
     limits = np.array(config.coils.limits)
-    # The emulated bridges drive each coil, and the telemetry reports it.
+    # The emulated bridges drive all four coils, and the telemetry reports the current of each coil.
     assert (np.abs(true["current"][before, :4]).max(axis=0) > 0.3 * limits).all()
     assert (np.abs(true["current"][:, :4]).max(axis=0) <= limits * (1.0 + 1e-6)).all()
-    # The current written in a cycle flows until the next cycle, with an error of the supply.
+    # The current that is commanded in a cycle flows until the next cycle, within the error of the supply.
     told_before = told[told["time_ns"] < 9_900_000_000]
     flowing = true["current"][np.searchsorted(true["time_ns"], told_before["time_ns"] + 25_000_000), :4]
     assert np.abs(flowing - told_before["written"][:, :4]).max() < 0.01
     assert run["truth"]["current"] == pytest.approx(true["current"][:, :3], abs=1e-7)
-    # The fourth coil is isolated, and the remaining coils continue to damp the body.
+    # The fourth coil is isolated, and the other three coils continue to damp the rotation.
     (event,) = [row for row in run["event"] if row["name"] == b"coil-broken"]
     assert event["text"].startswith(b"coil 4 open")
     assert event["time_ns"] < 25_000_000_000
     assert int(run["health"]["coils_in_use"][-1]) == 0b0111
     after = told["time_ns"] > event["time_ns"] + 1_000_000_000
     assert not told["command"][after, broken].any()
-    # The estimated parameters of four coils are not valid for three coils.
+    # Parameters that were estimated with four coils are not valid for three coils.
     told_of = run["description"]
     place = np.searchsorted(told_of["time_ns"], event["time_ns"])
     learned, anew = told_of["coils_sigma"][place - 1], told_of["coils_sigma"][place]

@@ -1,4 +1,4 @@
-"""Tests that the satellite's filter uses star fixes at their times, starts with them and restarts."""
+"""Tests of the satellite's filter: star fixes are used at their times, and start or restart the filter."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def around(_: int) -> FilterEnvironment:
 
 
 class Flown:
-    """A simulated body with coils, integrated by several Euler steps per reading, and its filter."""
+    """A simulated body with coils and its filter; each reading follows several Euler steps."""
 
     def __init__(
         self, pulses: bool = False, errors: BodyErrors | None = None, slow: SlowStates | None = None
@@ -78,15 +78,15 @@ class Flown:
         self.attitude, self.rate, self.time_ns = IDENTITY, SPIN, 0
         self.attitudes = {0: IDENTITY}
         self._pulses = pulses
-        self.carries = 1.0  # true dipole of the coils relative to the commanded dipole
-        self.rests = False  # no dipole is commanded
-        self.alternates = False  # the dipole alternates between x and -z
-        self.field: FloatArray | None = None  # field that a stuck magnetometer repeats
-        self.magnet: FloatArray = np.zeros(3)  # T, added to the field
+        self.carries = 1.0  # ratio of the coils' true dipole to the commanded dipole
+        self.rests = False  # if set, the commanded dipole is zero
+        self.alternates = False  # if set, the commanded dipole alternates between +x and -z
+        self.field: FloatArray | None = None  # field (T) that a stuck magnetometer repeats
+        self.magnet: FloatArray = np.zeros(3)  # error (T) that is added to the field
         self.has_gyro = True
 
     def fly(self, seconds: float) -> None:
-        """Simulate some time; with pulses the coils act for 0.8 s of each second."""
+        """Simulate for some time. If the coils are pulsed, they are driven for 0.8 s of each second."""
         for _ in range(round(seconds * SECOND_NS / PERIOD_NS)):
             acts = self._pulses and not self.rests and self.time_ns % SECOND_NS >= 200_000_000
             dipole = np.array([DIPOLE if acts else 0.0, 0.0, 0.0])
@@ -106,7 +106,7 @@ class Flown:
     def _acceleration(self, mx: float, my: float, mz: float) -> FloatArray:
         """Return the angular acceleration (3,), rad/s^2, under a dipole, A m^2.
 
-        Floats are faster than arrays here.
+        The method uses floats, because they are faster than arrays of three elements.
         """
         bx, by, bz = (attitude_matrix(self.attitude) @ FIELD).tolist()
         wx, wy, wz = self.rate.tolist()
@@ -120,7 +120,7 @@ class Flown:
         )
 
     def stars(self, time_ns: int, off: FloatArray | None = None) -> AttitudeMeasurement:
-        """Return the star attitude at a past time with the error `off` (3,), rad."""
+        """Return the star attitude at a past time, with an error of `off` (3,), rad."""
         error = STAR * self.generator.standard_normal(3) + (0.0 if off is None else off)
         seen = multiply(from_rotation_vector(error), self.attitudes[time_ns])
         return AttitudeMeasurement(time_ns, seen, STAR**2 * np.eye(3), by_stars=True)
@@ -162,9 +162,9 @@ def test_a_propagated_estimate_can_be_replaced_copied_and_pickled(
 
 
 def acquired(pulses: bool = False) -> Flown:
-    """Return a body whose filter has started with a star attitude 0.6 s old and received more every 5 s.
+    """Return a body whose filter has received star attitudes every 5 s; the first was 0.6 s old.
 
-    The body is a copy, so that a test cannot change the body of another test.
+    The body is a copy, so that no test changes the body of another test.
     """
     return deepcopy(_acquired(pulses))
 
@@ -195,7 +195,10 @@ def test_stars_of_over_a_second_ago_are_applied_at_their_own_time(pulses: bool) 
 
 
 def test_within_a_step_a_fast_body_is_propagated_by_the_learned_coils_in_the_rotating_field() -> None:
-    """The coils carry 1.2 times their command, and the body rotates by several degrees within a step."""
+    """Between two steps, the filter predicts the rate of a fast body from coil gains and the rotating field.
+
+    The true gain is 1.2, and the body rotates by several degrees within a step.
+    """
     flown = Flown(pulses=True, errors=BodyErrors(moments=0.0, axes=0.0))
     flown.rate, flown.carries = np.array([0.08, -0.1, 0.06]), 1.2
     flown.fly(3.0)
@@ -220,7 +223,7 @@ def test_the_claim_of_the_star_camera_is_that_of_the_present_and_not_of_the_last
     for seconds in (1.5, 0.7):
         flown.fly(seconds)
         found = flown.filter.description(flown.time_ns)["camera_attitude_sigma"]
-        # Without misalignment, the attitudes of camera and body have the same uncertainty.
+        # Without camera misalignment, the attitudes of camera and body have the same uncertainty.
         present = flown.filter.at(flown.time_ns).covariance[ATTITUDE, ATTITUDE]
         assert found == pytest.approx(np.sqrt(present.diagonal()))
         claims.append(found)
@@ -257,9 +260,9 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
 
 @pytest.mark.parametrize("wrong", [-2e-3, 1.5e-3])
 def test_stars_replace_a_wrong_bias_of_an_earlier_boot_within_half_a_minute(wrong: float) -> None:
-    """The stored bias has a claimed uncertainty of 1e-5 rad/s.
+    """A wrong stored bias with a stated uncertainty of 1e-5 rad/s is replaced within 30 s.
 
-    Star fixes contradict it and restart the filter.
+    Star fixes contradict the bias and restart the filter.
     """
     prior = FreeFilterSettings().error_state(INERTIA).prior[SLOW, SLOW].copy()
     values, bias = np.zeros(len(prior)), slice(GYRO.start - SLOW.start, GYRO.stop - SLOW.start)
@@ -280,7 +283,7 @@ ACCURACY = BodyErrors(moments=0.1, axes=0.05, coil_gain=0.2, coil_axes=0.05)
 
 
 def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
-    """Return the states of an earlier boot: value and standard deviation of some elements, by index."""
+    """Return the stored states of an earlier boot, with given values and standard deviations by index."""
     covariance = FreeFilterSettings(errors=ACCURACY).error_state(INERTIA).prior[SLOW, SLOW].copy()
     values = np.zeros(len(covariance))
     for index, (value, sigma) in stored.items():
@@ -290,8 +293,8 @@ def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
     return SlowStates(values, covariance)
 
 
-# Stored estimates of the inertia errors (relative to the trace), which are wrong by 10 or 15 % of a principal
-# moment.
+# Stored estimates of the inertia errors, relative to the trace. They differ from the truth by 10 or 15 % of a
+# principal moment.
 WRONG_INERTIA = {INERTIA_ERROR.start: (0.052, 1e-4), INERTIA_ERROR.start + 1: (-0.034, 1e-4)}
 KNOWN_COILS = {index: (0.0, 5e-3) for index in range(COILS.start, COILS.stop)}
 
@@ -326,7 +329,7 @@ def test_the_motion_replaces_wrong_learned_values_after_a_minute_and_healthy_one
 
 
 def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:
-    """A failing vision worker may send such attitudes. Invalid attitudes must not stop the control task."""
+    """A failing vision worker may send attitudes with NaN. They must not stop the control task."""
     flown = acquired()
     for _ in range(2 * REFUSALS_TO_RESTART):
         flown.fly(2.0)
@@ -353,7 +356,10 @@ def test_currents_that_may_not_have_flown_widen_the_claim() -> None:
 
 
 def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
-    """A coil fails in the middle of a step, which the gyro makes visible."""
+    """The attitude error stays within 5 sigma if a coil fails in the middle of a step.
+
+    The gyro measures the effect.
+    """
     flown = acquired(pulses=True)
     flown.carries = 0.0
     flown.fly(7.5)
@@ -364,9 +370,9 @@ def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_cl
 
 
 def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim() -> None:
-    """A coil has a third of the commanded dipole, which is not visible to the gyro.
+    """Star fixes that contradict the commanded dipole are accepted, and increase the uncertainty.
 
-    The filter must not refuse correct star fixes because of the wrong dipole.
+    Coil x has 0.3 times the commanded dipole, which the gyro alone does not show.
     """
     flown = acquired(pulses=True)
     flown.carries = 0.3
@@ -379,7 +385,10 @@ def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim
 
 
 def test_commands_that_were_doubted_are_tried_again_after_a_rest() -> None:
-    """Coils that are not trusted stay off, so without a trial they could not prove that they work again."""
+    """After 5 to 13 s without a dipole, the filter trusts the commands again.
+
+    Untrusted coils stay off, so only a new trial can show that they work.
+    """
     flown = acquired(pulses=True)
     flown.carries = -3.0
     flown.fly(6.0)
@@ -409,13 +418,13 @@ def test_a_magnetometer_that_repeats_its_value_or_is_false_is_doubted_and_left_o
 
 
 def _coil_x(flown: Flown) -> tuple[float, float]:
-    """Return the estimated gain of coil x and its standard deviation."""
+    """Return the estimated gain of coil x, and the standard deviation of this gain."""
     found = flown.filter.description(flown.time_ns)
     return float(found["coils"][0]), float(found["coils_sigma"][0])
 
 
 def test_a_correction_of_a_coil_is_applied_in_the_currents_and_not_in_the_learned_matrix_as_well() -> None:
-    """The filter has estimated a gain of 0.8 before the coil monitor multiplies the dipole by 0.8."""
+    """If the coil monitor corrects a gain of 0.8, the filter resets its own estimate of this gain to 1."""
     flown = acquired(pulses=True)
     flown.carries = 0.8
     for _ in range(10):
@@ -427,7 +436,7 @@ def test_a_correction_of_a_coil_is_applied_in_the_currents_and_not_in_the_learne
     gain, sigma = _coil_x(flown)
     assert gain == pytest.approx(1.0, abs=0.15)
     assert sigma > 0.05
-    flown.carries = 1.0  # the commanded currents include the correction of the coil
+    flown.carries = 1.0  # the commanded currents now include the correction
     assert flown.see(60 * PERIOD_NS), "a measurement from before the correction"
     for _ in range(6):
         flown.fly(5.0)
@@ -466,13 +475,13 @@ def test_the_dipole_of_a_corrected_coil_is_unknown_in_the_steps_before() -> None
 
 
 def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_less_certain() -> None:
-    """The currents of four coils have the least heat of all coils, or of all coils that are not isolated."""
+    """If the currents of redundant coils are not those of least heat, the dipole is less certain."""
     flown = acquired()
     pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
     coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
     errors = BodyErrors(coil_gain=0.2)
     settings = replace(flown.filter._settings, coils=coils, free=FreeFilterSettings(errors=errors))
-    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # currents that together have zero dipole
+    idle = 0.02 * np.array([1.0, -1.0, 1.0, -1.0])  # currents whose total dipole is zero
     linear = coils.currents(np.array([DIPOLE, 0.0, 0.0]))
     doubts = []
     for used, currents in (
@@ -488,12 +497,12 @@ def test_currents_that_redundant_coils_do_not_share_linearly_make_the_dipole_les
             filter_.accept(flown._reading_at(cycle * PERIOD_NS))
             filter_.command((cycle + 1) * PERIOD_NS, currents)
         doubts.append(filter_._steps[0].doubt)
-    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils with sqrt(3) A m^2 per ampere
+    expected = 0.2 * 0.02 * np.sqrt(12.0) / 3.0  # four coils of sqrt(3) A m^2 per ampere
     assert doubts == pytest.approx([0.0, expected, 0.0], abs=1e-12)
 
 
 def test_a_correction_of_redundant_coils_widens_the_present_estimate() -> None:
-    """The dipole of a corrected coil was unknown before, which the uncertainty of the estimate includes."""
+    """A correction of a coil increases the uncertainty, because earlier dipoles of the coil are uncertain."""
     pyramid = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0], [1.0, 1.0, 1.0, 1.0]])
     coils = CoilMap(pyramid, np.full(4, 0.1), np.full(4, 30.0))
     currents, flown, sigmas = coils.currents(np.array([DIPOLE, 0.0, 0.0])), Flown(), []
@@ -516,7 +525,10 @@ TUMBLE = np.array([0.02, -0.05, 0.03])
 def test_star_fixes_give_attitude_and_rate_of_a_tumbling_body_without_a_gyro(
     pulses: bool, every: float
 ) -> None:
-    """The first fix has no rate about the field; the second one must not discard the first."""
+    """Without a gyro, star fixes every 2 or 5 s determine attitude and rate of a tumbling body.
+
+    The first fix leaves the rate about the field unknown. The second fix must not discard the first.
+    """
     flown = Flown(pulses)
     flown.rate, flown.has_gyro = TUMBLE, False
     flown.fly(3.0)
@@ -554,7 +566,7 @@ def test_a_gyro_that_dies_and_recovers_within_the_flight_leaves_an_honest_estima
 
 
 def test_the_magnetometer_gives_the_rate_while_nothing_else_does() -> None:
-    """A direction is propagated by the magnetometer's rate only once this rate is known."""
+    """A direction is not propagated until the magnetometer has determined the rate about all axes."""
     flown = Flown()
     flown.rate, flown.has_gyro = TUMBLE, False
     assert flown.filter.rate_by_field() is None
@@ -571,7 +583,10 @@ def test_the_magnetometer_gives_the_rate_while_nothing_else_does() -> None:
 
 @pytest.mark.parametrize("renewed", [True, False])
 def test_another_magnetometer_begins_without_the_learned_bias(renewed: bool) -> None:
-    """A filter that keeps the bias of the first magnetometer refuses the fields of the second one."""
+    """The filter discards the bias of a replaced magnetometer.
+
+    With the old bias it would refuse the new readings.
+    """
     flown = Flown(pulses=True)
     flown.rate, flown.magnet = TUMBLE, np.array([6e-7, 0.0, -6e-7])
     flown.fly(3.0)

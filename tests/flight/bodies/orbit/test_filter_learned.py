@@ -1,4 +1,4 @@
-"""Tests that estimated parameters are the prior of the next boot, with variances that grow with age."""
+"""Tests that estimated parameters are the prior of the next boot, with variances that increase with age."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ THEN, CHANGED = 1.78e9, 0.05
 
 
 def known(share: float = 0.1) -> SlowStates:
-    """Return parameters known to a fraction of their prior sigmas, with correlated dipole parts."""
+    """Return parameters with `share` of their prior standard deviations, and correlated dipole components."""
     sigma = share * START
     together = np.eye(len(sigma))
     dark, lit = DIPOLE.start - GYRO.start, SUNLIT.start - GYRO.start
@@ -53,17 +53,17 @@ def known(share: float = 0.1) -> SlowStates:
 
 
 def stored(slow: SlowStates) -> dict[str, Learned]:
-    """Return parameters after storing and reading them."""
+    """Return parameters as they are read after they were stored."""
     return decode(encode(1, StoredState(learned=learned_of(slow, THEN)))).state.learned
 
 
 def grown(age: float) -> FloatArray:
-    """Return the variances, after an age (s), of parameters known to a tenth of their prior sigma."""
+    """Return the variances, after an age (s), of parameters once known to a tenth of their prior sigma."""
     return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2 + thinned(age).diagonal())
 
 
 def thinned(age: float) -> FloatArray:
-    """Return the covariance of the states due to changes of the air density during an age, s."""
+    """Return the covariance (growth during an age, s) of the torques due to changes of the air density."""
     changed, at = np.zeros_like(PRIOR), slice(TORQUES.start - GYRO.start, TORQUES.stop - GYRO.start)
     changed[at, at] = age * density_walk(0.5 * START[at])
     return changed

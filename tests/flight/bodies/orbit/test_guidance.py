@@ -1,4 +1,4 @@
-"""Tests of when slews and paths are planned, and of which part of a path is executed."""
+"""Tests of the times at which slews and paths are planned, and of the part of a path that is executed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def paths() -> PointingPaths:
 
 ALL = np.ones(3, dtype=bool)
 COILS = CoilMap(0.8 * np.eye(3), np.full(3, 0.5), np.array([10.0, 20.0, 30.0]))
-"""Coils with a limit of 2 LIMIT, which are driven half of the time."""
+"""Coils with a limit of 2 LIMIT each, which are driven for half of the time."""
 
 
 def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int, usable: BoolArray = ALL) -> PointingJob:
@@ -65,9 +65,9 @@ def submitted(
     usable: BoolArray = ALL,
     told: list[str] | None = None,
 ) -> list[PointingJob]:
-    """Return the jobs that a planner submits for a goal while these coils (n,) are not isolated.
+    """Return the jobs that a planner submits for a goal if only the given coils (n,) are usable.
 
-    The texts of the planner's events are appended to `told`.
+    The texts of the planner's events are added to `told`.
     """
     jobs: list[PointingJob] = []
 
@@ -161,7 +161,7 @@ def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, 
 
 
 def _fast_from(path: AttitudeReferences, place: int) -> AttitudeReferences:
-    """Return a path that rotates at 0.2 rad/s from an instant on."""
+    """Return a copy of a path that rotates at 0.2 rad/s from the sample number `place` on."""
     rate = path.rate.copy()
     rate[place:] = [0.2, 0.0, 0.0]
     return replace(path, rate=rate)

@@ -1,4 +1,4 @@
-"""Tests that an object is searched for, followed, predicted while lost, and given up with a reason."""
+"""Tests that an object is searched for, followed, predicted while it is lost, and given up with a reason."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ BLINK = 0.05
 
 @dataclass
 class Chase:
-    """A simulated rigid body in the magnetic field, with immediate plans and simulated sightings.
+    """A simulated rigid body in the magnetic field. Plans are available at once, and sightings are simulated.
 
-    The object starts `begin` deg from the boresight and moves at `rate` deg/s towards `across`.
+    The object starts at `begin` deg from the boresight and moves at `rate` deg/s in the direction `across`.
     """
 
     inertia: FloatArray
@@ -110,12 +110,12 @@ class Chase:
 
 
 def chase(craft: tuple[FloatArray, float], rate: float, begin: float) -> Chase:
-    """Return a pursuit of an object that needs no torque along the field."""
+    """Return a pursuit of an object that the coils can follow without a torque along the field."""
     strength = FIELD.field_at(np.zeros(1))[0]
     up = strength / np.linalg.norm(strength)
     first = np.cross(up, np.array([0.3, -0.5, 0.8]))
     first /= np.linalg.norm(first)
-    # If the boresight is along the field, the coils can rotate it about both perpendicular axes.
+    # With the boresight along the field, the coils can rotate the boresight about both perpendicular axes.
     rows = np.stack([first, -up, np.cross(first, -up)])
     return Chase(*craft, rate, begin, from_matrix(rows), first)
 
@@ -169,7 +169,10 @@ def test_where_it_is_looked_for_is_what_was_ordered_else_where_the_camera_looks(
 
 
 def test_the_boresight_stays_where_an_object_is_looked_for_whatever_axis_the_body_points() -> None:
-    """With small weights of the rotation about +z, the optimal path deviates by up to 7 deg."""
+    """The boresight stays on the search direction, whichever body axis is the pointing axis.
+
+    If the weights of the rotation about +z were small, the optimal path would deviate by up to 7 deg.
+    """
     rng = np.random.default_rng(3)
     for attitude in rng.normal(size=(5, 4)):
         spin = 3.5e-4 * np.array([0.4, -0.5, 0.8])

@@ -1,4 +1,4 @@
-"""Tests that the remaining slew is planned again, and replaces the current plan without a jump."""
+"""Tests that the rest of a slew is planned again, and that the new plan follows the old without a jump."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def slew() -> PointingTable:
 
 
 class Flight:
-    """A planner whose worker is replaced by the list of its jobs."""
+    """A planner without a worker. The submitted jobs are kept in a list."""
 
     def __init__(self, inertia: Any = LEARNED) -> None:
         self.jobs: list[PointingJob] = []

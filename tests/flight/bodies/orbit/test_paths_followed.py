@@ -1,4 +1,4 @@
-"""Tests that a slew along a pointing path lasts until its arrival, which is reported once."""
+"""Tests that a slew along a pointing path ends at its arrival, and that the arrival is reported once."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def table(horizon: float | None, fastest: float = 0.005) -> Any:
 
 @pytest.fixture
 def paths(monkeypatch: pytest.MonkeyPatch) -> PointingPaths:
-    """Return paths whose law begins 4 s and ends 500 s after the origin of its table."""
+    """Return paths whose control law is valid from 4 s to 500 s after the origin of its table."""
     monkeypatch.setattr(guidance, "PointingLaw", lambda *_: SimpleNamespace(span=(4.0, 500.0)))
     return PointingPaths(0.1, 0.01)
 

@@ -1,4 +1,4 @@
-"""Tests of filter steps: integrals of the commanded dipole, and readings with and without a rate."""
+"""Tests of filter steps: integral of the commanded dipole, and steps with and without a gyro rate."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AROUND = FilterEnvironment(NOTHING, np.ones(3), Pressures(np.zeros((1, 3)), np.z
 
 
 def reading(time_ns: int, rate: float) -> ImuReading:
-    """Return a reading with the same rate about each axis."""
+    """Return a reading with the same rate about all axes."""
     return ImuReading(time_ns, time_ns, time_ns, IDENTITY, np.full(3, rate), NOTHING, NOTHING)
 
 
@@ -37,7 +37,7 @@ def test_a_step_averages_only_the_valid_gyro_rates(dead_from: int) -> None:
     assert found.spread is None
     assert found.gyro == pytest.approx(np.full(3, 0.1 * (dead_from - 1)))
     assert found.gyro_ns == 50 * (dead_from + 1)
-    # The impulse covers the whole step, whether or not the last reading has a rate.
+    # The impulse covers the whole step, even if the last reading has no rate.
     assert found.impulse[0] == pytest.approx(1.0 - totals[:dead_from, 0].mean())
 
 
@@ -53,7 +53,11 @@ def test_the_mean_dipole_is_that_on_the_wire() -> None:
 
 
 def test_the_impulse_of_a_dipole_is_that_by_which_a_rate_differs_from_its_mean() -> None:
-    """The dipole acts in the last quarter of a second, so the mean rate contains an eighth of its effect."""
+    """The impulse of a dipole is the final rate minus the mean rate that the dipole causes.
+
+    A dipole in the last quarter of a second changes the mean rate by an eighth of its effect on the final
+    rate.
+    """
     history = DipoleHistory(10 * SECOND_NS)
     history.record(0, (0.0, 0.0, 0.0), True)
     history.record(3 * SECOND_NS // 4, (0.0, 0.08, 0.0), True)

@@ -1,4 +1,4 @@
-"""Tests of the satellite's targets, which are set by mission time or command, or are the present attitude."""
+"""Tests that the satellite's target is set by mission time, by a command, or to the present attitude."""
 
 from __future__ import annotations
 

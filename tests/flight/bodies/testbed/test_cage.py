@@ -1,4 +1,4 @@
-"""Tests of the flight software's coil cage model: its field, and torques of two coils."""
+"""Tests of the coil cage model in the flight software: its field, and the torques of two coils."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def _field(config: TestbedConfig, section: Simulation) -> CageField:
 def test_the_predicted_field_is_the_simulators_within_what_models_and_coils_differ(
     config: TestbedConfig, section: Simulation
 ) -> None:
-    """The software uses WMM2025 and SGP4, and the simulator IGRF-14, a ring current and J2."""
+    """The field of the flight software (WMM2025, SGP4) is within 1.5 uT of the simulator's.
+
+    The simulator uses IGRF-14, a ring current and an orbit with J2.
+    """
     assert section.cage is not None
     assert config.cage is not None
     believed, true = (
@@ -67,12 +70,12 @@ def test_the_local_frame_looks_down_and_ahead() -> None:
     assert np.linalg.det(frame) == pytest.approx(1.0)
     assert frame @ np.array([-1.0, 0.0, 0.0]) == pytest.approx([0.0, 0.0, 1.0], abs=1e-12)
     assert frame @ np.array([0.0, 1.0, 0.0]) == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
-    # Body y points opposite to the orbit normal, which is +z.
+    # The axis y points opposite to the orbit normal, which is +z.
     assert frame[1] == pytest.approx([0.0, 0.0, -1.0], abs=1e-12)
 
 
 class _Fixed:
-    """A constant field, a sensor with a constant angle, and a tracker with a constant current."""
+    """A test double of field, sensor and tracker with a constant field, angle and current."""
 
     def __init__(self, field: FloatArray, angle: float, current: float) -> None:
         self._field, self._angle, self._current = field, angle, current
@@ -88,14 +91,17 @@ class _Fixed:
         return CoilCommand(currents, currents, False)
 
     def reset(self) -> None:
-        """Do nothing: the law has no state."""
+        """Do nothing, because the law has no state."""
 
 
 @pytest.mark.parametrize("direction", np.linspace(0.0, 2.0 * np.pi, 9))
 def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less_current(
     config: TestbedConfig, direction: float
 ) -> None:
-    """The torque is also available if the field is along body x, where coil x alone causes none."""
+    """Two coils give the torque that was commanded of coil x, in any field direction and with less current.
+
+    This torque is available even if the field is along body x, where coil x alone gives no torque.
+    """
     plant, dipole = plant_of(config), config.plant.coil_turns * config.plant.coil_area
     for angle in (-0.6, 0.0, 0.4):
         field = 1.1 * config.plant.field * np.array([np.sin(direction), 0.0, np.cos(direction)])

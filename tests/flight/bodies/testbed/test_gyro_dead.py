@@ -1,4 +1,4 @@
-"""Tests of the testbed without a gyro: angle by magnetometer, coil field, and control by covariance."""
+"""Tests of the testbed without a gyro: angle from the magnetometer, coil field, and control by covariance."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def feed_of(field: FloatArray = FIELD) -> tuple[UnitFeed, AttitudeFilter]:
 
 
 def reading(time_ns: int, field: FloatArray, rate: float = math.nan) -> ImuReading:
-    """Return a reading whose own attitude is wrong, so that only the field can give the angle."""
+    """Return a reading with a wrong attitude, so that only its field can give the angle."""
     wrong = about_axis_y(2.0)
     return ImuReading(time_ns, time_ns, time_ns, wrong, np.full(3, rate), field, np.zeros(3))
 
@@ -66,7 +66,10 @@ def test_a_weak_field_gives_no_heading() -> None:
 
 
 def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_weight() -> None:
-    """After 5 s, the error of 0.1 rad due to the coils' field is below the claimed uncertainty."""
+    """A field error of 0.1 rad that the coils cause for 5 s moves the estimate by less than 2 sigma.
+
+    With the coils off, the magnetometer has its full weight again.
+    """
     feed, filter_ = feed_of()
     for step in range(40):
         feed.accept(reading(step * PERIOD_NS, FIELD))
@@ -86,7 +89,10 @@ def test_the_field_of_the_coils_hardly_moves_the_estimate_and_rest_restores_its_
 
 @pytest.mark.parametrize("current", [0.0, 0.05])
 def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: float) -> None:
-    """Between two measurements with coils off, inaccurate measurements with driven coils are accepted."""
+    """An estimate is discarded if measurements with coils off contradict it repeatedly.
+
+    Inaccurate measurements with driven coils, in between, are accepted.
+    """
     feed, filter_ = feed_of()
     for step in range(40):
         feed.accept(reading(step * PERIOD_NS, FIELD))
@@ -99,7 +105,7 @@ def test_an_estimate_that_the_resting_coils_field_refutes_is_discarded(current: 
         filter_.command((step + 2) * PERIOD_NS, np.zeros(3))
         held.append(feed.accept(reading((step + 5) * PERIOD_NS, turned)).holds)
         step += 6
-    # If coils are driven, only every other measurement is made with coils off.
+    # With driven coils, only every other measurement is made with the coils off.
     assert held.index(True) == (8 if current else 4)
     assert angle_about_axis_y(filter_.at(step * PERIOD_NS).quaternion) == pytest.approx(2.5, abs=0.1)
 
@@ -128,7 +134,7 @@ def test_a_magnetometer_replaces_a_silent_unit_until_the_unit_answers_again() ->
         now_ns = step * 50_000_000
         spare.poll.return_value = [reading(now_ns - 1, FIELD)]
         given += found.update(now_ns)
-    # After 0.1 s of silence, the readings of the magnetometer are used.
+    # After 0.1 s without IMU readings, the readings of the magnetometer are used.
     assert [one.time_ns for one in given] == [0, 149_999_999, 199_999_999]
     assert changed.call_count == 1
     assert [one.has_rate for one in given] == [True, False, False]
@@ -178,7 +184,7 @@ def test_without_a_gyro_the_limits_of_an_arrival_decide_whether_coils_are_driven
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a flight whose gyro is dead from the start to 18 s; the coils disturb the magnetometer."""
+    """Return a flight whose gyro is dead until 18 s, and whose coils disturb the magnetometer."""
     coils = tuple(tuple(5e-4 * float(i == k) for k in range(3)) for i in range(3))
     entry = FaultEntry(fault="imu: gyro-dead", at=0.0, span=18.0)
     section = replace(demo_world(), seed=4, coil_field=coils, faults=(entry,))

@@ -19,7 +19,10 @@ def anything(_: Metadata) -> str:
 
 
 class Pair:
-    """A satellite and a ground station. In both directions, data units are lost with a given probability."""
+    """A satellite and a ground station.
+
+    The channel loses data units in both directions with a given probability.
+    """
 
     def __init__(self, place: Path, loss: float, seed: int = 1) -> None:
         self.place, self.loss = place, loss
@@ -36,7 +39,7 @@ class Pair:
         return Entity(number, self.store(number), anything, MOST, self.now_ns)
 
     def kill(self, number: int) -> None:
-        """Kill a process without notice, and start a new one."""
+        """Discard the state of one end without closing it, and open a new one."""
         self.ends[number] = self.opened(number)
 
     def send(self, source: int, path: Path, name: str, kind: int = CRC32) -> Progress:
@@ -44,7 +47,7 @@ class Pair:
         return self.ends[source].send(path, name, to, kind, self.now_ns, self.now_ns, Origin())
 
     def turn(self, units: int = 20) -> None:
-        """Make each end send some data units, and advance the clock."""
+        """Send up to `units` data units from each end, and advance the clock."""
         for number, other in ((SATELLITE, GROUND), (GROUND, SATELLITE)):
             for _ in range(units):
                 unit = self.ends[number].unit(self.now_ns)

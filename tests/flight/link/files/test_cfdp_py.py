@@ -62,7 +62,7 @@ class User(CfdpUserBase):  # type: ignore[misc]
 
 
 class Faults(DefaultFaultHandlerBase):  # type: ignore[misc]
-    """Fault handler for cfdp-py whose callbacks do nothing."""
+    """Fault handler of cfdp-py whose callbacks do nothing."""
 
     def notice_of_suspension_cb(self, *_: Any) -> None:
         pass
@@ -76,7 +76,7 @@ class Timers(CheckTimerProvider):  # type: ignore[misc]
 
 
 class Ends:
-    """KnightCube's satellite end, the ground end of cfdp-py, and the channel between them."""
+    """KnightCube as the satellite end, cfdp-py as the ground end, and the channel between them."""
 
     def __init__(
         self,
@@ -151,9 +151,12 @@ class Ends:
         return bool(self.draw.random() >= self.loss)
 
     def _give(self, unit: Any) -> None:
-        """Pass a data unit to the handler of its transfer, or reply for a transfer that has ended."""
+        """Pass a data unit to the handler of its transfer.
+
+        If the transfer has ended, reply as its handler would.
+        """
         if isinstance(unit, EofPdu) and unit.condition_code > CANCELLED:
-            # spacepackets 0.32 does not shift the condition out of the upper half of its byte.
+            # spacepackets 0.32 leaves the condition code in the upper half of its byte.
             unit.condition_code = ConditionCode(unit.condition_code >> 4)
         if unit.direction == Direction.TOWARDS_SENDER:
             if not self.source.states.state.value:
@@ -246,7 +249,7 @@ def test_a_file_goes_down_whole_to_cfdp_py(
     loss: float,
     kind: int,
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # cfdp-py writes to the file name that the sender gives
+    monkeypatch.chdir(tmp_path)  # cfdp-py writes to the file name that the sender gave
     pair = ends(loss)
     pair.get(file, kind, tmp_path / "down")
     pair.until_closed()

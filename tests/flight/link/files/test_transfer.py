@@ -190,7 +190,10 @@ def test_what_is_wrong_with_a_file_ends_its_transfer(
 
 
 def test_bytes_beyond_the_end_that_came_before_the_metadata_are_left_out_of_the_file(tmp_path: Path) -> None:
-    """By CCSDS 727.0-B-5, 4.6.1.2, this is a file size error, whichever data unit came first."""
+    """File data beyond the stated size is a file size error, whichever of the two arrives first.
+
+    This is the rule of CCSDS 727.0-B-5, 4.6.1.2.
+    """
     pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
     end = pair.ends[SATELLITE]
     checksum = zlib.crc32(b"abc")
@@ -350,9 +353,9 @@ def test_without_an_end_missing_data_are_requested_ten_seconds_after_the_last_da
 
 
 def _sliced(missing: set[int]) -> list[tuple[int, int]]:
-    """Return the first gap between bytes 0 and 25, and the last gap between bytes 7 and 25.
+    """Return the first gap in the bytes 0 to 25, and the last gap in the bytes 7 to 25.
 
-    A gap is a pair (begin, end) of a range of `missing` bytes. The part of a gap below byte 7 is cut off.
+    A gap is a pair (begin, end) of a range of `missing` bytes. The second gap starts at byte 7 or later.
     """
     edges = [n for n in range(26) if (n in missing) != (n - 1 in missing)]
     gaps = list(zip(edges[::2], edges[1::2], strict=True))

@@ -207,7 +207,10 @@ def test_the_longest_units_fit_into_a_telecommand_frame() -> None:
 
 @pytest.mark.parametrize("size", [0, 1, 7, (1 << 20) + 3])
 def test_checksums_are_those_of_the_standard(tmp_path: Path, size: int) -> None:
-    """The checksum is a sum of words (CCSDS 727.0-B-5, 4.2.5); the CRCs of "123456789" are published."""
+    """The checksum is a sum of words (CCSDS 727.0-B-5, 4.2.5).
+
+    The CRCs of "123456789" are published values.
+    """
     data = bytes(i * 37 % 256 for i in range(size))
     path = tmp_path / "file"
     path.write_bytes(data)

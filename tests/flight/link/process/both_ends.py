@@ -1,4 +1,4 @@
-"""Both ends of a link in one process on a manual clock: a station, its flight, and a terminal."""
+"""Both ends of a link in one process on a manual clock: a link process, its flight, and a ground terminal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SETTINGS = TerminalSettings(frame_bytes=512)
 
 
 class Wire:
-    """A line of either end that stores the sent frames."""
+    """One end of a line, which stores the sent frames."""
 
     name = "wire"
 
@@ -47,7 +47,7 @@ class Wire:
         pass
 
     def ground(self) -> GroundWire:
-        """Return the other end."""
+        """Return the ground's end of this line."""
         return GroundWire(self)
 
 
@@ -104,7 +104,10 @@ class GroundStream(GroundWire):
 
 
 class BothEnds:
-    """A satellite in orbit and its ground; `renewal` is the status file of the privileged program."""
+    """A satellite in orbit and its ground station.
+
+    `renewal` is the status file of the privileged update program.
+    """
 
     renewal = STATUS
 
@@ -117,7 +120,10 @@ class BothEnds:
         codes: LinkCodes | None = None,
         noise: Callable[[bytes], bytes] = bytes,
     ) -> None:
-        """Make keys and an empty run in the folder `place`; with `codes` the line is a noisy stream."""
+        """Make keys and an empty run in the folder `place`.
+
+        If `codes` is given, the line is a noisy byte stream.
+        """
         make_keys(place / "keys")
         self.place, self.rate, self.clock = place, rate, ManualClock()
         self.settings, self.idle_rate, self.codes = settings, idle_rate, codes or LinkCodes()
@@ -133,7 +139,7 @@ class BothEnds:
         self.restart()
 
     def restart(self) -> None:
-        """Replace link process and terminal by new ones."""
+        """Replace the link process and the terminal by new instances."""
         given = self.settings
         settings = StationSettings(
             given.spacecraft,
@@ -161,7 +167,10 @@ class BothEnds:
         return self.packer.pack(MODE, self.clock.now_ns(), fields)
 
     def turn(self, seconds: float = 0.5, answer: Callable[[bytes], bool] | None = None) -> None:
-        """Advance the clock; the flight executes received commands, or replies with `answer`."""
+        """Advance the clock.
+
+        The flight executes received commands; if `answer` is given, it decides on execution.
+        """
         until = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < until:
             self.station.turn()
@@ -180,7 +189,7 @@ class BothEnds:
         self.packets += self.terminal.take()
 
     def stages(self, counter: int, spi: int = 1) -> list[str]:
-        """Return the verification stages of a command that the ground has received."""
+        """Return the verification stages that the ground has received for a command."""
         return [r.stage.name.lower() for r in self.reports() if (r.counter, r.spi) == (counter, spi)]
 
     def reports(self) -> list[Report]:
@@ -188,12 +197,12 @@ class BothEnds:
         return [report_of(packet) for packet in self.of(VERIFICATION.name)]
 
     def of(self, name: str) -> list[bytes]:
-        """Return the received packets of one name."""
+        """Return the received packets with a name."""
         identifier = LAYOUTS[name].identifier.to_bytes(2, "big")
         return [packet for _, packet in self.packets if packet[:2] == identifier]
 
     def status(self) -> PacketArray:
-        """Return the newest status of the link."""
+        """Return the newest status packet of the link."""
         (row,) = LAYOUTS[LINK.name].array(self.of(LINK.name)[-1])
         return row  # type: ignore[no-any-return]  # numpy types no row of a structured array
 

@@ -18,10 +18,10 @@ _MOST_S = 7200.0
 
 
 class FiledEnds(BothEnds):
-    """A satellite and a ground that transfer files.
+    """A satellite and a ground station that transfer files.
 
     Attributes:
-        ended: ended transfers of the ground.
+        ended: transfers that have ended at the ground.
         seconds: time (s) of the clock until all transfers were closed.
     """
 
@@ -34,7 +34,7 @@ class FiledEnds(BothEnds):
         super().__init__(place, rate)
 
     def restart(self) -> None:
-        """Replace link process, terminal and file session by new ones, as after kills."""
+        """Replace link process, terminal and file session by new instances, as after kills."""
         super().restart()
         store = Store(self.place / "ground-files")
         self.session = FileSession(self.terminal, store, 1, self.up_rate, self.clock.now_ns())
@@ -44,7 +44,7 @@ class FiledEnds(BothEnds):
         self.session.ask(directive, self.clock.now_ns())
 
     def turn(self, seconds: float = 0.5, answer: object = None) -> None:
-        """Advance the clock in cycles of the link."""
+        """Advance the clock in steps of one link cycle."""
         del answer
         until = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < until:
@@ -52,7 +52,7 @@ class FiledEnds(BothEnds):
             super().turn(TURN_NS * 1e-9)
 
     def collect(self) -> None:
-        """Process the received telemetry, also in the file session."""
+        """Process the received telemetry, and pass it to the file session."""
         now_ns = self.clock.now_ns()
         self.wire.down = self._left(self.wire.down)
         packets = list(self.terminal.take())
@@ -72,7 +72,7 @@ class FiledEnds(BothEnds):
             self.turn(0.5)
 
     def command(self, directive: Directive) -> str:
-        """Send a command, and return the reason of its failure or its last stage."""
+        """Send a command; return the reason of its failure, or its last verification stage."""
         self.session.reports()
         self.ask(directive)
         reports: list[Report] = []
@@ -84,5 +84,5 @@ class FiledEnds(BothEnds):
         return failed(reports) or reports[-1].stage.name.lower()
 
     def _left(self, frames: list[bytes]) -> list[bytes]:
-        """Return those of the given frames that are not lost."""
+        """Return the given frames without those that the line loses."""
         return [frame for frame in frames if self.draw.random() >= self.loss]

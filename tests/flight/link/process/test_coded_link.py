@@ -50,7 +50,7 @@ def ping(number: int) -> bytes:
 
 
 class Noise:
-    """A channel that inverts single bits, one in about 200 bytes."""
+    """A channel that inverts single bits, on average one in 200 bytes."""
 
     def __call__(self, data: bytes) -> bytes:
         bits = np.unpackbits(np.frombuffer(data, np.uint8))
@@ -106,8 +106,7 @@ def test_telemetry_can_be_readable_for_everybody_and_still_cannot_be_forged(
     link.turn(1.5)
     seen = list(link.wire.down)
     packets = [packet for _, packet in link.terminal.take()]
-    # Sixteen bytes are compared, because two equal bytes occur by chance in one of a hundred encrypted
-    # downlinks.
+    # Sixteen bytes are compared. Two bytes would be equal by chance in one of a hundred encrypted downlinks.
     starts = [
         packet[:16] for packet in packets if packet[:2] == LAYOUTS[LINK.name].identifier.to_bytes(2, "big")
     ]
@@ -302,7 +301,7 @@ def test_datagrams_and_streams_of_both_ends_are_coded_alike(stack: ExitStack, ki
     assert found == [telemetry] * 2
     if kind == "udp":
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.sendto(command, ("127.0.0.1", line.port))  # a frame without code
+            stranger.sendto(command, ("127.0.0.1", line.port))  # a frame without a code block
             while not (taken := line.receive()):
                 pass
         assert [frame for frame, _ in taken] == [b""]

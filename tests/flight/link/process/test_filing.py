@@ -1,4 +1,4 @@
-"""Tests of files over the whole link: commands, protected frames both ways, selection by SHA-256."""
+"""Tests of file transfers over a link: commands, protected frames both ways, selection by SHA-256."""
 
 from __future__ import annotations
 
@@ -122,9 +122,9 @@ def test_a_file_that_changes_while_it_is_checked_is_chosen_as_it_was_checked(
 def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
     link: FiledEnds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two files are requested at once, and each is copied into the same temporary file during its check.
+    """Two files whose checks overlap are both selected, although both are copied to the same temporary file.
 
-    The longer file comes first, so that its check still runs when the second file is requested.
+    The longer file is requested first, so that its check still runs when the shorter file is requested.
     """
     monkeypatch.setattr(filing, "_PORTION", 1)
     folder = link.place / "keys" / "files"
@@ -144,7 +144,7 @@ def test_of_two_files_that_are_checked_at_once_each_is_chosen_as_it_was_checked(
 
 @pytest.mark.parametrize("name", [b"bad\xff", b"loop"])
 def test_a_strange_name_in_the_log_does_not_end_the_link(link: FiledEnds, name: bytes) -> None:
-    """The tested names are a name that is not UTF-8, and a symbolic link to itself."""
+    """The link continues if the log contains a file name that is not UTF-8, or a symbolic link to itself."""
     link.record(*timing_packets(50))
     run = link.place / "runs" / "run-000001"
     if name == b"loop":

@@ -1,4 +1,4 @@
-"""Tests that ground lines read floods in portions, accept only peers, and drop clients that do not read."""
+"""Tests that link lines read floods in portions, accept only peers, and drop clients that do not read."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
             stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)
         )
         stranger.bind(("127.0.0.2", 0))
-        for _ in range(10_000):  # together much larger than the receive buffer
+        for _ in range(10_000):  # the total size exceeds the receive buffer
             stranger.sendto(FRAME, ("127.0.0.1", line.port))
         peer.sendto(FRAME, ("127.0.0.1", line.port))
         assert [frame for frame, _ in line.receive()] == [FRAME]
@@ -68,7 +68,10 @@ def test_strangers_do_not_fill_the_buffer_of_the_peers_datagrams() -> None:
 
 
 def test_an_operator_whose_frame_is_late_is_not_displaced_by_200_strangers_a_second() -> None:
-    """The link runs only five cycles a second, as on a busy board; the frame follows after half a second."""
+    """200 strangers a second do not displace an operator, whose frame arrives after half a second.
+
+    The link runs only five cycles a second, as on a busy board.
+    """
     line = TcpLine("127.0.0.1:0")
     with ExitStack() as stack:
         (operator,) = callers_of(line, stack, 1)
@@ -131,7 +134,7 @@ def test_a_connection_that_does_not_read_is_closed() -> None:
         ((frame, sender),) = received_by(line)
         assert frame == FRAME
         line.trust(sender, 0)
-        for _ in range(300):  # together much larger than the socket buffers
+        for _ in range(300):  # the total size exceeds the socket buffers
             line.send([bytes(1 << 16)], 0)
         assert sender not in line._connections
         assert len(line._connections) == 1

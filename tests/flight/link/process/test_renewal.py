@@ -1,4 +1,4 @@
-"""Tests that the link passes requests for updates to the privileged program, and reports its results."""
+"""Tests that the link passes update requests to the privileged update program, and reports its results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DATA = b"a bundle" * 100
 
 
 class Ends(FiledEnds):
-    """Satellite and ground end of a link, with the status file that a privileged program writes on board."""
+    """The satellite's and the ground's end of a link, and the status file of the privileged program."""
 
     def __init__(self, place: Path) -> None:
         self.renewal = place / "status"
@@ -32,7 +32,7 @@ class Ends(FiledEnds):
         self.renewal.write_bytes(encoded({"reports": reports, "trial": "", "note": ""}))
 
     def requests(self) -> dict[str, dict[str, object]]:
-        """Return the stored requests by their names."""
+        """Return the stored requests, by name."""
         folder = self.place / "keys/renewal"
         return {path.name: decoded(path.read_bytes()) for path in sorted(folder.glob("1-*"))}
 

@@ -1,4 +1,7 @@
-"""Tests that scheduled commands run once at their UTC, even after a restart, and late ones are reported."""
+"""Tests that scheduled commands run once at their UTC, even after a restart.
+
+Late commands are only reported.
+"""
 
 from __future__ import annotations
 
@@ -174,7 +177,7 @@ def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
 
     def until_killed(path: Path, data: bytes) -> bool:
         if next(left, None) is None:
-            path.write_bytes(data[:10])  # a truncated copy
+            path.write_bytes(data[:10])  # a truncated file
             raise KeyboardInterrupt
         return overwrite(path, data)
 
@@ -224,7 +227,7 @@ def test_a_due_command_that_cannot_be_removed_from_the_disk_is_reported_once_and
 
 
 def _scheduling(tmp_path: Path, mode: Mode | None = Mode.HOLD) -> tuple[Scheduling, int]:
-    """Return a scheduler with a command, and the due time of the command, ns."""
+    """Return a scheduler with one command, and the due time (ns) of this command."""
     table, at_ns = Timetable(tmp_path), 1_800_000_000 * 10**9
     table.add(at_ns, 1, 9, "ping 3")
     made = Scheduling(table)
@@ -307,14 +310,14 @@ def test_a_line_that_an_earlier_release_stored_has_angles_in_rad() -> None:
 
 
 def label(link: BothEnds, utc_ns: int) -> bytes:
-    """Return the packet of a run that begins at the present time with the given UTC."""
+    """Return the packet that begins a run, whose UTC at the present time is `utc_ns`."""
     fields: dict[str, Any] = {field.name: [0.0] * 3 if field.count == 3 else 0 for field in RUN.fields}
     fields |= {"config_name": "orbit", "software": "1", "utc_ns": utc_ns - link.clock.now_ns()}
     return link.packer.pack(RUN, link.clock.now_ns(), fields)
 
 
 def fly(link: BothEnds, seconds: int) -> None:
-    """Make a flight write a packet each second."""
+    """Write one packet per second into the flight log."""
     for _ in range(seconds):
         link.record(link.mode_packet(Mode.HOLD, "again"))
         link.turn(1.0)
@@ -322,7 +325,7 @@ def fly(link: BothEnds, seconds: int) -> None:
 
 @pytest.mark.parametrize("days", [2500, 40])
 def test_the_schedule_follows_the_utc_of_the_flight(link: BothEnds, days: int) -> None:
-    """The flight is a simulation, or has corrected the wall clock; a restart keeps the UTC."""
+    """Scheduled commands run at the UTC of the flight, which may differ from the wall clock."""
     begun_ns = link.clock.utc_ns()
     link.record(label(link, begun_ns))
     link.turn(2.0)

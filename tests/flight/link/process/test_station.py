@@ -206,7 +206,7 @@ def test_the_loop_shows_once_a_second_that_it_turns_also_while_it_takes_many_fra
     slow = link.station._gate.admit
 
     def admit(frame: bytes) -> Admitted:
-        link.clock.advance(500_000_000)  # emulates a disk that takes long to store a counter
+        link.clock.advance(500_000_000)  # emulates a disk that is slow to store a counter
         return slow(frame)
 
     monkeypatch.setattr(link.station._gate, "admit", admit)
@@ -284,7 +284,7 @@ def test_a_slow_line_thins_what_repeats_and_loses_no_event(tmp_path: Path) -> No
 
 
 def test_a_stretch_of_the_archive_is_played_back_whole_beside_live_telemetry(link: BothEnds) -> None:
-    old = timing_packets(4000)  # enough packets for several segments
+    old = timing_packets(4000)  # enough packets for several segments of the log
     link.record(*old)
     link.turn(4.0)
     link.packets.clear()

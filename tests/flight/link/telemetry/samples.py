@@ -22,7 +22,7 @@ def timing_packets(count: int, packer: Packer | None = None) -> list[bytes]:
 
 
 def values_of(field: Field) -> st.SearchStrategy[object]:
-    """Return a strategy for the values of a field."""
+    """Return a hypothesis strategy for the values of a field."""
     one: st.SearchStrategy[object]
     if field.kind.startswith("S"):
         return st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")).map(
@@ -38,19 +38,19 @@ def values_of(field: Field) -> st.SearchStrategy[object]:
 
 
 def cut(text: str, size: int) -> str:
-    """Return the longest start of `text` that fits in `size` bytes of UTF-8 and has no zero."""
+    """Return the longest prefix of `text` that has at most `size` bytes of UTF-8 and contains no NUL."""
     while len(text.encode()) >= size:
         text = text[:-1]
     return text
 
 
 def contents(packet: Packet) -> st.SearchStrategy[dict[str, object]]:
-    """Return a strategy for the contents of a packet."""
+    """Return a hypothesis strategy for the contents of a packet."""
     return st.fixed_dictionaries({field.name: values_of(field) for field in packet.fields})
 
 
 def plain_contents(packet: Packet) -> dict[str, object]:
-    """Return simple contents that fit a packet."""
+    """Return simple contents that are valid for a packet."""
     plain: dict[str, object] = {}
     for field in packet.fields:
         if field.kind.startswith("S"):

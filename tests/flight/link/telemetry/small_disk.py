@@ -1,4 +1,4 @@
-"""A disk with little free space, and the packets that a log has written."""
+"""A disk with little free space, and the bytes that a log has written."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def content(folder: Path, stem: str = "flight") -> bytes:
 
 
 class SmallDisk:
-    """A disk of `room` bytes that opens segments. The write that fills it is cut; later writes fail."""
+    """A disk with `room` free bytes. The write that fills the disk is incomplete, and later writes fail."""
 
     def __init__(self, room: int) -> None:
         self.room = room
@@ -28,7 +28,7 @@ class SmallDisk:
 
 
 class SmallDiskFile:
-    """One file on a small disk."""
+    """A segment file on a small disk."""
 
     def __init__(self, disk: SmallDisk, file: SegmentFile) -> None:
         self._disk = disk
@@ -48,7 +48,7 @@ class SmallDiskFile:
         return self._file.truncate(size)
 
     def fileno(self) -> int:
-        """Count a sync."""
+        """Count a sync, and return the file descriptor."""
         self._disk.syncs += 1
         return self._file.fileno()
 

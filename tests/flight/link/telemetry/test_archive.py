@@ -1,4 +1,4 @@
-"""Tests that an archive gives each boot a new folder and deletes the oldest runs within its budget."""
+"""Tests that each boot gets a new folder in the archive, which deletes the oldest runs to keep its budget."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_budget_below_the_coming_run_and_a_place_that_cannot_be_written_are_cl
 def test_a_full_disk_takes_the_oldest_runs_but_not_the_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Either the disk has room after the two oldest runs are deleted, or only after all runs are deleted."""
+    """The tested disks have room after two runs were deleted, or only after all runs were deleted."""
     for _ in range(4):
         fill(begin_run(tmp_path, 10_000, 100).folder, 300)
 

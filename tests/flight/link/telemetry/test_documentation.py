@@ -1,4 +1,4 @@
-"""Tests that the telemetry page equals the packet tables and suffices to decode a packet."""
+"""Tests that the telemetry page agrees with the packet tables, and is sufficient to decode a packet."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_every_field_of_every_packet_is_documented() -> None:
 
 
 def test_the_ground_database_is_enough_to_read_a_packet() -> None:
-    """Read a field at the offset that the database states, without code of the project."""
+    """A field of a packet is read at the offset that the database states, without code of this project."""
     ground = json.loads(json.dumps(database()))
     (control,) = (packet for packet in ground["packets"] if packet["name"] == "control")
     raw = Packer().pack(

@@ -1,4 +1,4 @@
-"""Tests that the flight log stores all packets in order, or reports the packets it could not store."""
+"""Tests that the flight log stores all packets in order, and reports packets that it could not store."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_an_old_log_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"flight-0001\.ccsds exists"):
         FlightLog(tmp_path, clock=ManualClock())
     assert content(tmp_path) == b"".join(packets)
-    FlightLog(tmp_path, "truth", clock=ManualClock()).close()  # another log by its name
+    FlightLog(tmp_path, "truth", clock=ManualClock()).close()  # a log with another name
     second = FlightLog(tmp_path, clock=ManualClock(), overwrite=True)
     second.write(packets[0])
     second.close()
@@ -162,7 +162,7 @@ while True:
 
 
 def test_a_killed_process_leaves_a_readable_log(tmp_path: Path) -> None:
-    """After a SIGKILL during a write, the log has no gap, and at most its last packet is cut."""
+    """After a SIGKILL during a write, the log has no gap, and only its last packet may be incomplete."""
     root = Path(__file__).resolve().parents[4]
     writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], cwd=root)
     try:
@@ -182,7 +182,7 @@ def test_a_killed_process_leaves_a_readable_log(tmp_path: Path) -> None:
 
 
 def test_a_kill_at_every_byte_of_a_write_leaves_every_whole_packet(tmp_path: Path) -> None:
-    """A crash can leave any prefix of the file."""
+    """A crash can leave any prefix of the written bytes. All complete packets of the prefix are returned."""
     log = FlightLog(tmp_path, clock=ManualClock())
     packets = timing_packets(100)
     for packet in packets:

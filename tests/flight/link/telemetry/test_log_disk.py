@@ -23,7 +23,7 @@ SECOND = 1_000_000_000
 
 @pytest.mark.parametrize("room", [0, 1, 500, 777])
 def test_a_full_disk_stops_the_log_in_order(tmp_path: Path, room: int) -> None:
-    """Packets that fit are stored completely; all others are counted and reported."""
+    """Packets that fit on the disk are stored completely, and all other packets are counted and reported."""
     clock, disk = ManualClock(0), SmallDisk(room)
     packets = timing_packets(50)
     log = FlightLog(tmp_path, clock=clock, segment_bytes=10 * len(packets[0]), opener=disk.open)
@@ -45,7 +45,10 @@ def test_a_full_disk_stops_the_log_in_order(tmp_path: Path, room: int) -> None:
 
 @pytest.mark.parametrize("room", [0, 500, 777])
 def test_a_disk_that_was_full_and_has_room_again_gets_what_waited(tmp_path: Path, room: int) -> None:
-    """No packet is lost while the queue has room. A partly written packet is written again completely."""
+    """The queue of the log keeps packets until the disk has room again.
+
+    A packet that was written incompletely is written again.
+    """
     clock, disk = ManualClock(0), SmallDisk(room)
     packets = timing_packets(60)
     log = FlightLog(tmp_path, clock=clock, segment_bytes=25 * len(packets[0]), opener=disk.open)
@@ -226,7 +229,7 @@ def test_a_hung_disk_blocks_neither_write_nor_close(tmp_path: Path, monkeypatch:
     release.set()
     drain.join()
     assert log._store is not None
-    log._store.close()  # simulates the end of the process
+    log._store.close()  # the process ends without closing the log
 
 
 def test_a_patient_log_begins_without_its_disk_and_writes_all_when_it_comes(tmp_path: Path) -> None:

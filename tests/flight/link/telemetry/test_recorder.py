@@ -1,4 +1,4 @@
-"""Tests that the recorder writes two logs in mission time, and counts values that do not fit."""
+"""Tests that the recorder writes two logs in mission time, and counts values that are out of range."""
 
 from __future__ import annotations
 

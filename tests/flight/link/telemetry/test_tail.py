@@ -1,4 +1,4 @@
-"""Tests that a log with a torn tail or damaged bytes returns every undamaged packet."""
+"""Tests that a log with an incomplete end or damaged bytes still gives every undamaged packet."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ TAIL = 4096
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run with packets of many kinds, in one segment."""
+    """Return the folder of a run whose only segment contains packets of many types."""
     return make_run(tmp_path_factory.mktemp("tail"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
 
 
 def packets_of(data: bytes) -> list[tuple[int, bytes]]:
-    """Return offset and bytes of each packet from the lengths in the headers."""
+    """Return the offset and the bytes of each packet, found by the lengths in the packet headers."""
     found, position = [], 0
     while position < len(data):
         length = int.from_bytes(data[position + 4 : position + 6], "big") + 7
@@ -54,7 +54,10 @@ def test_power_lost_at_every_byte_of_the_last_four_kibibytes_costs_the_packet_it
 
 
 def test_blocks_that_power_loss_left_as_zeros_cost_only_what_they_cover(run: Path) -> None:
-    """A file contains zeros if the file system stored its length but not its last blocks."""
+    """Blocks that became zeros by a power loss destroy only the packets that they cover.
+
+    A file contains such blocks if the file system has stored its length but not its last blocks.
+    """
     data = find_segments(run, "flight")[0].read_bytes()[:8192]
     packets = packets_of(data[: packets_of_prefix(data)])
     for start in range(0, 8192, 512):
@@ -66,7 +69,7 @@ def test_blocks_that_power_loss_left_as_zeros_cost_only_what_they_cover(run: Pat
 
 
 def packets_of_prefix(data: bytes) -> int:
-    """Return the position at which the last complete packet of `data` ends."""
+    """Return the offset at which the last complete packet of `data` ends."""
     position = 0
     while True:
         length = int.from_bytes(data[position + 4 : position + 6], "big") + 7
@@ -77,7 +80,10 @@ def packets_of_prefix(data: bytes) -> int:
 
 @pytest.mark.parametrize("seed", range(40))
 def test_random_damage_costs_the_packets_it_touches_and_invents_none(run: Path, seed: int) -> None:
-    """Up to three bits of a packet are flipped, which the CRC always finds (distance 4 below 32,751 bits)."""
+    """Packets with one to three flipped bits are dropped, and all other packets are returned unchanged.
+
+    The CRC detects up to three flipped bits in a packet (distance 4 below 32,751 bits).
+    """
     draw = random.Random(seed)
     data = bytearray(find_segments(run, "flight")[0].read_bytes())
     packets = packets_of(bytes(data))
@@ -91,9 +97,9 @@ def test_random_damage_costs_the_packets_it_touches_and_invents_none(run: Path, 
 
 
 def test_a_packet_of_a_segment_or_of_a_sequence_is_none_of_ours() -> None:
-    """In a complete packet both sequence flags are set.
+    """A packet is accepted only if both sequence flags are set, which mark it as complete.
 
-    Packets with other flags are refused even with a correct CRC.
+    Packets with other flags are refused even if their CRC is correct.
     """
     body = bytearray(LAYOUTS["cycle_timing"].length - 2)
     body[:2] = LAYOUTS["cycle_timing"].identifier.to_bytes(2, "big")
