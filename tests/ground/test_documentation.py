@@ -1,4 +1,4 @@
-"""Tests that a ground station can decode packets with the telemetry documentation alone."""
+"""Tests that a ground station can decode packets from the telemetry documentation alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EXAMPLE = Packet(
 
 
 def crc(data: bytes, polynomial: int, preset: int) -> int:
-    """Return a CRC of 16 bits, computed bit by bit."""
+    """Return the 16-bit CRC of some bytes, computed bit by bit."""
     value = preset
     for byte in data:
         value ^= byte << 8

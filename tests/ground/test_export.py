@@ -102,7 +102,10 @@ def rich_run(tmp_path: Path) -> Run:
 def test_readers_of_other_authors_need_no_options(
     rich_run: Run, tmp_path: Path, reader: str, form: str
 ) -> None:
-    """Numbers with NaN stay numbers, and texts keep their quotes and accents."""
+    """Other programs read the exported files without options.
+
+    NaN is read as a number, and texts keep their quotes and accents.
+    """
     module = pytest.importorskip(f"pyarrow.{form}" if reader == "pyarrow" else reader)
     pytest.importorskip("pyarrow", reason="needs the extra `parquet`")
     files = {path.stem: str(path) for path in export(rich_run, tmp_path / form, form)}
@@ -125,7 +128,7 @@ def test_readers_of_other_authors_need_no_options(
 
 def test_one_sqlite_file_has_a_table_for_each_packet_and_the_units(rich_run: Run, tmp_path: Path) -> None:
     file = tmp_path / "new" / "all.sqlite"
-    for _ in range(2):  # the second export replaces the first
+    for _ in range(2):  # the second export replaces the files of the first
         assert export(rich_run, file, "sqlite") == [file]
     assert list(file.parent.iterdir()) == [file]
     with closing(sqlite3.connect(file)) as database:

@@ -1,4 +1,4 @@
-"""Tests of tracks of objects as CCSDS Tracking Data Messages (503.0-B-2), from artificial packets."""
+"""Tests of object tracks as CCSDS Tracking Data Messages (503.0-B-2), from artificial packets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNPLACED = {"place": [math.nan] * 3, "velocity": [math.nan] * 3}
 
 
 def sighting(time: float, number: int, ra: float, dec: float, **values: Any) -> tuple[float, dict[str, Any]]:
-    """Return a track packet of a sighting at angles in degrees."""
+    """Return the track packet of a sighting at given angles (deg)."""
     a, d = math.radians(ra), math.radians(dec)
     direction = [math.cos(d) * math.cos(a), math.cos(d) * math.sin(a), math.sin(d)]
     known = {
@@ -84,7 +84,7 @@ def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path:
 
 
 def test_the_orbit_of_the_camera_stands_beside_the_tracks(tmp_path: Path) -> None:
-    """Two objects of one frame share one camera state; without a known orbit, a sighting has no state."""
+    """Two objects of one frame share one camera state. A sighting has no state if the orbit is unknown."""
     states = [([7e6 + k, -1e6, 2e6], [1e3, 7e3 - k, -5e2]) for k in range(3)]
     track = [
         sighting(1.0 + k, number, 10.0, 5.0, place=place, velocity=velocity, place_sigma=20.0 + k)
@@ -177,7 +177,7 @@ def test_too_few_sightings_with_a_position_give_a_reason_instead_of_an_orbit() -
 
 
 def both_forms(tmp_path: Path, write: Any) -> tuple[list[Any], list[Any]]:
-    """Return the messages of the same data as text and XML, parsed by an independent program."""
+    """Return the messages of the same data in text and in XML, as an independent program reads them."""
     reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
     plain, xml = (write(tmp_path / name, as_xml) for name, as_xml in (("kvn", False), ("xml", True)))
     assert all(path.read_text(encoding="ascii").startswith("<?xml") for path in xml)

@@ -29,7 +29,7 @@ def prediction() -> OrbitPrediction:
 
 
 def seen(station: Station, at: datetime) -> tuple[float, float, float]:
-    """Return elevation and azimuth, deg, and distance, m, of the satellite seen from a station."""
+    """Return elevation (deg), azimuth (deg) and distance (m) of the satellite for a ground station."""
     date = julian_date(at)
     satellite = celestial_to_terrestrial(date) @ TwoLineElements(*POLAR_ORBIT).at(date).position
     latitude, longitude = math.radians(station.latitude_deg), math.radians(station.longitude_deg)
@@ -52,7 +52,8 @@ def test_a_pass_begins_and_ends_at_the_mask_and_culminates_between(prediction: O
             elevation, own, distance = seen(one.station, at)
             expected = one.elevation_deg if at is one.top else one.station.mask_deg
             assert elevation == pytest.approx(expected, abs=0.02)
-            # Azimuths are compared only below 80 deg, because they change quickly near the zenith.
+            # Azimuths are compared only below 80 deg of elevation, because they change quickly near the
+            # zenith.
             if elevation < 80.0:
                 assert (own - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
         assert distance > one.range

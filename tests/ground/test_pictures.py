@@ -22,7 +22,7 @@ def _sky(size: int, grey: int) -> Picture:
 
 
 def _stand_apart(plain: Picture, drawn: Picture) -> bool:
-    """Return whether every coloured pixel is separated from sky pixels."""
+    """Return whether no coloured pixel touches a pixel of the sky."""
     coloured = np.ptp(drawn.astype(int), axis=2) > 40
     around = binary_dilation(coloured, np.ones((3, 3), dtype=bool)) & ~coloured
     return bool(coloured.any() and np.all(np.any(drawn[around] != plain[around], axis=1)))

@@ -14,10 +14,10 @@ from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.startracker.sky_map import Pointing, SkyMap
 from tests.support.scenes import catalogue
 
-# Julian date TT of the great conjunction, 2020 December 21, 18:20 UTC, with a separation of 6.1' by the
-# almanacs.
+# Julian date (TT) of the great conjunction of Jupiter and Saturn, 2020 December 21, 18:20 UTC. The almanacs
+# give a separation of 6.1'.
 _CONJUNCTION = 2_459_205.264
-# The total eclipse of 2024 April 8 is greatest at 18:17 UTC, with a gamma of 0.3431 Earth radii.
+# The total eclipse of 2024 April 8 is greatest at 18:17 UTC. Its gamma is 0.3431 Earth radii.
 _ECLIPSE = 2_460_409.263
 
 
@@ -31,7 +31,10 @@ def test_jupiter_and_saturn_meet_on_the_day_of_the_great_conjunction() -> None:
 
 
 def test_the_moon_is_before_the_sun_at_an_eclipse() -> None:
-    """From the Earth's centre, Sun and Moon are separated by gamma times the Moon's parallax, about 1 deg."""
+    """At an eclipse, Sun and Moon are separated by gamma times the Moon's parallax, which is about 1 deg.
+
+    The separation is that at the Earth's centre.
+    """
     found = directions_of_bodies(_ECLIPSE)
     assert _apart_deg(found["Sun"], found["Moon"]) == pytest.approx(0.343 * 0.998, abs=0.05)
 
@@ -43,7 +46,7 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
     found = bodies_in(SkyMap(camera, attitude), _CONJUNCTION)
     assert [body.name for body in found] == ["Jupiter", "Saturn"]
     assert found[0].point == pytest.approx(camera.centre, abs=0.1)
-    # In the mirrored image, Saturn is on the opposite side of Jupiter.
+    # In the mirrored image, Saturn is on the other side of Jupiter.
     back = bodies_in(SkyMap(camera, attitude, mirrored=True), _CONJUNCTION)
     assert [body.name for body in back] == ["Jupiter", "Saturn"]
     assert back[1].point == pytest.approx([639.0 - found[1].point[0], found[1].point[1]], abs=1e-6)
@@ -52,7 +55,7 @@ def test_a_picture_of_the_conjunction_shows_both_planets_and_no_other() -> None:
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")
 wcs = pytest.importorskip("astropy.wcs", reason="astropy is of the extra `test`")
 
-# The warning is for a FITS header without an image, as some solvers write it.
+# Astropy warns of a FITS header without an image, as some star solvers write it.
 pytestmark = pytest.mark.filterwarnings("ignore:The WCS transformation has more axes")
 
 _LENS = Lens(1280, 960, 4000.0, (655.0, 470.0), k1=-0.3, k2=0.4)
@@ -66,7 +69,7 @@ def _sky(seed: int) -> SkyMap:
 def _stars(sky: SkyMap) -> tuple[FloatArray, FloatArray]:
     """Return right ascension and declination (n, 2), deg, of stars in the picture, and their pixels.
 
-    The pixels follow from the camera's projection, which the code that makes the header does not use.
+    The camera's projection gives the pixels. The code that makes the header does not use this projection.
     """
     _, directions = catalogue(8.5)
     place = _LENS.project(directions @ attitude_matrix(sky.quaternion).T)
@@ -77,7 +80,7 @@ def _stars(sky: SkyMap) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_astropy_finds_the_stars_where_they_are(seed: int) -> None:
-    """Conversions from pixel to sky and back agree to 0.1" and 0.01 px over the whole distorted image."""
+    """The conversions from pixel to sky and back agree to 0.1" and 0.01 px over the whole distorted image."""
     sky = _sky(seed)
     header = fits.Header.fromstring(header_text(sky))
     frame = wcs.WCS(header)
@@ -91,7 +94,7 @@ def test_astropy_finds_the_stars_where_they_are(seed: int) -> None:
 
 
 def test_a_lens_told_without_its_distortion_is_noticed() -> None:
-    """Without SIP, the errors at the corners are several px."""
+    """Without the SIP polynomials of the distortion, the errors at the corners are several px."""
     sky = _sky(1)
     plain = wcs.WCS(fits.Header.fromstring(header_text(sky)))
     radec, place = _stars(sky)
@@ -100,7 +103,7 @@ def test_a_lens_told_without_its_distortion_is_noticed() -> None:
 
 @pytest.mark.parametrize(("mirrored", "reversed_rows"), [(True, False), (False, True), (True, True)])
 def test_the_header_is_of_the_pixels_of_the_file(mirrored: bool, reversed_rows: bool) -> None:
-    """For a mirrored image, the determinant of the CD matrix has the opposite sign."""
+    """In a mirrored image, the determinant of the CD matrix has the opposite sign."""
     plain = _sky(2)
     radec, place = _stars(plain)
     if mirrored:

@@ -1,4 +1,4 @@
-"""Tests of reading packets from bytes and from the folder of a run, and of the damage report."""
+"""Tests of packets read from bytes and from the folder of a run, and of the damage report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `knightcube watch` with a finished log, a growing log, a stalled log, and a listening flight."""
+"""Tests of `knightcube watch` with a finished, a growing and a stalled log, and with a listening flight."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.support.places import ROOT
 
 
 def pack(packer: Packer, packet: Packet, time_s: float, **values: object) -> bytes:
-    """Return a packet whose other fields are zero or empty."""
+    """Return a packet whose fields are zero or empty, except for the given fields."""
     fields: dict[str, object] = {}
     for field in packet.fields:
         value: object = "" if field.kind.startswith("S") else 0
@@ -105,7 +105,7 @@ def test_an_archive_shows_its_newest_run(growing: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def watcher(growing: Path) -> Iterator[subprocess.Popen[str]]:
-    """Yield a `watch` process of a growing log after its first lines."""
+    """Yield a `watch` process of a growing log, after the process has printed its first lines."""
     words = [sys.executable, "-m", "flight", "watch", str(growing), "--every", "2"]
     with subprocess.Popen(
         words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -308,7 +308,7 @@ def test_a_folder_without_a_log_is_refused(tmp_path: Path) -> None:
 
 
 class Portions:
-    """Packets that arrive in portions, as over a link."""
+    """A feed whose packets arrive in portions, as over a link."""
 
     silence = 0.0
 

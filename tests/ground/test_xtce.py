@@ -1,4 +1,4 @@
-"""Tests that an independent client reads the XTCE file and finds the complete tables."""
+"""Tests that an independent client reads the XTCE file, and finds all packets and fields."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ server."""
 
 @pytest.fixture(scope="module")
 def schema(tmp_path_factory: pytest.TempPathFactory) -> etree.XMLSchema:
-    """Return the OMG's schema of XTCE 1.2 from the copy in space-packet-parser."""
+    """Return the OMG schema of XTCE 1.2 from its copy in the package space-packet-parser."""
     original = Path(space_packet_parser.__file__).parent / "xtce" / "schemas" / "SpaceSystem.xsd"
     folder = tmp_path_factory.mktemp("schema")
     (folder / "xml.xsd").write_text(XML_SCHEMA, encoding="utf-8")
@@ -162,7 +162,7 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
 def test_each_form_of_point_takes_degrees_and_is_the_command_in_words(
     name: str, values: dict[str, float], words: str
 ) -> None:
-    """The packet that the document describes is read as the flight software reads it."""
+    """The flight software reads a command that a client has packed by the document, in degrees."""
     root = found(fromstring(document()), "x:CommandMetaData")
     command = found(root, f"x:MetaCommandSet/x:MetaCommand[@name='{name}']")
     arguments = {one.get("name"): one for one in command.iter(f"{{{SPACE['x']}}}Argument")}
@@ -183,7 +183,10 @@ def test_each_form_of_point_takes_degrees_and_is_the_command_in_words(
 
 
 def test_the_states_of_the_table_are_those_of_the_code() -> None:
-    """The test covers state names that the link cannot import, because loop and bodies define them."""
+    """The state names of the packet table equal those of the code.
+
+    The link cannot import these names, because loop and bodies define them.
+    """
     assert tuple((int(state), state.name.lower()) for state in SteeringState) == definitions.STEERING
     streams = tuple((int(state), state.name.lower().replace("_", "-")) for state in StreamState)
     assert streams == definitions.STREAMS

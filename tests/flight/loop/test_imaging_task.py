@@ -463,7 +463,7 @@ def test_the_priors_of_a_job_are_those_of_mid_exposure_in_camera_axes() -> None:
 
 
 def solved(count: int = 14, status: SolveStatus = SolveStatus.SOLVED) -> FrameSolution:
-    """Return a solution of stars, with a fix if solved."""
+    """Return a solution of the star tracker, with a star fix if solved."""
     found = FrameSolution(
         status, "", FrameKind.POINTS, CAMERA, points=np.zeros((count, 2)), star=np.arange(count) - 2
     )
@@ -571,7 +571,7 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     bench.finish(FrameFound(motion(), None, lens=better), 12 * S)
     values = bench.only(LENS)
     assert (values["frames"], values["contradictions"], values["sequence"]) == (3, 0, 1)
-    # Half a pixel from the image centre (159.5, 119.5) on each axis.
+    # The image centre is (159.5, 119.5), and the optical axis is 0.5 px off in x and in y.
     assert values["centre"] == [160.0, 120.0]
     assert np.allclose(values["sigma"], better.sigma[[0, 1, 2, 3, 4, 9, 10]])
     stored = bench.task.learned()["lens"]
@@ -579,7 +579,7 @@ def test_the_learned_lens_goes_from_frame_to_frame_and_to_the_next_boot() -> Non
     bench.take(2, 15 * S, 16 * S)
     assert bench.jobs[-1].lens == (better, 5.0)
     bench.finish(FrameFound(motion(), None, lens=better), 17 * S)
-    bench.only(LENS)  # a frame without a result is not recorded
+    bench.only(LENS)  # a frame is recorded only with its result
     assert events.LENS_CHANGED not in bench.reports
     bench.take(3, 35 * S, 36 * S)
     assert bench.jobs[-1].lens == (better, 25.0), "the lens may have changed since the last frame that taught"

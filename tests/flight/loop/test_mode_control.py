@@ -19,7 +19,7 @@ FAST, LOW, LOW_FOR = 0.02, 0.008, 3.0
 
 
 class Watched:
-    """The mode control with records of its actions, run once a second."""
+    """The mode control, run once a second, with records of its actions."""
 
     def __init__(self) -> None:
         self.watch = AttitudeWatch(
@@ -83,7 +83,7 @@ def test_a_latched_fault_bars_both_also_what_has_begun(watched: Watched) -> None
 def test_an_attitude_that_is_lost_for_long_enough_ends_pointing(watched: Watched) -> None:
     watch = watched.watch
     for second in range(20):
-        known = second < 5 or second == 7  # a known attitude restarts the timeout
+        known = second < 5 or second == 7  # a second with a known attitude restarts the timeout
         trigger = watch.trigger(Mode.POINT, known, second * SECOND_NS)
         assert (trigger is Trigger.LOST) is (second >= 12), second
     assert watch.trigger(Mode.ACQUIRE, False, 30 * SECOND_NS) is None
@@ -137,7 +137,7 @@ def test_a_body_without_the_initial_mode_is_refused() -> None:
 
 
 def flying(initial: str = "hold", **changes: Any) -> ModeBench:
-    """Return a testbed in its first mode."""
+    """Return the mode control of a testbed in its first mode."""
     bench = ModeBench(settings=Modes(initial=cast(Any, initial), **changes))
     bench.step()
     return bench
@@ -323,7 +323,7 @@ def test_new_limits_apply_to_all_conditions() -> None:
 
 
 def orbiting(**changes: Any) -> ModeBench:
-    """Return a satellite in safe mode."""
+    """Return the mode control of a satellite in the mode SAFE."""
     bench = ModeBench(
         SATELLITE, Modes(initial="safe", tumble_rate=FAST, known_for=2.0, lost_for=4.0, **changes)
     )

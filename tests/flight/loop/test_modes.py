@@ -1,4 +1,4 @@
-"""Tests that the transition table is complete and that each mode, and SAFE from each mode, can be reached."""
+"""Tests that the transition table is complete, that each mode can be reached, and SAFE from every mode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that a loaded table is confirmed after a minute, and otherwise replaced by the former table."""
+"""Tests that a loaded table is kept after its confirmation, and replaced by the former table otherwise."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MINUTE_NS = 60_000_000_000
 
 
 class Board:
-    """Onboard parameters with a state keeper and a recorder that only store the passed values."""
+    """Onboard parameters with test doubles of state keeper and recorder, which store the passed values."""
 
     def __init__(self, table: KeptTable | None = None, keeps: bool = True) -> None:
         self.noted: list[KeptTable] = []
@@ -38,7 +38,7 @@ class Board:
         )
 
     def values(self, **changes: float) -> dict[str, float]:
-        """Return the values of the active table with changes."""
+        """Return the values of the active table with some changes."""
         return {
             **self.parameters._values,
             **{key.replace("__", "."): value for key, value in changes.items()},
@@ -50,7 +50,7 @@ class Board:
 
 
 def begun(table: KeptTable | None = None, keeps: bool = True) -> Board:
-    """Return a board on which the parameters were started at time 5 ns."""
+    """Return a board whose parameter task started at the time 5 ns."""
     board = Board(table, keeps)
     board.parameters.begin(5)
     return board

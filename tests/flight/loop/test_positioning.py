@@ -28,7 +28,7 @@ class Sink:
 
 
 class KeepingRecorder(Recorder):
-    """Recorder that keeps the values of each packet that could be packed."""
+    """Recorder that keeps the values of each packet which the packer accepts."""
 
     def __init__(self) -> None:
         super().__init__(Sink(), Sink())
@@ -41,7 +41,7 @@ class KeepingRecorder(Recorder):
 
 
 class Receiver:
-    """Receiver with given counters that delivers no readings, or one each second."""
+    """Receiver with given counters, which delivers no reading or one reading each second."""
 
     def __init__(self) -> None:
         self.counters = LINK
@@ -71,7 +71,7 @@ class Bench:
         self._now_ns = 0
 
     def run(self, seconds: int, **changes: object) -> None:
-        """Run once a second; `changes` are the values of the counters from the present time on."""
+        """Run the task once a second. From the present time on, the counters have the values `changes`."""
         self.receiver.counters = replace(self.receiver.counters, **changes)  # type: ignore[arg-type]
         for _ in range(seconds):
             self._now_ns += SECOND_NS

@@ -42,7 +42,7 @@ FULL_COILS = 0.45
 
 
 class Satellite:
-    """A power system, its monitors and task, with coils that obey the limit, and a mode control."""
+    """A power system, its monitors and its task, with coils that obey the limit, and a mode control."""
 
     def __init__(self, charge: float = TRUTH.charge) -> None:
         self.clock = SimClock()
@@ -75,7 +75,7 @@ class Satellite:
         return self.clock.now_ns() * 1e-9
 
     def fly(self, end: float, *faults: tuple[float, str]) -> None:
-        """Run the task once a second until `end` s; each fault begins at its time."""
+        """Run the task once a second until `end` s. Each fault begins at its given time."""
         due = dict(faults)
         bench: Any = SimpleNamespace(hardware=SimpleNamespace(power=self.power))
         while self.seconds < end:
@@ -116,7 +116,7 @@ def pointing(satellite: Satellite) -> Satellite:
 
 @pytest.fixture(scope="module")
 def orbit() -> Satellite:
-    """Return a satellite after an eclipse with full coils, and the sunlight after it."""
+    """Return a satellite that has flown through an eclipse with full coils, and then in sunlight."""
     satellite = pointing(Satellite())
     satellite.fly(END)
     return satellite
@@ -151,7 +151,7 @@ def test_the_estimated_charge_follows_a_battery_unlike_the_described_one(orbit: 
 
 
 def test_battery_bus_and_panels_balance(orbit: Satellite) -> None:
-    """The panel along y is in shadow; the other panel receives the fraction 0.6 (cosine)."""
+    """The powers of battery, bus and panels balance. The lit panel receives the fraction 0.6 (cosine)."""
     lit = [one for one in orbit.true if one["solar_power"] > 0.0]
     assert lit[0]["solar_power"] == pytest.approx(9.0 * 0.6)
     for one in orbit.true[5::50]:

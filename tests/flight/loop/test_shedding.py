@@ -1,4 +1,4 @@
-"""Tests of load shedding with test doubles: signs of overload, order of levels, recovery and telemetry."""
+"""Tests of load shedding with test doubles: indications of overload, order of levels, recovery, telemetry."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ S = 1_000_000_000
 
 
 class Bench:
-    """A load-shedding task; its signs of overload are counters that the test sets."""
+    """A load-shedding task. Counters that the test sets are its indications of overload."""
 
     def __init__(self) -> None:
         self.frames = self.cycles = 0
@@ -44,7 +44,7 @@ class Bench:
         )
 
     def run(self, seconds: int, *, frames: bool = False, cycles: bool = False) -> int:
-        """Run the task once a second, with signs of overload in each; return the level."""
+        """Run the task once a second, with indications of overload in each second; return the level."""
         for _ in range(seconds):
             self.second += 1
             self.frames += frames

@@ -1,6 +1,6 @@
-"""Tests that crashes are counted over the operating time and forgotten after operating time only.
+"""Tests that crashes are counted by operating time, and forgotten only after a period of operating time.
 
-Parameters estimated in one boot are the prior of the next, with an increased covariance.
+The parameters that are estimated in one boot are the prior of the next boot, with a larger covariance.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LABEL = "1970-01-01T00:00:00Z"
 
 
 def boot(state: StoredState, seconds: float, clean: bool, utc: str = LABEL) -> StoredState:
-    """Return the state after one boot."""
+    """Return the crash record after one boot."""
     begun = begin_boot(state, utc)
     state = state_after(begun, seconds, Noted("hold", {}, begun.table), utc)
     return end_cleanly(state) if clean else state
@@ -135,13 +135,13 @@ def test_the_count_is_that_of_the_crashes_in_the_window(
 
 
 BOOT, SETTLED, AGAIN = 0, 600, 640
-"""Cycles at which the first boot starts, the first boot ends, and the second boot ends one second after
-its start."""
+"""Cycles at which the first boot starts, the first boot ends, and the second boot ends, which lasts one
+second."""
 CHANGED = 0.3
 
 
 def booted(flown: Flight, begin: int, end: int, learned: dict[str, Learned]) -> Estimate:
-    """Return the last estimate of a filter that runs over the cycles `begin` to `end` - 1 of a flight."""
+    """Return the last estimate of a filter that runs in the cycles `begin` to `end` - 1 of a flight."""
     prior, problems = start_from(learned, slow_prior(SUSPENDED, SETTINGS), CHANGED)
     assert not problems
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS, prior)
@@ -158,9 +158,10 @@ def error(estimate: Estimate, flown: Flight) -> FloatArray:
 
 
 def test_the_second_boot_knows_the_plant_better_after_a_second_than_the_first_did() -> None:
-    """The errors are rms values over four plants.
+    """A filter that begins with learned parameters has smaller errors after one second than a new filter.
 
-    In the first boot's 15 s the damping is hardly observable.
+    The errors are rms values over four plants. The damping is hardly observable in the 15 s of the first
+    boot.
     """
     begun, begun_again = [], []
     for seed in range(4):
@@ -246,7 +247,7 @@ def test_a_plant_that_is_configured_otherwise_is_another_one() -> None:
 
 def test_a_flight_begins_where_the_last_one_ended_and_from_nothing_with_a_lost_state(tmp_path: Path) -> None:
     def torsion_after(seconds: float, folder: Path, run: str) -> tuple[float, float, list[str]]:
-        """Simulate a run, and return the stored torsion of the thread, its sigma, and the events."""
+        """Simulate a run; return the stored torsion of the thread, its standard deviation, and the events."""
         config = flights.demo_config(seconds, camera=False)
         config = configuration.replace(config, state=configuration.replace(config.state, folder=str(folder)))
         names = flights.event_names(flights.fly(config, tmp_path / run))

@@ -65,7 +65,7 @@ def test_a_table_outlives_a_clean_end_and_a_new_one_no_crash() -> None:
 
 
 def on_disk(disk: Disk) -> StoredState:
-    """Return the state that another process would read."""
+    """Return the state that another process would read from the disk."""
     return StateStore(FOLDER, lambda *_: None, disk).load()
 
 
@@ -81,7 +81,7 @@ def test_running_is_on_disk_before_anything_flies_and_gone_after_a_clean_end() -
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -> None:
-    """The process was killed, or an exception ended it and closed the state keeper."""
+    """A start reports that the last process was killed, or that an exception ended it."""
     disk, clock = Disk(), ManualClock()
     first = keeper_on(disk, clock)
     first.note("hold")
@@ -199,7 +199,7 @@ def stored(folder: Path) -> StoredState:
 
 
 def simulated(folder: Path | None) -> Config:
-    """Return a configuration of simulated devices, with a folder for the state or without."""
+    """Return a configuration of simulated devices, with or without a folder for the state."""
     config = configuration.load(CONFIG)
     if folder is None:
         return config
@@ -263,7 +263,7 @@ def test_a_flight_starts_although_its_folder_cannot_be_made(tmp_path: Path) -> N
 
 
 def begun(folder: Path, runs: list[Path]) -> tuple[StoredState, list[str]]:
-    """Return the state after a boot that ended cleanly, and the names of its events."""
+    """Return the state after a boot that ended cleanly, and the names of the events of this boot."""
     with ExitStack() as stack:
         keeper = open_state(simulated(folder), {}, ManualClock(), stack, runs)
         assert keeper is not None
@@ -295,7 +295,7 @@ def test_a_state_that_vanished_or_is_older_than_a_run_counts_as_an_unclean_stop(
 
 
 def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before(tmp_path: Path) -> None:
-    """After two short runs, the second process detects that the first process was killed."""
+    """Two short runs of a service end cleanly. After a kill, the next process reports an unclean shutdown."""
     path = write_config(tmp_path)
     with path.open("a", encoding="utf-8") as file:
         file.write(f"\nstate: {{folder: {tmp_path / 'state'}}}\n")
@@ -307,7 +307,7 @@ def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before
     assert state.operated == pytest.approx(3.0, abs=1.1), "a second of preparation and two of flight"
     with ExitStack() as killed:
         open_state(configuration.load(path), {}, ManualClock(), killed)
-        killed.pop_all()  # as after kill -9, nothing is closed
+        killed.pop_all()  # as after `kill -9`, nothing is closed
     second = fly(request)
     assert second.folder.name == "run-000002"
     names = [to_text(name) for name in read_run(second.folder)["event"]["name"]]

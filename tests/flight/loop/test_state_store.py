@@ -45,7 +45,7 @@ def test_what_is_stored_is_read_back_by_another_process_of_the_application(tmp_p
 
 
 def _stored(disk: Disk, reports: Reports) -> StateStore:
-    """Return a store on a disk with the states 1 and 2, as a new process finds it."""
+    """Return a store that a new process opens on a disk with the states 1 and 2."""
     first = StateStore(FOLDER, reports, disk)
     first.store(state_of(1))
     first.store(state_of(2))
@@ -55,7 +55,7 @@ def _stored(disk: Disk, reports: Reports) -> StateStore:
 
 
 def calls_of_one_write(bite: int) -> int:
-    """Return how many calls of one `store` change the disk."""
+    """Return the number of calls of one `store` that change the disk."""
     disk = Disk(bite=bite)
     store = _stored(disk, Reports())
     disk.start(None)
@@ -65,7 +65,7 @@ def calls_of_one_write(bite: int) -> int:
 
 @pytest.mark.parametrize("bite", [1 << 30, 100])
 def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int) -> None:
-    """Power is lost before each system call of a write; all files that the disk can then hold are tested."""
+    """If power is lost before any system call of a write, a later start reads the old or the new state."""
     calls, found = calls_of_one_write(bite), 0
     assert calls >= 10
     for stop in range(calls + 1):
@@ -88,7 +88,10 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
 
 @pytest.mark.parametrize("forgotten", ["sync", "sync_folder"])
 def test_the_model_of_power_loss_finds_a_write_that_forgets_to_sync(forgotten: str) -> None:
-    """Without one of the two syncs, the disk may contain an old state or none, so the test above can fail."""
+    """Without one of the two syncs, the model of the disk can lose the new state.
+
+    This shows that the tests of power loss can fail.
+    """
     disk = Disk(forget=forgotten)
     _stored(disk, Reports()).store(state_of(3))
     states = [StateStore(FOLDER, Reports(), after).load() for after in disk.after_power_loss()]
@@ -295,7 +298,7 @@ print(midway)
 
 
 def test_two_hundred_kills_at_random_moments_leave_the_old_state_or_the_new(tmp_path: Path) -> None:
-    """After each of 200 SIGKILLs during a write, the state is the last state or the one in progress."""
+    """After each of 200 SIGKILLs during a write, the stored state is the last one or the one in progress."""
     seed = 20260115
     done = subprocess.run(
         [sys.executable, "-c", WRITER, str(tmp_path), "200", str(seed)],

@@ -1,4 +1,4 @@
-"""Tests that control without a valid estimate commands zero, and that the coil drive corrects and reports."""
+"""Tests that the commanded current is zero without a valid estimate, and of the coil drive's corrections."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DIPOLE = 0.65
 
 
 class Coils:
-    """Coils that store the newest command."""
+    """Coils that store the most recent command."""
 
     def __init__(self) -> None:
         self.currents: FloatArray = np.zeros(3)

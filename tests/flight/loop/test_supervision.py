@@ -1,4 +1,4 @@
-"""Tests that the watchdog is fed only while no group and no worker is stalled."""
+"""Tests that the watchdog is fed only while no rate group and no worker is stalled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that worker messages return every permitted value, and never create another type from bytes."""
+"""Tests that worker messages preserve every permitted value, and never create other types from bytes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LENS = Lens(1024, 768, 500.0, (511.5, 383.5))
 
 
 class Pair(NamedTuple):
-    """Pair of numbers, one of the types that a message to a worker may contain."""
+    """A pair of numbers, one of the types that a worker message may contain."""
 
     first: int
     second: float

@@ -1,4 +1,4 @@
-"""Tests of the memory that a worker process holds after a job, and of the modules that it imports."""
+"""Tests of the memory that a worker process still holds after a job, and of the modules that it imports."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _kept: list[npt.NDArray[np.float64]] = []
 def fill_and_free(_: Any) -> tuple[int, float]:
     """Allocate 48 MiB in blocks and free all except the last block, so that the heap cannot shrink.
 
-    Returns the process identifier and the memory (bytes) that the process then holds.
+    Returns the process identifier, and the memory (bytes) that the process holds afterwards.
     """
     pieces = [np.ones(8192) for _ in range(768)]
     _kept.append(pieces.pop())
@@ -51,7 +51,7 @@ def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
 
 
 def heavy_parts(_: Any) -> list[str]:
-    """Import scipy, and return the modules of numpy that it imported and that no job uses."""
+    """Import scipy; return the modules of numpy that scipy imported although no job uses them."""
     import scipy.linalg  # noqa: F401, PLC0415 - in the worker's process
 
     return [name for name in ("numpy.f2py", "numpy.ma", "numpy.testing") if name in sys.modules]

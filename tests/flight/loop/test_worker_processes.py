@@ -1,4 +1,4 @@
-"""Tests that jobs behave equally in simulated time and in processes, and that no call waits."""
+"""Tests that jobs behave the same in simulated time and in processes, and that no call waits for a job."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ MS = 1_000_000
 
 
 def worker(name: str, function: Callable[[Any], Any]) -> Worker:
-    # Timeouts: a short one for tests of the timeout itself, and a long one because a start takes seconds.
+    # Timeouts (s): a short one for tests of the timeout itself, and a long one because processes start
+    # slowly.
     patience = 1500 if function is hang else 20_000
     return Worker(name, function, latency_ns=50 * MS, timeout_ns=patience * MS)
 
@@ -37,7 +38,7 @@ WORKERS = [worker("double", double), worker("fail", fail)]
 
 
 def wait(runner: JobRunner, seconds: float = 20.0) -> list[JobResult]:
-    """Poll as the control loop does, until a result arrives."""
+    """Poll for a result as the control loop does, until the result arrives."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         if results := runner.collect():
@@ -47,7 +48,7 @@ def wait(runner: JobRunner, seconds: float = 20.0) -> list[JobResult]:
 
 
 def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:
-    """Return a worker's process identifier, once its supervisor has started it."""
+    """Return the process identifier of a worker, once its supervisor has started the worker."""
     deadline = time.monotonic() + seconds
     while name not in runner.process_identifiers() and time.monotonic() < deadline:
         time.sleep(0.005)
@@ -56,7 +57,7 @@ def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:
 
 @pytest.fixture(scope="module")
 def processes() -> Iterator[ProcessRunner]:
-    """Yield workers for all tests of this module; each test leaves every worker idle or replaced."""
+    """Yield workers that all tests of this module share; each test leaves the workers idle or replaced."""
     more = [worker("hang", hang), worker("die", die), worker("function", function)]
     runner = ProcessRunner(SystemClock(), [*WORKERS, *more])
     yield runner
@@ -129,7 +130,7 @@ def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
 
 
 def hear(runner: ProcessRunner, name: str, change: WorkerChange) -> WorkerNews:
-    """Return the first report of the given change of a worker, as the health task receives it."""
+    """Return the first report of a given change of a worker's state, as the health task receives it."""
     deadline = time.monotonic() + 20.0
     while time.monotonic() < deadline:
         for news in runner.news():
@@ -216,7 +217,7 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
         assert flight.stderr is not None
         orphan = int(flight.stdout.readline())
         flight.kill()
-        # The worker inherits standard error, so the pipe closes only when the last process has ended.
+        # The worker inherits standard error, so the pipe closes only when the worker has ended too.
         assert flight.stderr.read() == ""
     assert not lives(orphan)
 

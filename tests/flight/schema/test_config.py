@@ -1,4 +1,4 @@
-"""Tests that a wrong configuration gives one line with the wrong value and the permitted values."""
+"""Tests that a wrong configuration is refused in one line with the wrong value and the permitted values."""
 
 from __future__ import annotations
 
@@ -56,7 +56,10 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
 
 
 def test_the_simulation_case_is_the_thesis_s() -> None:
-    """The thesis's configuration (ch. 5): step_thesis.yaml with another state, without thread and camera."""
+    """step_simulation.yaml is the case of chapter 5 of the thesis, without a thread and a camera.
+
+    Its control, plant and devices are those of step_thesis.yaml.
+    """
     loop, case = (
         as_testbed(reader.load(FOLDER / name)) for name in ("step_thesis.yaml", "step_simulation.yaml")
     )
@@ -253,7 +256,7 @@ def test_no_text_whatever_makes_a_traceback(text: str) -> None:
 @given(st.integers(min_value=0, max_value=len(DEMO) - 1), st.characters(), st.integers(0, 20))
 def test_a_damaged_configuration_is_valid_or_refused_clearly(place: int, letter: str, cut: int) -> None:
     damaged = DEMO[:place] + letter + DEMO[place + cut :]
-    with contextlib.suppress(ConfigError):  # any other exception is a failure
+    with contextlib.suppress(ConfigError):  # an exception of any other type is a failure
         reader.parse(damaged)
 
 
@@ -290,9 +293,10 @@ def test_a_configuration_is_written_in_its_order_and_read_back_the_same() -> Non
 
 
 def test_what_a_lens_differs_by_from_a_pinhole_counts_as_unknown_to_the_streaks() -> None:
-    """The optical axis is 3 and 4 px from the image centre.
+    """An unknown lens is described by the offset of the optical axis and by the distortion.
 
-    The distortion moves the image corner by 1 % of its distance from the centre.
+    The axis is 3 and 4 px from the image centre. The distortion moves the image corner by 1 % of its distance
+    from the centre.
     """
     demo = reader.load(FOLDER / "step_demo.yaml").camera
     assert demo is not None
@@ -383,7 +387,7 @@ def test_values_that_follow_from_craft_and_coils_are_those_tuned_for_the_shipped
     assert config.torque_noise() == noise
     assert config.torque_sizes() == pytest.approx((size, 2e-3 * size))
     assert config.dipole_weight() == dipole
-    # A rigid body rotates by a given angle in a time proportional to the square root of its moment of
+    # At a given torque, a rigid body rotates by an angle in a time proportional to the square root of its
     # inertia.
     rows = (4.0 * config.craft.inertia_matrix()).tolist()
     heavy = reader.replace(config.craft, inertia=tuple(tuple(row) for row in rows))
@@ -407,7 +411,7 @@ def test_the_error_of_the_residual_dipole_follows_from_the_mass_unless_it_is_giv
     config = as_orbit(reader.parse(ORBIT))
     craft = reader.replace(config.craft, mass=2.0)
     assert reader.replace(config, craft=craft).dipole_errors() == pytest.approx((7e-3, 2.1e-3))
-    # A box of 3 kg with edges of 0.1, 0.2 and 0.3 m has these moments.
+    # These are the moments of inertia of a box of 3 kg with edges of 0.1, 0.2 and 0.3 m.
     inertia = tuple((0.25 * np.array([0.13, 0.10, 0.05])).tolist())
     box = reader.replace(config.craft, mass=None, size=(0.1, 0.2, 0.3), inertia=inertia)
     assert reader.replace(config, craft=box).dipole_errors()[0] == pytest.approx(1.05e-2, rel=0.05)
@@ -435,7 +439,7 @@ FIELD_SENSOR = "magnetometer: {max_age: 0.2, sensors: [{part: lis3mdl, measures:
 
 @pytest.mark.parametrize("word", ["inertial_unit: none\n", ""])
 def test_a_magnetometer_becomes_the_unit_of_a_file_without_an_inertial_unit(word: str) -> None:
-    """The section of the VN-100 is removed from the demonstration, or replaced by `none`."""
+    """Without an inertial unit, or with `inertial_unit: none`, the magnetometer takes the unit's role."""
     without = re.sub(r"(?m)^inertial_unit:.*\n(?:  .*\n)*", word, DEMO)
     config = reader.parse(without + FIELD_SENSOR)
     assert (config.inertial_unit.driver, config.inertial_unit.max_age) == ("sensors", 0.2)

@@ -1,4 +1,4 @@
-"""Tests that contradictory values are refused, and that the link accepts only its configured addresses."""
+"""Tests that contradictory values are refused, and that the link accepts only configured addresses."""
 
 from __future__ import annotations
 
@@ -208,7 +208,10 @@ def test_values_at_a_limit_are_accepted(right: str) -> None:
 
 @pytest.mark.parametrize("name", ["sun", "earth", "moon"])
 def test_a_cone_that_reaches_into_the_field_of_view_is_refused(name: str) -> None:
-    """The corner of a square field of 20 deg is atan(sqrt(2) tan(10 deg)) = 14.0 deg from the boresight."""
+    """An exclusion cone must not reach into the field of view.
+
+    The corner of a square field of 20 deg is atan(sqrt(2) tan(10 deg)) = 14.0 deg from the boresight.
+    """
     text = ORBIT.read_text(encoding="utf-8")
     start = text.index("  cones: {")
     line = text[start : text.index("\n", start)]

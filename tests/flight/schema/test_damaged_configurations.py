@@ -1,4 +1,4 @@
-"""Tests that configurations with random wrong values are refused in one line, or are usable."""
+"""Tests that configurations with random wrong values are usable, or are refused in one line."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FACTORS = (-1, 0, 2, 10, 1e-3, 1e3, 1e9, 0.999)
 
 
 def spoil(chance: Random, node: Any) -> None:
-    """Change one random value below a node."""
+    """Change one random value in a tree of values."""
     while True:
         key = chance.choice(list(node) if isinstance(node, dict) else list(range(len(node))))
         below = node[key]
@@ -50,7 +50,7 @@ def spoil(chance: Random, node: Any) -> None:
 
 
 def assert_finite(value: Any) -> None:
-    """Assert that all numbers within a plain value are finite."""
+    """Assert that all numbers in a tree of values are finite."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):
@@ -83,7 +83,7 @@ def test_a_damaged_configuration_is_refused_in_one_line_or_usable(chance: Random
         assert "\n" not in message
         assert len(message) < 8000
         return
-    except DeviceError:  # the devices cannot fulfil this configuration
+    except DeviceError:  # the devices cannot be set as this configuration states
         return
     assert_finite(msgspec.to_builtins(config))
     assert msgspec.convert(msgspec.to_builtins(config), type(config)) == config

@@ -1,4 +1,4 @@
-"""Tests that settings classes have the defaults of their configuration sections."""
+"""Tests that settings classes have the same defaults as the sections of the configuration."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "Vn100Settings": (devices.InertialUnitSection,),
     "HorizonCameraSettings": (devices.WideCamera,),
 }
-"""Configuration sections from which a flight fills each settings class."""
+"""Configuration sections whose values a flight copies into each settings class."""
 
 FILLED = {"DetectionSettings"}
 """Settings classes in which None means a value measured from the frame; a flight uses the camera's value."""
@@ -74,18 +74,18 @@ OTHERS = {
     "VerificationSettings": "limits of the method",
     "Vn100EmulatorSettings": "the emulated unit: truth, not belief",
 }
-"""Settings classes that no section fills, with the reasons."""
+"""Settings classes that no configuration section fills, with the reasons."""
 
 
 def _modules(package: ModuleType) -> Iterator[ModuleType]:
     for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        # Basilisk is an optional extra; its world reads its values from the configuration.
+        # Basilisk is an optional dependency. Its simulated world reads its values from the configuration.
         if not found.name.endswith("__main__") and ".basilisk" not in found.name:
             yield importlib.import_module(found.name)
 
 
 def _settings() -> dict[str, type]:
-    """Return the settings classes of flight software and simulator by name."""
+    """Return the settings classes of the flight software and the simulator, by name."""
     return {
         name: kind
         for package in (knightcube, flight, hal, sim_hal)
@@ -102,9 +102,9 @@ def _default(field: dataclasses.Field[object]) -> object:
 
 
 def _disagreements(kind: type, section: type[msgspec.Struct]) -> list[str]:
-    """Return the values with two different defaults, where times in ns are compared with times in s.
+    """Return the values whose two defaults differ. Times in ns are compared with times in s.
 
-    If a section has no value (None), the settings class determines it.
+    If a section has no default (None), only the settings class has a default, which is not compared.
     """
     of_section = {field.name: field.default for field in msgspec.structs.fields(section)}
     found = []
@@ -146,6 +146,6 @@ def test_a_default_that_differs_is_found() -> None:
 
 
 def test_the_defaults_are_the_published_ones() -> None:
-    """A configuration may omit keys with a default, so a changed default would change its meaning."""
+    """The defaults are unchanged, because a configuration that omits a key depends on its default."""
     published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
     assert json.loads(json.dumps(defaults_of(devices, orbit, sections, testbed))) == published

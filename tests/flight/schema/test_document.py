@@ -1,4 +1,4 @@
-"""Tests that YAML 1.2 text is read as an independent library reads it, or is refused with the line number."""
+"""Tests that YAML 1.2 text is read as by an independent library, or refused with the line number."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 FILES = sorted(path for path in FOLDER.rglob("*.yaml") if "\nextends:" not in path.read_text("utf-8"))
-"""Files without `extends`, a key that the independent reader does not support."""
+"""Files without `extends`, because the independent reader does not support this key."""
 
 _PLAIN = st.sampled_from(
     """true True FALSE yes no on off null ~ none x y N -x- a:b 12:30 1:30:00 1.2.3
@@ -65,7 +65,7 @@ def other_reader(text: str) -> Any:
 
 
 def written(tree: Any, indent: int, flow: bool) -> str:
-    """Return YAML text of nested lists and mappings, whose scalars are YAML text already."""
+    """Return YAML text of nested lists and mappings. The scalars of `value` are already YAML text."""
     if not tree or isinstance(tree, str):
         return f" {tree}" if isinstance(tree, str) else " []" if isinstance(tree, list) else " {}"
     if flow:
@@ -82,7 +82,7 @@ def written(tree: Any, indent: int, flow: bool) -> str:
 
 
 def typed(value: Any) -> Any:
-    """Return a value with the type of each scalar, so that 1, 1.0 and true differ."""
+    """Return a value with the type name of each scalar, so that 1, 1.0 and true differ."""
     if isinstance(value, dict):
         return {key: typed(inner) for key, inner in value.items()}
     return [typed(inner) for inner in value] if isinstance(value, list) else (type(value), repr(value))
@@ -110,7 +110,7 @@ def test_both_readers_agree_about_every_shipped_file_and_its_lines(path: Path) -
 
 
 def _loaded(compose: Callable[[], tuple[_Loader, Any]]) -> tuple[list[tuple[str, int]], Any] | None:
-    """Return lines and values that a parser finds in a text, or None if the parser refuses it."""
+    """Return the values and lines that a parser reads, or None if the parser refuses the text."""
     try:
         loader, node = compose()
         return list(_lines_of(node, "")), node and loader.construct_document(node)
@@ -125,7 +125,10 @@ def _plainly_composed(text: str) -> tuple[_Loader, Any]:
 
 @given(st.data())
 def test_both_parsers_read_the_same_in_a_damaged_file(data: st.DataObject) -> None:
-    """Texts that only libyaml would accept are passed to PyYAML's parser, which refuses them."""
+    """The parsers of libyaml and PyYAML read the same values from damaged files, or both refuse them.
+
+    Texts that only libyaml would accept are passed to PyYAML's parser, which refuses them.
+    """
     text = FILES[data.draw(st.integers(0, len(FILES) - 1))].read_text("utf-8")
     begin = data.draw(st.integers(0, len(text) - 1))
     text = text[begin : begin + 300].partition("\n")[2]
@@ -285,7 +288,8 @@ def test_a_file_takes_over_mappings_key_by_key_and_replaces_lists_and_scalars(tm
 def test_a_packaged_configuration_is_extended_by_its_name(tmp_path: Path, named: str) -> None:
     top = write(tmp_path, "top.yaml", f"extends: {named}\nname: mine\n")
     assert read(top).values == read(FOLDER / "orbit_3u.yaml").values | {"name": "mine"}
-    # A file beside the extending file has precedence over a packaged file, but not over the bare name.
+    # A file in the folder of the extending file has precedence over a packaged file if its full name is
+    # given, but not if the name is given without `.yaml`.
     write(tmp_path, "orbit_3u.yaml", "own: 1\n")
     assert ("own" in read(top).values) == named.endswith(".yaml")
 

@@ -1,4 +1,4 @@
-"""Tests of the sections of a configuration to which the devices of a bring-up session belong."""
+"""Tests of the configuration sections that describe the devices of a bring-up session."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.orbit_devices import orbit_config
 
 
 def _session(power: Power | None) -> Session:
-    """Return a session without hardware."""
+    """Return a bring-up session without hardware."""
     config = reader.replace(orbit_config(), power=power)
     return Session(config, Mock(cameras=None), ExitStack(), lambda _: None)
 

@@ -1,4 +1,4 @@
-"""Tests of the diagnosis of axes and coils with inexact manual rotations, noise, and random swaps."""
+"""Tests of the diagnosis of axes and coils with inexact rotations by hand, noise, and random axis swaps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def rotation(vector: FloatArray) -> FloatArray:
 
 
 def by_hand(generator: np.random.Generator, axes: dict[str, FloatArray]) -> Turns:
-    """Return manual rotations with random errors of axis (6 deg rms) and angle (8 deg rms)."""
+    """Return rotations by hand with random errors of the axis (6 deg rms) and of the angle (8 deg rms)."""
     field, up, bias = (
         np.array([1.9e-5, 0.0, -4.2e-5]),
         np.array([0.0, 0.0, GRAVITY]),
@@ -77,7 +77,7 @@ def test_exchanged_and_reversed_coils_are_found(size_known: bool) -> None:
         current = 0.15 * (1.0 + 0.02 * generator.normal(size=(3, 2)))
         test = CoilTest(np.full(3, 0.15), plus, minus, current, 0.0, 1e-7, np.zeros((3, 2)))
         found = diagnose_coils(test, expected, "xyz", size_known=size_known)
-        # The fault is that of the magnetometer, not of three coils.
+        # The diagnosis blames the magnetometer, not the three coils.
         common = -1.0 if (signs < 0).all() else 1.0
         assert found.serves == order.tolist()
         assert np.array_equal(np.sign(found.strength), common * signs)

@@ -1,4 +1,4 @@
-"""Tests that a bench session with emulated devices identifies each wiring fault, and none if all is correct.
+"""Tests that a bench session with emulated devices identifies each wiring fault, and no fault otherwise.
 
 The drivers are configured by `step_demo`. The emulated devices differ from `step_demo` by one wiring fault.
 The devices send and receive the bytes of their real protocols.
@@ -37,7 +37,7 @@ def configuration(name: str) -> tuple[str, Config]:
 
 
 def windings(**changes: Change) -> Change:
-    """Return the coils x, y and z of step_demo with other values."""
+    """Return the coils x, y and z of `step_demo` with changed values."""
     plain = [
         {"axis": axis, "resistance": 23.0, "channels": [2 * k, 2 * k + 1]}
         for k, axis in enumerate(np.eye(3).tolist())
@@ -48,17 +48,17 @@ def windings(**changes: Change) -> Change:
 
 
 def fault(*names: str) -> Change:
-    """Return the faults of the emulated devices."""
+    """Return faults of the emulated devices."""
     return {"simulation": {"faults": [{"fault": name} for name in names]}}
 
 
 def coil_field(matrix: Any) -> Change:
-    """Return the coils' field at the magnetometer, relative to the usual field."""
+    """Return the coils' field at the magnetometer, relative to its usual value."""
     return {"simulation": {"coil_field": (FIELD * np.array(matrix)).tolist()}}
 
 
 def sensed(**matrices: Any) -> Callable[[Any], Any]:
-    """Return a fault of the IMU that changes the axes or scales of sensors."""
+    """Return a fault of the IMU that changes the axes or scales of its sensors."""
     return lambda sample: replace(
         sample, **{name: np.array(matrix) @ getattr(sample, name) for name, matrix in matrices.items()}
     )
@@ -66,7 +66,7 @@ def sensed(**matrices: Any) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """A wiring fault: changed values, the steps that detect it, and expected findings ("part kind")."""
+    """A wiring fault: changed values, the steps that detect it, and the expected findings ("part kind")."""
 
     change: Change
     steps: str
@@ -78,7 +78,7 @@ class Case:
 
 
 def held(sensor: str, axis: int) -> Callable[[Any], Any]:
-    """Return a fault of the IMU that keeps the first value of one axis of a sensor."""
+    """Return a fault of the IMU that freezes one axis of a sensor at its first value."""
     kept: list[float] = []
 
     def alter(sample: Any) -> Any:
@@ -91,7 +91,7 @@ def held(sensor: str, axis: int) -> Callable[[Any], Any]:
 
 
 def repeated(sensor: str) -> Callable[[Any], Any]:
-    """Return a fault of the IMU whose sensor has a new value in every second sample only."""
+    """Return a fault of the IMU that repeats each value of a sensor in the next sample."""
     kept: list[Any] = []
 
     def alter(sample: Any) -> Any:
@@ -102,14 +102,14 @@ def repeated(sensor: str) -> Callable[[Any], Any]:
 
 
 def exchanged_strings() -> list[Any]:
-    """Return the solar strings of `orbit` with the first two channels swapped."""
+    """Return the solar strings of `orbit` with exchanged channels of the first two strings."""
     strings = [msgspec.to_builtins(one) for one in configuration("orbit")[1].solar_strings.strings]  # type: ignore[union-attr]
     strings[0]["channel"], strings[1]["channel"] = strings[1]["channel"], strings[0]["channel"]
     return strings
 
 
 def sagging(opened: Session) -> None:
-    """Make the supply voltage fall in proportion to its current, by 20 % at 0.1 A."""
+    """Reduce the supply voltage in proportion to the supply current, by 20 % at 0.1 A."""
     circuit = opened.hand.hardware.circuit
     measure, currents = circuit.mean_supply, circuit.currents
 
@@ -134,7 +134,7 @@ def loose_coil(opened: Session) -> None:
 
 
 def pictured(change: Callable[[Any], Any]) -> Callable[[Session], None]:
-    """Return a fault of the star camera that changes its pixels."""
+    """Return a fault of the star camera that changes the pixels of its frames."""
 
     def spoil(opened: Session) -> None:
         camera = opened.rig.cameras[0]  # type: ignore[index]
@@ -147,7 +147,7 @@ def pictured(change: Callable[[Any], Any]) -> Callable[[Session], None]:
 
 
 def without_stars(pixels: Any) -> Any:
-    """Return a frame in which one pixel of a hundred is hot."""
+    """Return a frame without stars, in which one pixel of a hundred is hot."""
     hot = np.random.default_rng(1).random(pixels.shape) < 0.01
     return np.where(hot, 3000, pixels).astype(pixels.dtype)
 
@@ -416,7 +416,7 @@ CASES = {
 
 
 def session(case: Case, folder: Path) -> Session:
-    """Return a session whose emulated devices differ from the configuration by the change of a case."""
+    """Return a session whose emulated devices differ from the configuration as the case states."""
     path = folder / "wired.yaml"
     path.write_text(to_yaml({"extends": case.base, **case.change}), encoding="utf-8")
     wired, config = requested_config(RunRequest(path, Path()))
@@ -429,7 +429,7 @@ def session(case: Case, folder: Path) -> Session:
 
 
 def outcomes(opened: Session, steps: str) -> list[Outcome]:
-    """Return the outcomes of steps, after which the coils must carry no current."""
+    """Return the outcomes of some steps, and check that the coils carry no current afterwards."""
     found = []
     for name in steps.split():
         try:
@@ -490,7 +490,7 @@ POWER = {"power": {"battery": {"capacity": 2.0}}}
 
 
 def fitted(change: Change, folder: Path, *, fault_of: str = "") -> Session:
-    """Return a session with a change of `orbit` that drivers and emulated devices share."""
+    """Return a session in which the drivers and the emulated devices share a change of `orbit`."""
     opened = session(Case(change | (fault(fault_of) if fault_of else {}), "", [], base="orbit"), folder)
     opened.config = requested_config(RunRequest(folder / "wired.yaml", Path()))[1]
     return opened

@@ -1,1 +1,1 @@
-"""Tests of ground.campaigns."""
+"""Tests of the package ground.campaigns."""

@@ -1,4 +1,4 @@
-"""Tests of runs with random values: distributions, refusals, resuming, and the table of failed runs."""
+"""Tests of runs with random values: distributions, refusals, resumption, and the table of failed runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SIMULATION = DEMO.with_name("step_simulation.yaml")
 
 
 def draws(text: str, value: float, count: int = 4000) -> np.ndarray[Any, Any]:
-    """Return random values that a variation draws for a configured number."""
+    """Return random values that a variation draws for a number of the configuration."""
     one, chance = variation_of(f"key={text}"), np.random.default_rng(5)
     return np.array([one.draw(chance, value) for _ in range(count)])
 
@@ -105,7 +105,10 @@ def test_values_of_an_extended_file_and_defaults_can_be_drawn() -> None:
 
 
 def test_an_impossible_inertia_is_drawn_again() -> None:
-    """At 60 %, a third of the drawn inertias of a slender body violate the triangle inequality."""
+    """A drawn inertia that violates the triangle inequality is drawn again.
+
+    At 60 %, a third of the inertias of a slender body do.
+    """
     for given in cases(ORBIT, "craft.inertia=60%", runs=8):
         moments = np.sort(yaml.safe_load(given["config"])["craft"]["inertia"][:3])
         assert moments[2] <= moments[0] + moments[1]
@@ -145,7 +148,7 @@ def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) 
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "campaign.json").write_text((tmp_path / "whole" / "campaign.json").read_text())
-    # The second line is cut off, as after a kill of the campaign.
+    # The last line of the results is incomplete, as after a kill of the campaign.
     (broken / "results.jsonl").write_text(lines[1] + lines[0][:40])
     facts = json.loads(json.dumps(fly(campaign, 3, 7, broken, workers=1).facts).replace("broken", "whole"))
     assert facts == whole.facts
@@ -158,7 +161,10 @@ def test_a_campaign_continues_after_a_kill_with_the_same_result(tmp_path: Path) 
 def test_the_listed_command_flies_a_failed_flight_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A run of 2 s is too short to meet the limit of the average power."""
+    """The command that the campaign prints for a failed flight reproduces the result of this flight.
+
+    A run of 2 s is too short to meet the limit of the average power.
+    """
     out = tmp_path / "campaign"
     vary = ["--vary", "simulation.release.rate=-0.3..-0.2"]
     words = ["campaign", str(SIMULATION), *vary, "--runs", "1", "--duration", "2", "--workers", "1"]
@@ -177,7 +183,7 @@ def test_the_listed_command_flies_a_failed_flight_again(
 
 @pytest.mark.slow
 def test_an_interrupted_flight_has_no_result() -> None:
-    """The signal arrives during the run, and ends it like Ctrl-C."""
+    """A SIGINT during a run, like Ctrl-C, ends the campaign without a result of this run."""
     code = (
         "import os, signal, sys, threading\n"
         "from pathlib import Path\n"

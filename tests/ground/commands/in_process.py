@@ -1,7 +1,4 @@
-"""Runs `knightcube` command lines in the test process, which loads modules and star catalogue only once.
-
-`test_commands.py` tests that a separate process gives the same output.
-"""
+"""Runs `knightcube` command lines in the test process, to load modules and star catalogue only once."""
 
 from __future__ import annotations
 
@@ -26,6 +23,6 @@ def command(*arguments: str | Path, folder: Path = ROOT) -> CompletedProcess[str
     ):
         try:
             status = main(words)
-        except SystemExit as end:  # argparse exits after help or wrong use
+        except SystemExit as end:  # argparse exits after `--help` or wrong use
             status = end.code if isinstance(end.code, int) else 1
     return CompletedProcess(words, status, raw.getvalue().decode(), complaint.getvalue())

@@ -18,5 +18,5 @@ def test_the_commands_are_the_published_ones() -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_has_its_published_arguments(name: str) -> None:
-    """Scripts of users depend on these arguments."""
+    """The published arguments, defaults and choices do not change, because users' scripts depend on them."""
     assert arguments_of(f"ground.commands.{COMMANDS[name][2]}") == PUBLISHED[name]

@@ -1,4 +1,4 @@
-"""Tests of `knightcube bringup`: stored steps, continuation, and the corrected configuration."""
+"""Tests of `knightcube bringup`: stored steps, resumption, and the corrected configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of `knightcube calibrate`, which makes a camera file for `knightcube solve` from sky images."""
+"""Tests of `knightcube calibrate`, which makes a camera file for `knightcube solve` from star images."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], tmp_path: Path) -> None:
-    """The simulator's camera has no distortion and a centred axis.
+    """The calibration finds the lens of the simulated camera, which has no distortion and a centred axis.
 
-    All fitted values must lie within five sigmas.
+    All fitted values must lie within five standard deviations of the truth.
     """
     out = tmp_path / "camera.yaml"
     done = command("calibrate", *pictures, "--fov", "12.3", "--out", out, "--json")
@@ -42,7 +42,10 @@ def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], 
 
 
 def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path], tmp_path: Path) -> None:
-    """The central 7 deg of one image exclude the edge, where a distortion would be measurable."""
+    """Parameters that the stars do not determine are named and not written.
+
+    The image covers only the central 7 deg, where a distortion is not measurable.
+    """
     middle, out = tmp_path / "middle.png", tmp_path / "camera.yaml"
     pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle)
     done = command("calibrate", middle, "--fov", "7.05", "--out", out)
@@ -56,7 +59,7 @@ def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path]
 
 
 def test_a_camera_file_says_how_well_the_lens_is_known(pictures: list[Path], tmp_path: Path) -> None:
-    """`knightcube rate` uses the uncertainty of the focal length from the fit."""
+    """`knightcube rate` uses the uncertainty of the focal length in the camera file."""
     out = tmp_path / "camera.yaml"
     done = command("calibrate", *pictures, "--fov", "12", "--out", out, "--json")
     facts = json.loads(done.stdout)
@@ -116,7 +119,7 @@ def test_a_file_that_is_there_is_not_overwritten(pictures: list[Path], tmp_path:
 def test_mirrored_pictures_give_the_lens_of_the_pictures_as_they_are(
     pictures: list[Path], tmp_path: Path
 ) -> None:
-    """Two of three images are mirrored; the third image is excluded and named."""
+    """If two of three images are mirrored, the third image is excluded and named."""
     paths = [tmp_path / path.name for path in pictures]
     for number, (path, source) in enumerate(zip(paths, pictures, strict=True)):
         pixels = np.asarray(pillow.open(source))

@@ -23,7 +23,7 @@ SMALL = "{%s, columns: 64, rows: 64, bits: %d, exposure: 0.04}"
 
 
 def with_camera(folder: Path, device: str, bits: int = 8) -> Path:
-    """Return a configuration of real devices with the given camera."""
+    """Return a configuration of real devices with the given camera section."""
     path = folder / "flight.yaml"
     camera = SMALL % (f"device: {device}" if device else "period: 5.0", bits)
     path.write_text(TESTBED.replace("camera: none", f"camera: {camera}"), encoding="utf-8")
@@ -32,7 +32,7 @@ def with_camera(folder: Path, device: str, bits: int = 8) -> Path:
 
 @pytest.fixture
 def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
-    """Install an emulated V4L2 camera of 64 x 64 pixels and a clock that jumps."""
+    """Install an emulated V4L2 camera of 64 x 64 pixels, and a clock that jumps to the end of each wait."""
     clock = ManualClock()
     kernel = kernel_in(tmp_path, clock, monkeypatch)
     kernel.sizes = {"GREY": (64, 64), "Y10": (64, 64)}

@@ -65,7 +65,10 @@ def test_frames_are_triggered_one_by_one() -> None:
 
 @pytest.mark.parametrize(("polls", "comes"), [(2161, True), (2162, False)])
 def test_a_frame_is_awaited_for_eight_exposures_and_ten_seconds(polls: int, comes: bool) -> None:
-    """With an exposure of 0.1 s, the timeout of 10.8 s is 2160 polls at intervals of 5 ms."""
+    """The timeout of a frame is eight exposures plus ten seconds.
+
+    For an exposure of 0.1 s, the timeout of 10.8 s is 2160 polls at intervals of 5 ms.
+    """
     clock = ManualClock()
     frames = camera._frames(clock, Source(clock, polls), 100_000_000, 1)
     if comes:
@@ -83,7 +86,7 @@ def test_several_frames_are_named_by_their_numbers(tmp_path: Path, count: int, n
 
 
 def motion(**changes: Any) -> FrameMotion:
-    """Return a motion with one used streak and one unused streak."""
+    """Return a motion that was estimated from one of two streaks."""
     ends = np.array([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [7.0, 8.0]]])
     known = {
         "rate": np.array([3e-3, 0.0, 4e-3]), "covariance": np.diag([1e-8, 4e-8, 1e-8]), "length": 12.34,

@@ -1,4 +1,4 @@
-"""Tests of the command line: the examples work, an error is one line, and Ctrl-C loses no data."""
+"""Tests of the command line: the examples work, each error is one line, and Ctrl-C loses no data."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tests.support.places import DEMO, ROOT
 
 
 def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run `knightcube` in the repository."""
+    """Run `knightcube` in a separate process in the repository."""
     words = [sys.executable, "-m", "flight", *map(str, arguments)]
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
 
 
 def obeyed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
-    """Return exit status, output and error output of a command that runs in the test process."""
+    """Return exit status, output and error output of a command, run in the test process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         try:
@@ -186,7 +186,7 @@ def test_a_file_whose_name_is_not_valid_text_is_named_all_the_same(
 
 
 def test_on_board_nothing_is_imported_that_a_board_does_not_need() -> None:
-    """The flight application must not import plot libraries, the simulator or general optimisers."""
+    """The flight application imports no plotting library, no simulator and no general optimiser."""
     script = (
         "import sys, flight.app.flight, flight.app.cli; "
         "away = ('matplotlib', 'PIL', 'ground', 'sim_hal', 'pytest', 'hypothesis'); "

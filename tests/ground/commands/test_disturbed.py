@@ -23,7 +23,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:
-    """Run a shell line and return the exit status of the first failing command of its pipe."""
+    """Run a shell line, and return the exit status of the first command that fails in its pipe."""
     words = ["bash", "-o", "pipefail", "-c", line.replace("FLIGHT", f"{sys.executable} -m flight")]
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
 
@@ -41,9 +41,10 @@ def test_output_that_does_not_fit_the_disk_is_one_line(words: str, run_folder: P
 
 
 def test_ctrl_c_ends_a_command_by_the_signal_itself_from_its_first_import_on() -> None:
-    """During the first import, neither project code nor library code can handle the interrupt."""
+    """Ctrl-C ends a command even during its first import, in which Python code cannot handle the signal."""
     script = (
-        # Restore the handler as in a terminal, because a shell's `&` ignores the signal.
+        # Restore the default handler as in a terminal, because commands that a shell starts by `&` ignore the
+        # signal.
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import flight.__main__\n"
         "assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL\n"

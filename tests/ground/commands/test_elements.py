@@ -1,4 +1,4 @@
-"""Tests that `knightcube elements` fits elements to GPS fixes and that `knightcube check` accepts them."""
+"""Tests that `knightcube elements` fits elements to GPS fixes, and that `knightcube check` accepts them."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_elements_are_fitted_to_noisy_fixes(velocity: bool, tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_elements_are_fitted_to_the_fixes_in_a_flight_log(tmp_path: Path) -> None:
-    """The log contains one GPS fix every ten seconds."""
+    """Elements are fitted to a flight log with one GPS fix every ten seconds."""
     out, path = tmp_path / "run", tmp_path / "mine.yaml"
     path.write_text("extends: orbit_3u\ncamera: none\nwide_cameras: []\n", encoding="utf-8")
     assert command("run", path, "--duration", "70", "--out", out).returncode == 0

@@ -1,4 +1,4 @@
-"""Tests of `knightcube horizon`, which gives the nadir direction of an image as numbers and as an image."""
+"""Tests of `knightcube horizon`, which gives the nadir direction of an image as numbers and as a drawing."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def test_json_shows_nadir_with_its_covariance(folder: Path) -> None:
     facts = json.loads(done.stdout)
     assert facts["status"] == "found"
     off = np.degrees(np.arccos(np.array(facts["nadir_camera"]) @ nadir(SCENE)))
-    # The lens has a distortion of up to 20 px at the corners. Neither the command nor its covariance accounts
-    # for it.
+    # The lens has a distortion of up to 20 px at the corners. The command and its covariance do not account
+    # for this distortion.
     assert off < 1.0
     assert np.all(np.linalg.eigvalsh(np.array(facts["covariance_rad2"])) > -1e-15)
     assert facts["sigma_deg"] > 0.05
@@ -74,15 +74,15 @@ LEVEL = limb_scene(
     sun=np.array([1.0, 0.6, 0.5]),
     dip=float(np.arcsin(6_378.137 / 6_978.137) - 0.5 * np.pi),
 )
-"""The boresight is horizontal and the limb is 24 deg below it."""
+"""In this scene the boresight is horizontal, and the limb is 24 deg below the boresight."""
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
-    """Return a folder with three images and their nadirs, by name.
+    """Return a folder with three images, and their nadir directions by name.
 
-    The images `first` and `later` are of a horizontal camera at two times. The image `right` is of a camera
-    that looks to the right of it.
+    A horizontal camera took the images `first` and `later` at two times. A camera that points to the right of
+    it took the image `right`.
     """
     folder = tmp_path_factory.mktemp("paper")
     model = EarthCameraModel.fuga15d(seed=1)
@@ -119,7 +119,7 @@ def test_the_papers_methods_find_nadir_of_a_level_sunlit_limb_to_a_degree(
     assert facts["method"] == words[1]
     off = np.degrees(np.arccos(min(1.0, np.array(facts["nadir_camera"]) @ downs[picture])))
     assert off < 1.0
-    # An undetected rotation of 1.1 deg would exceed this uncertainty.
+    # An undetected rotation of the camera by 1.1 deg would exceed this limit.
     assert picture == "first" or off < 0.6
 
 
@@ -172,7 +172,7 @@ def test_a_mistake_is_reported_with_exit_status_2(words: list[str], complaint: s
 
 
 def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
-    """The nadir for a field of view that is 5 % wrong is within three standard deviations of the true one."""
+    """If the field of view is 5 % wrong, the nadir error stays within three standard deviations."""
     facts = {}
     for field, error in ((67.0, None), (67.0, 3.3), (70.3, 3.3)):
         words = [] if error is None else ["--fov-error", str(error)]
@@ -189,7 +189,7 @@ def test_an_uncertain_field_of_view_is_in_the_uncertainty(folder: Path) -> None:
         )
         assert done.returncode == 0, done.stderr
         facts[field, error] = json.loads(done.stdout)
-    # If the altitude is known, the curvature of the limb determines the focal length well.
+    # At a known altitude, the curvature of the limb determines the focal length well.
     assert facts[67.0, 3.3]["sigma_deg"] > 1.1 * facts[67.0, None]["sigma_deg"]
     for uncertain in (facts[67.0, 3.3], facts[70.3, 3.3]):
         off = np.subtract(uncertain["nadir_camera"], facts[67.0, None]["nadir_camera"])

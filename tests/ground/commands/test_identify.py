@@ -34,13 +34,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, obj
     ]
     done = command("identify", DEMO, *words, "--json")
     assert done.returncode == 0, done.stderr
-    assert all("events" in line for line in done.stderr.splitlines())  # progress lines
+    assert all("events" in line for line in done.stderr.splitlines())  # progress lines only
     facts: dict[str, object] = json.loads(done.stdout)
     return place, facts
 
 
 def test_a_flight_finds_the_simulated_body(flown: tuple[Path, dict[str, object]]) -> None:
-    """The expected values are N A B / J, k / J and c / J of config/step_demo.yaml."""
+    """The fit finds N A B / J, k / J and c / J of config/step_demo.yaml."""
     _, facts = flown
     motion: dict[str, dict[str, float]] = facts["motion"]  # type: ignore[assignment]  # JSON
     truth = {"gain": 80 * 0.0081 * 4.5e-4 / 1.05e-3, "torsion": 1e-5 / 1.05e-3, "damping": 2e-6 / 1.05e-3}

@@ -1,4 +1,4 @@
-"""Tests that `knightcube identify` of a satellite gives a configuration nearer to the truth."""
+"""Tests that `knightcube identify` of a satellite gives a configuration that is closer to the truth."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     """Return the folder of a run, the output of the command, and the configuration fragment."""
     place = tmp_path_factory.mktemp("identify")
     config = place / "first.yaml"
-    seen = "camera: {objects: null}\nwide_cameras: []"  # the run has no horizon measurements and no objects
+    seen = "camera: {objects: null}\nwide_cameras: []"  # the run has no horizon cameras and no objects
     config.write_text(f"extends: orbit_3u\nname: first\nduration: 65.0\n{seen}\n{WORLD}")
     fly(config, place / "first")
     done = command("identify", place / "first", "--out", place / "learned.yaml", "--json")
@@ -54,9 +54,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 
 
 def ratio_errors(folder: Path) -> list[float]:
-    """Return the largest error of an element of J / trace(J) for each inertia that the log of a run states.
+    """Return the largest element error of J / trace(J) for each inertia in the log of a run.
 
-    The first inertia is the configured one; the flight estimates the later ones.
+    The first inertia is that of the configuration, and all later inertias are estimates of the flight.
     """
     elements = read_run(folder)["description"]["inertia"].astype(float)
     true = TRUE[(0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)] / np.trace(TRUE)
@@ -185,7 +185,7 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
 
 
 def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, dict[str, Any]]) -> None:
-    """The accuracies of the fragment are those of the packet `lens`, rounded up."""
+    """The fragment contains the estimated lens. Its accuracies are those of the packet `lens`, rounded up."""
     place, _ = flown
     config = as_orbit(load(place / "first" / "config.yaml"))
     found = learned_description(read_run(place / "first"), config)
@@ -209,7 +209,7 @@ def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, 
     stated = (accuracy.focal_length, accuracy.centre, accuracy.distortion, accuracy.line_time)
     assert stated == pytest.approx((2e-4, 0.125, 4e-4, 1e-7), rel=0.02)
     assert (camera.line_time, camera.psf_sigma) == (2.5e-5, 1.25)
-    # The pixel on the configured axis keeps its direction in body axes.
+    # The pixel of the configured optical axis keeps its direction in body axes.
     (place / "plain.yaml").write_text(fragment(found, place / "first", "first/config.yaml"))
     plain = as_orbit(load(place / "plain.yaml")).camera
     assert plain is not None

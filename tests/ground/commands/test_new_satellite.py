@@ -35,7 +35,7 @@ FOURTH = ("--coil", "axis=1/1/1,dipole=1,current=0.1,resistance=5")
 
 
 def written(folder: Path, *words: str) -> OrbitConfig:
-    """Return the configuration that the command writes with these options."""
+    """Return the configuration that the command writes for these options."""
     path = folder / "mine.yaml"
     done = command("new-satellite", *words, "--out", path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -118,7 +118,7 @@ def test_the_star_camera_looks_away_from_the_sun(tmp_path: Path, utc: str, hours
 
 
 def test_the_derived_values_are_those_of_the_shipped_satellites(tmp_path: Path) -> None:
-    """The scaling laws reproduce the two tuned configurations."""
+    """The scaling laws reproduce the values of `orbit` and `orbit_3u`, which were tuned, within 35 %."""
     for name, words in {
         "orbit": ("--mass", "0.628", "--size", "0.1x0.1x0.1", "--coil", _coil(0.0959, 0.148, 23.0)),
         "orbit_3u": ("--mass", "4", "--size", "0.3x0.1x0.1", "--coil", _coil(0.2, 0.148, 9.13)),
@@ -144,7 +144,8 @@ def _coil(dipole: float, current: float, resistance: float) -> str:
 
 
 def test_inclinations_and_dipoles_have_their_textbook_values() -> None:
-    # In Vallado, Fundamentals of Astrodynamics, example 11-2, a near-circular orbit at 800 km has 98.6 deg.
+    # The inclination of a near-circular Sun-synchronous orbit at 800 km is 98.6 deg in Vallado, Fundamentals
+    # of Astrodynamics, example 11-2.
     assert sun_synchronous_inclination(800e3, 0.0) == pytest.approx(98.60, abs=0.02)
     assert sun_synchronous_inclination(6000e3, 0.0) is None
     equal = read_coils("axis=xyz,turns=80,area=0.0081,current=0.148,resistance=23")

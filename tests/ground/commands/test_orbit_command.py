@@ -20,13 +20,13 @@ UTC_NS = 1_774_008_000_000_000_000
 
 
 class Tracked(dict[str, Any]):
-    """The fields of a run that `orbits_of` reads."""
+    """Test double of a run with the fields that `orbits_of` reads."""
 
     folder = Path("runs/tracked")
 
 
 def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
-    """Return packets of a pass of an object at a distance of 2,000 km, and its true state at mid-pass."""
+    """Return packets of the pass of an object at a distance of 2,000 km, and its true state at mid-pass."""
     rng = np.random.default_rng(4)
     times = np.arange(0.0, seconds + 0.5, 10.0)
     middle = len(times) // 2
@@ -34,7 +34,7 @@ def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
     other = np.array([6.6e6, 1.9e6, 5e5, -914.0, 1.2e3, 7.5e3])
     observer, true = (passes.flown_states(state, times, middle) for state in (own, other))
     way = true[:, :3] - observer[:, :3]
-    # The Earth's speed at the epoch, near the equinox, is 29.9 km/s according to an almanac.
+    # The almanac gives 29.9 km/s for the speed of the Earth at the epoch, near the equinox.
     earth = np.array([0.0, -29.9e3 * np.cos(np.radians(23.44)), -29.9e3 * np.sin(np.radians(23.44))])
     late = np.linalg.norm(way, axis=1, keepdims=True) / passes.LIGHT
     seen = way - late * (true[:, 3:] + earth)
@@ -67,7 +67,7 @@ def test_the_orbit_is_the_true_one_in_each_form(
     found = np.array(facts["orbit"]["position_m"] + facts["orbit"]["velocity_m_s"])
     covariance = np.array(facts["orbit"]["covariance"])
     off = found - true
-    # 99.9 % quantile of chi-square with six degrees of freedom.
+    # 99.9 % quantile of the chi-square distribution with six degrees of freedom.
     assert off @ np.linalg.solve(covariance, off) < 22.5
     assert np.linalg.norm(off[:3]) < 50e3
     assert facts["orbit"]["utc"].startswith("2026-03-20T12:02:00")

@@ -1,4 +1,4 @@
-"""Tests of `knightcube parameters` with the flight's parameter task at the other end of its socket."""
+"""Tests of `knightcube parameters`, with the parameter task of the flight at the other end of its socket."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from tests.support.flights import demo_config
 
 
 class Sink:
-    """A log that keeps nothing."""
+    """A log that stores nothing."""
 
     def write(self, packet: bytes) -> None:
         pass
 
 
 class Answering:
-    """The flight's end of the socket, which replies to parameter commands as the loop does."""
+    """The flight's end of the command socket, which answers parameter commands as the loop does."""
 
     def __init__(self, path: Path) -> None:
         self.modes: list[Modes] = []
@@ -77,7 +77,7 @@ def flight(tmp_path: Path) -> Iterator[Answering]:
 
 
 def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, object]]:
-    """Run the command with --json."""
+    """Run the command `parameters` with `--json`."""
     status = main(["parameters", "--to", str(tmp_path / "s"), "--json", *words])
     return status, json.loads(capsys.readouterr().out)
 

@@ -1,4 +1,4 @@
-"""Tests of the output, the plots and the refusals of the commands `passes` and `day`."""
+"""Tests of the commands `passes` and `day`: output, plots and refusals."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mende
     assert facts["way_deg"] == pytest.approx(np.degrees(swept))
     assert facts["way_deg"] >= facts["turn_deg"]
     assert facts["mean_heat_W"] == pytest.approx(facts["energy_J"] / 120.0)
-    # The nadir direction rotates once per orbit of 5,677 s.
+    # The nadir direction rotates once per orbit, in 5,677 s.
     assert np.linalg.norm(facts["rate_rad_s"][0]) == pytest.approx(2.0 * np.pi / 5677.0, rel=0.01)
     assert np.abs(facts["dipole_A_m2"]).max() == pytest.approx(
         facts["peak_of_limit"] * facts["dipole_limit_A_m2"][0]

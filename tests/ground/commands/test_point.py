@@ -23,7 +23,7 @@ BEGUN = np.array([0.5, -0.5, 0.1, 0.7]) / np.linalg.norm([0.5, -0.5, 0.1, 0.7])
 
 
 def turned_by(words: list[str]) -> FloatArray:
-    """Return the attitude matrix (3, 3), ICRS to body, at `TIME`, of a packed and unpacked command."""
+    """Return the attitude matrix (3, 3), ICRS to body, that a command gives at `TIME` after packing."""
     parser = argparse.ArgumentParser()
     satellite.configure_command(parser)
     options = parser.parse_args(["--to", "127.0.0.1:1", "point", *words])
@@ -34,7 +34,7 @@ def turned_by(words: list[str]) -> FloatArray:
 
 UP = ORBIT.position_at(TIME)[0] / np.linalg.norm(ORBIT.position_at(TIME)[0])
 AHEAD = np.array([-UP[2], 0.0, UP[0]])
-"""Position and velocity on a circular polar orbit above the x axis."""
+"""Position above the +x axis and direction of motion, on a circular polar orbit."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Tests of `knightcube rate`, which gives the rate of an image, its covariance, and a plot of the streaks."""
+"""Tests of `knightcube rate`, which gives the rate in an image, its covariance, and a plot of the streaks."""
 
 from __future__ import annotations
 
@@ -92,9 +92,10 @@ def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) 
 
 
 def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, picture: Path) -> None:
-    """The image's point spread is 1 px.
+    """A stated point spread function that is too wide increases the uncertainty, or leads to a refusal.
 
-    If 2 px are stated, the uncertainty grows; if 4 px are stated, the rate is refused.
+    The true width is 1 px. If 2 px are stated, the uncertainty is larger. If 4 px are stated, the rate is
+    refused.
     """
     told = [
         "--fov",

@@ -1,4 +1,4 @@
-"""Tests that `knightcube renewal` makes keys and bundles that an on-board computer accepts."""
+"""Tests that `knightcube renewal` makes keys and update bundles that a board accepts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the printed reports, exports and initial orbits of a run."""
+"""Tests of the commands that print reports, exports and initial orbits of a run."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_an_export_prints_its_files(flown: Path, tmp_path: Path) -> None:
 
 
 def orbit(lasts: bool = True) -> ObjectOrbit:
-    """Return an orbit of an object whose values all differ."""
+    """Return an orbit of an object in which no two values are equal."""
     state = np.array([7e6, -1e6, 2e6, 1e3, 7e3, -5e2])
     root = np.arange(36.0).reshape(6, 6) / 10.0 + np.diag([30.0, 20.0, 10.0, 3.0, 2.0, 1.0])
     found = FirstOrbit(5.0, state, root @ root.T, 3e5, (2.9e5, 3.2e5), lasts, 12.5, 14)

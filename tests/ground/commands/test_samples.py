@@ -1,4 +1,4 @@
-"""Tests that the commands find the truth in images of `knightcube samples` and `knightcube camera --rate`."""
+"""Tests that commands find the truth of images by `knightcube samples` and `knightcube camera --rate`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.places import DEMO
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Return the facts that `samples --json` prints."""
+    """Return the JSON object that `samples --json` prints."""
     done = command("samples", "--out", tmp_path_factory.mktemp("samples"), "--json")
     assert done.returncode == 0, done.stderr
     facts: dict[str, Any] = json.loads(done.stdout)
@@ -26,7 +26,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def _tried(samples: dict[str, Any], name: str) -> dict[str, Any]:
-    """Run the command that is printed for a sample, and return its JSON output."""
+    """Run the command that is printed for a sample image, and return its JSON output."""
     (line,) = [line for line in samples["try"] if line.startswith(f"{name} ")]
     done = command(*line.split(), "--json")
     assert done.returncode == 0, done.stderr
@@ -85,14 +85,15 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_frames_of_a_turning_camera_have_their_truth_beside_them(config: Path, tmp_path: Path) -> None:
-    """The rate is in camera axes, so it does not depend on the mounting."""
+    """The true rate of a frame is stated in camera axes, so it is independent of the camera's mounting."""
     rate = ["0.03", "0.02", "-0.01"]
     words = ["--exposure", "0.3", "--rate", *rate, "--count", "2", "--out", str(tmp_path / "turn.png")]
     done = command("camera", "--config", config, *words)
     assert done.returncode == 0, done.stderr
     truths = [json.loads((tmp_path / f"turn-{number}.json").read_text()) for number in (1, 2)]
     between = angle_between(np.array(truths[0]["attitude"]), np.array(truths[1]["attitude"]))
-    # The second frame is triggered after the readout of the first (0.05 s), which is polled every 5 ms.
+    # The second frame is triggered after the readout of the first frame (0.05 s). The readout is polled every
+    # 5 ms.
     assert float(between) == pytest.approx(np.linalg.norm([0.03, 0.02, 0.01]) * 0.3525, rel=0.01)
     found = command(
         "rate", tmp_path / "turn-2.png", "--camera", config, "--exposure", "0.3", "--prior", *rate, "--json"

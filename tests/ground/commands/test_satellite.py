@@ -1,4 +1,4 @@
-"""Tests of commands, parameters and files of a satellite with test doubles of the socket and the link."""
+"""Tests of commands, parameters and files of a satellite, with test doubles of socket and link."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ DEFAULTS = {
 
 
 def packed(packet: Packet, **values: Any) -> bytes:
-    """Return a packet with zeros and empty texts except for given values."""
+    """Return a packet whose values are zero or empty, except for the given values."""
     plain: dict[str, Any] = {}
     for field in packet.fields:
         zero: Any = "" if field.kind.startswith("S") else 0
@@ -76,7 +76,7 @@ def table(values: dict[str, float], **changes: Any) -> bytes:
 
 
 class Flight:
-    """A test double of a flight process, which replies from a list and stores the received commands."""
+    """A test double of a flight process, which answers from a list and stores the received commands."""
 
     def __init__(self, *answers: bytes) -> None:
         self.answers = list(answers)
@@ -229,7 +229,7 @@ class Link:
 
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> Link:
-    """Return a test double of the terminal, which the commands open instead of a link."""
+    """Return a test double of the terminal, which the commands use instead of a link."""
     found = Link()
     monkeypatch.setattr(satellite, "terminal_of", lambda _: found)
     return found
@@ -347,7 +347,7 @@ def verified(stage: Stage, counter: int = 1, spi: int = 1, text: str = "why") ->
 
 
 def by_link(options: Any, wants_table: bool = True) -> Any:
-    """Return the telemetry that a request over the link receives."""
+    """Return the telemetry that a request receives over the link."""
     return satellite._ask_by_link(options, b"packet", wants_table)
 
 
@@ -376,7 +376,7 @@ def test_the_table_arrives_before_or_after_its_verification(link: Link) -> None:
 
 
 class Session:
-    """A file session whose reports and results are given for each cycle."""
+    """A file session with given reports and results for each cycle."""
 
     def __init__(self, folder: Path, *turns: tuple[list[Report], list[Any]]) -> None:
         self.received = folder
@@ -411,17 +411,17 @@ class Session:
 
 @pytest.fixture
 def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make the link silent without waiting."""
+    """Make the link silent without real waiting."""
     monkeypatch.setattr("ground.commands.satellite.select.select", lambda *_: ([], [], []))
 
 
 def work(session: Session, ended: bool = False) -> satellite._FileWork:
-    """Return the file-transfer methods of a session."""
+    """Return the file-transfer methods for a session."""
     return satellite._FileWork(cast(Any, session), cast(Any, None), 1e9, lambda: ended)
 
 
 def ending(name: str, number: int = 5, condition: int = 0) -> Any:
-    """Return the packet for the end of a transfer."""
+    """Return the packet that reports the end of a transfer."""
     return SimpleNamespace(name=name, number=number, condition=condition)
 
 
@@ -429,9 +429,9 @@ def ending(name: str, number: int = 5, condition: int = 0) -> Any:
 def test_the_name_that_a_satellite_gives_a_file_does_not_control_the_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A refused file keeps the name in its metadata until the transfer is closed.
+    """Control characters in file names of the satellite are not printed.
 
-    Only the progress of the command's own transfer is printed.
+    A refused transfer keeps its file name until it is closed, but only the command's own transfer is printed.
     """
     (tmp_path / "up").write_bytes(b"x")
     session = Session(tmp_path, ([], []), ([], [ending("elements/up")]))

@@ -1,4 +1,4 @@
-"""Tests of the output of `knightcube solve` and `knightcube calibrate`."""
+"""Tests of the printed output of `knightcube solve` and `knightcube calibrate`."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_a_date_without_a_zone_is_in_utc() -> None:
 
 
 def lens(omitted: bool = False) -> DeterminedLens:
-    """Return a calibrated lens, without the given terms."""
+    """Return a calibrated lens without some terms."""
     begun = Pinhole.from_field_of_view(1024, 1024, np.radians(20.0))
     truth = Lens(1024, 1024, 1.01 * begun.focal_length, (505.0, 520.0), -0.1, 0.05)
     rng, frames = np.random.default_rng(24), []
@@ -155,7 +155,7 @@ def lens(omitted: bool = False) -> DeterminedLens:
 
 
 def pictures() -> list[tuple[Path, Any]]:
-    """Return the results of a used, an excluded and an unsolved image."""
+    """Return the calibration results of a used, an excluded and an unsolved image."""
     solution = SimpleNamespace(status=SimpleNamespace(value="solved"), matched=list(range(20)))
     return [
         (Path(name), SimpleNamespace(solution=solution, reason=reason, excluded=excluded))

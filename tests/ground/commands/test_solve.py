@@ -69,7 +69,10 @@ def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> Non
 
 
 def test_the_date_takes_aberration_off(picture: Path) -> None:
-    """The stars were rendered without aberration. Its correction changes the attitude by at most 20.5"."""
+    """The option for the date removes stellar aberration, which changes the attitude by at most 20.5".
+
+    The stars were rendered without aberration.
+    """
     without = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
     with_it = command("solve", picture, "--fov", "12", "--date", "2026-07-02T12:00", "--json")
     facts = json.loads(with_it.stdout)
@@ -79,7 +82,7 @@ def test_the_date_takes_aberration_off(picture: Path) -> None:
 
 @pytest.mark.parametrize("method", sorted(SOLVERS))
 def test_each_attitude_solver_finds_the_same_place(method: str, resting: SkyFrame, picture: Path) -> None:
-    """TRIAD uses only two stars, so its attitude has the largest uncertainty."""
+    """All attitude solvers agree within 4 sigma. TRIAD uses only two stars, so it has the largest sigma."""
     words = ("--fov", "12", "--fov-error", "0.1", "--attitude", method)
     done = command("solve", picture, *words, "--json")
     assert done.returncode == 0, done.stderr
@@ -101,7 +104,7 @@ def test_each_centroid_finds_the_same_place(method: str, resting: SkyFrame, pict
     assert facts["centroid_method"] == method
     assert angle_between(np.array(facts["quaternion"]), resting.attitude) < np.radians(20.0 / 3600.0)
     places = np.array([star["point_px"] for star in facts["stars"]])
-    # The attitudes differ, because the methods differ.
+    # The centroids of two methods differ slightly, which shows that the option has an effect.
     other = "psf" if method != "psf" else "window"
     again = command("solve", picture, *words[:-1], other, "--json")
     others = np.array([star["point_px"] for star in json.loads(again.stdout)["stars"]])
@@ -171,7 +174,10 @@ def test_a_mistake_is_one_line_and_exit_status_2(
 def test_the_world_coordinates_put_the_stars_where_the_picture_has_them(
     picture: Path, tmp_path: Path
 ) -> None:
-    """The test computes the tangent plane by Calabretta & Greisen 2002, and SIP by Shupe 2005."""
+    """The world coordinates in the file agree with the star positions.
+
+    The test computes the tangent plane by Calabretta & Greisen 2002, and SIP by Shupe 2005.
+    """
     out = tmp_path / "frame.wcs"
     done = command("solve", picture, "--fov", "12", "--wcs", out, "--json")
     assert done.returncode == 0, done.stderr
@@ -190,8 +196,8 @@ def test_the_world_coordinates_put_the_stars_where_the_picture_has_them(
         assert _sky_of(wcs, x, y, crval) == pytest.approx(
             (place["right_ascension_deg"], place["declination_deg"]), abs=1e-6
         )
-    # The conversions from pixel to sky (forward polynomials) and back (inverse polynomials) agree out to the
-    # corners.
+    # The conversion from pixel to sky (forward polynomials) and the conversion back (inverse polynomials)
+    # agree out to the corners.
     x, y = 400.0, -350.0
     u, v = x + _polynomial(wcs, "A", x, y), y + _polynomial(wcs, "B", x, y)
     assert (u + _polynomial(wcs, "AP", u, v), v + _polynomial(wcs, "BP", u, v)) == pytest.approx(

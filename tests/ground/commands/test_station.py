@@ -24,7 +24,7 @@ from tests.ground.commands.in_process import command
 
 
 def packed(packer: Packer, packet: Packet, time: float, **values: Any) -> bytes:
-    """Return a packet with zeros and empty texts except for given values."""
+    """Return a packet whose values are zero or empty, except for the given values."""
     plain: dict[str, Any] = {}
     for field in packet.fields:
         zero: Any = "" if field.kind.startswith("S") else 0
@@ -177,7 +177,7 @@ def test_the_page_listens_on_loopback_only() -> None:
 
 @contextmanager
 def _served(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
-    """Store the console instead of serving its page."""
+    """Keep the console instead of starting its server."""
     web = pytest.importorskip("aiohttp.web")
     served: list[Any] = []
     monkeypatch.setattr(web, "run_app", lambda app, **options: served.append((app, options)))

@@ -1,4 +1,4 @@
-"""Tests that no command prints control characters from data, because they would control the terminal."""
+"""Tests that no command prints control characters from data, because they could control the terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run in whose log each text begins with control characters."""
+    """Return a run whose texts in the log all begin with control characters."""
     folder = make_run(
         tmp_path_factory.mktemp("runs") / "run-000001", Recipe(duration=40.0, rate_hz=10.0, hold=10.0)
     )

@@ -1,4 +1,4 @@
-"""Tests that wrong use gives exit status 2 and one line with the location and the permitted values."""
+"""Tests that wrong use gives exit status 2 and one line with the wrong value and the permitted values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Console server for tests, and the responses that a client receives."""
+"""A server of the console for tests, and its responses to a client."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def asked(
     send: Any = None,
     access: Access | None = None,
 ) -> Any:
-    """Serve a run, and return the response to a client, which is admitted unless `access` differs."""
+    """Serve a run; return the responses to a client, which is authorised unless `access` differs."""
 
     async def talk(history: History) -> Any:
         place = FlightSurroundings.of(folder / "config.yaml")
@@ -34,7 +34,7 @@ def asked(
         console.read()
         door = access or Access(lambda token: None)
         server = TestServer(application(console, door), host="127.0.0.1")
-        # Cookies are also accepted from numeric hosts.
+        # The client must also accept cookies from hosts with numeric addresses.
         async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:
             if access is None:
                 async with client.get("/", params={"token": door.token}) as answer:

@@ -1,4 +1,4 @@
-"""Tests that any request gets a text, never status 500, and that only complete commands are sent."""
+"""Tests that any request gets an answer without status 500, and that only complete commands are sent."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ ODD = [
     ),
     *(f'"{HUGE}"', f'"{"x" * 5000}"', '"' + "9" * 5000 + '"', "[" * 500 + "]" * 500, "0.1", "-0", "7"),
 ]
-"""JSON values that a form of the page never sends."""
+"""JSON values that no form of the page sends."""
 NUMBERS = [
     *(
         "",
@@ -93,7 +93,7 @@ NUMBERS = [
         "+1",
     ),
 ]
-"""Numbers in a query."""
+"""Texts of numbers for the query of a URL."""
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def bodies(draw: np.random.Generator) -> Iterator[tuple[bytes, str]]:
-    """Yield bodies of commands and their content types."""
+    """Yield command bodies and their content types."""
     for packet in COMMANDS:
         names = [field.name for field in packet.fields]
         for odd in ODD:
@@ -132,7 +132,7 @@ def bodies(draw: np.random.Generator) -> Iterator[tuple[bytes, str]]:
 
 
 def queries() -> Iterator[str]:
-    """Yield URLs with numbers that no page requests."""
+    """Yield URLs whose queries contain numbers that no page requests."""
     for number in NUMBERS:
         yield f"/api/series?packet=imu&field=rate&from={number}&to=1"
         yield f"/api/series?packet=imu&field=rate&from=0&to={number}"

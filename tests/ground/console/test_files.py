@@ -17,10 +17,10 @@ from tests.flight.link.process.filed_ends import FiledEnds
 
 
 class Ends(FiledEnds):
-    """Both ends of a link, with the console as the only program at the ground end."""
+    """Both ends of a link. At the ground end, the console is the only program."""
 
     def collect(self) -> None:
-        """Keep the telemetry for the console."""
+        """Leave received telemetry to the console."""
         self.packets += list(self.terminal.take())
 
 
@@ -40,7 +40,7 @@ def console(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[E
 
 
 def during(feed: LinkFeed, request: Callable[[], Any]) -> Any:
-    """Run a request while the feed is read, and return its result or its FlightError."""
+    """Run a request while the feed is read; return the result of the request, or its FlightError."""
     found: list[Any] = []
 
     def work() -> None:

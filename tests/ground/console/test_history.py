@@ -1,4 +1,4 @@
-"""Tests of the console's history: each packet occurs once, peaks are kept, and states at an instant."""
+"""Tests of the console's history: each packet is kept once, peaks are kept, and past states are found."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture
 def history(run: Run) -> Iterator[History]:
-    """Yield the run's history, read in two updates."""
+    """Yield the history of a run, read in two updates."""
     with History() as history:
         for half in (0, 1):
             cut = {name: len(rows) // 2 for name, rows in run.flight.packets.items()}
@@ -75,7 +75,7 @@ def test_an_instant_shows_what_had_come_and_each_event_once(history: History, ru
 
 
 def test_a_replay_shows_at_each_time_what_was_live_then(history: History, run: Run) -> None:
-    """The live state equals a history that ends at the same time."""
+    """The live state at a time equals the state that a replay shows for this time."""
     for until in (1_000_000_000, 3_300_000_000):
         with History() as then:
             then.append({n: rows[rows["time_ns"] <= until] for n, rows in run.flight.packets.items()})

@@ -1,4 +1,4 @@
-"""Tests of kept frames on the page: a PNG that Pillow reads, and the objects found in the frame."""
+"""Tests of stored frames on the page: each is a PNG that Pillow reads, with the objects that were found."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from tests.flight.link.process.both_ends import BothEnds
 class Satellite:
     """Both ends of a link.
 
-    The ground end is a feed; each update of the feed runs one cycle of the satellite's end.
+    The ground end is a feed. Each update of the feed runs one cycle of the satellite's end.
     """
 
     def __init__(self, ends: BothEnds, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,7 +53,7 @@ def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite:
 
 
 def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dict[str, object]:
-    """Send a command in a second thread, as the page's server does, and return the reply."""
+    """Send a command in a second thread, as the server of the page does, and return the reply."""
     answers: list[dict[str, object]] = []
     sending = threading.Thread(target=lambda: answers.append(send()))
     sending.start()

@@ -1,6 +1,6 @@
-"""Tests of the page in Chromium.
+"""Tests of the console's page in Chromium.
 
-`python -m tests.studies.console` measures its load beside a flight process.
+`python -m tests.studies.console` measures the load of the console beside a flight process.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _event(kind: events.EventKind, time_s: float, text: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def orbit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run of a satellite with 105 saturated frames, an outage of the gyro, and a parameter table."""
+    """Return a run of a satellite with 105 saturated frames, a gyro outage, and a parameter table."""
     run = make_run(tmp_path_factory.mktemp("orbit"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
     shutil.copy(ROOT / "config/orbit.yaml", run / "config.yaml")
     values = [sum(field.valid) / 2.0 for field in PARAMETER_FIELDS if field.valid]
@@ -96,7 +96,7 @@ def orbit_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def serving(folder: Path, *words: object, port: int = 0) -> Iterator[str]:
-    """Run `knightcube console` on a run, and yield the address that it prints."""
+    """Run `knightcube console` on a run, and yield the address that the command prints."""
     command = [sys.executable, "-m", "flight", "console", folder, "--port", port, *words]
     with subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, text=True) as server:
         try:
@@ -122,7 +122,7 @@ def page(browser: Any, folder: Path) -> Iterator[Page]:
 
 @pytest.fixture(scope="module")
 def orbit_url(browser: Any, orbit_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of a console that sends its commands to a socket; the browser is already admitted."""
+    """Address of a console that sends commands to a socket, for a browser that is already authorised."""
     socket = tmp_path_factory.mktemp("to") / "commands"
     listener = Listener(socket)
     station = ("--station", "Berlin,52.5,13.4,30,10")
@@ -155,7 +155,10 @@ def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder
 
 
 def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:
-    """Even an admitted browser must be refused: both pages have the same host, so it sends cookies."""
+    """A page on another port can neither embed the console nor read its data, even in an authorised browser.
+
+    Both pages have the same host, so the browser sends its cookies.
+    """
     with serving(folder) as url, another_origin() as foreign, browsing() as chromium:
         context = chromium.new_context()
         own, other = context.new_page(), context.new_page()

@@ -53,7 +53,7 @@ def get(folder: Path, path: str, headers: dict[str, str] | None = None) -> tuple
 
 
 def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) -> None:
-    """The page has at most 250 kB."""
+    """All files that the page names are served. Together they have at most 250 kB."""
     page = Path(__file__).parents[3] / "ground/console/page"
     names = [path.relative_to(page) for path in page.rglob("*") if path.is_file()]
     assert sum((page / name).stat().st_size for name in names) <= 250_000
@@ -83,13 +83,13 @@ def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) 
     ],
 )
 def test_another_page_of_the_same_browser_gets_nothing(folder: Path, headers: dict[str, str]) -> None:
-    """Requests by a rebound DNS name or from another origin are refused even with a session cookie."""
+    """Requests for a rebound DNS name or from another origin are refused, even with a session cookie."""
     for path in ("/", "/api/table", "/api/live", "/page/main.js"):
         assert get(folder, path, headers)[0] == 403
 
 
 def own(client: TestClient[Any, Any]) -> str:
-    """Return the origin of the console's own page."""
+    """Return the origin of the console's page."""
     return str(client.make_url("/").origin())
 
 
@@ -224,7 +224,7 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
         async with client.ws_connect("/api/live", origin=own(client)) as line:
             first = (await line.receive_json())["time"]
             growing.write_bytes(data)
-            for _ in range(10):  # waits for pushes, which come ten times a second
+            for _ in range(10):  # the server pushes updates ten times a second
                 if (time := (await line.receive_json())["time"]) > first:
                     break
             return first, time
@@ -234,7 +234,7 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
 
 
 def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path) -> None:
-    """A working link continues to report once a second."""
+    """Packets that the link itself sends once a second do not count as packets of the flight."""
 
     class Feed:
         silence = 0.0
@@ -261,9 +261,10 @@ def test_a_frame_that_was_not_kept_is_null_and_has_no_picture(folder: Path) -> N
 
 
 def test_what_is_shown_live_is_whole(folder: Path) -> None:
-    """Packets of one instant may arrive in two updates.
+    """The live state is shown only when all packets of an instant have arrived.
 
-    Until the second update, the live state is that of the previous instant.
+    Packets of one instant may arrive in two updates. Until the second update, the state of the previous
+    instant is shown.
     """
 
     class Feed:
@@ -405,7 +406,11 @@ def test_without_a_way_to_the_flight_nothing_is_sent(folder: Path) -> None:
 def test_a_satellites_place_is_known_from_its_elements_and_without_a_configuration_nothing_is(
     tmp_path: Path,
 ) -> None:
-    """At an equinox at noon UTC, the Sun is above the equator at about 2 deg east."""
+    """The position of a satellite follows from its elements.
+
+    Without a configuration, the position is unknown. At an equinox at noon UTC, the Sun is above the equator
+    at about 2 deg east.
+    """
     shutil.copy(Path(__file__).parents[3] / "config/orbit.yaml", tmp_path / "config.yaml")
     noon = int(datetime(2026, 3, 20, 12, tzinfo=UTC).timestamp() * 1e9)
     place = FlightSurroundings.of(tmp_path / "config.yaml").at(noon)
@@ -415,7 +420,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
         pytest.approx(0.0, abs=0.3),
         pytest.approx(1.9, abs=0.5),
     )
-    # The zenith direction is opposite to nadir, and the ground track is below the satellite.
+    # The nadir direction is normal to the velocity, and the ground track passes below the satellite.
     track = np.array(FlightSurroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)

@@ -1,4 +1,4 @@
-"""`python -m tests.ground.identification`: identification on random testbeds with the complete software."""
+"""Identification on random testbeds, with the complete software: `python -m tests.ground.identification`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.ground.identification.worlds import believed, drawn, fly_bare, fly_st
 
 
 def main() -> int:
-    """Run flights in random worlds, fit their constants, and compare the results with the truth."""
+    """Run flights in random worlds, fit the constants of each world, and compare them with the truth."""
     parser = argparse.ArgumentParser(prog="python -m tests.ground.identification", description=__doc__)
     parser.add_argument("--runs", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
@@ -41,7 +41,7 @@ def main() -> int:
         error = motion_error(world, found.constants)
         motion.append((error, found.covariance[:3, :3]))
         plant = absolute(found, prior_of(config), record.field)
-        # One of the six constants is a combination of the first three and the last two, so it is omitted.
+        # The omitted constant of the six is a combination of the first three and the last two constants.
         keep = [0, 1, 2, 4, 5]
         scaled.append((scale_error(world, plant)[keep], plant.covariance[np.ix_(keep, keep)]))
         relative.append(np.abs(error) / world.constants.to_array()[:3])

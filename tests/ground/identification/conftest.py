@@ -1,4 +1,4 @@
-"""Flights that several tests use; each is flown once."""
+"""Flights that several tests share. Each flight is simulated once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Identified = tuple[World, Record, PlantFit]
 
 
 def _identified() -> str:
-    """Return a string that encodes four random worlds, their simulated records and their fits.
+    """Return four random worlds, their simulated records and their fits, encoded as a string.
 
     The records are of the bare testbed, without the flight software.
     """
@@ -33,7 +33,7 @@ def _identified() -> str:
 
 @pytest.fixture(scope="session")
 def identified(session_folder: Path) -> list[Identified]:
-    """Return four random worlds with their flights and fits, which one process of the session computes."""
+    """Return four random worlds with their flights and fits, computed by only one process of the session."""
     found: list[Identified] = pickle.loads(
         base64.b64decode(made_once(session_folder, "identified", _identified))
     )

@@ -1,4 +1,4 @@
-"""Excitations for several tests of the identification."""
+"""Excitations that several tests of the identification share."""
 
 from __future__ import annotations
 

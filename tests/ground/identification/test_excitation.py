@@ -1,4 +1,4 @@
-"""Tests that the excitation moves the body as intended and within its limit, for any body."""
+"""Tests that the excitation moves any body as intended and within its limit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ def controller(**changes: float) -> ExcitationController:
 
 
 def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_reach() -> None:
-    """The motion of a free body (a double integrator) under the pulses is integrated exactly."""
+    """Under the pulses of a manoeuvre, a free body comes to rest within the reach of the excitation.
+
+    The motion is integrated exactly, as that of a double integrator.
+    """
     strength, reach = 0.02, 0.5
     for manoeuvre in manoeuvres(strength, reach, 45.0):
         angle = rate = farthest = 0.0
@@ -49,7 +52,10 @@ def test_within_the_drawn_worlds_the_body_stays_within_half_and_the_current_with
 
 
 def test_a_body_far_livelier_than_believed_is_caught_before_the_bound() -> None:
-    """At three times the assumed acceleration, the pulses would reach q2 = 0.52 without feedback."""
+    """The feedback keeps a body with three times the assumed acceleration below the largest permitted q2.
+
+    Without feedback, the pulses would reach q2 = 0.52.
+    """
     record = fly_bare(replace(USUAL, inertia=USUAL.inertia / 3.0), 60.0)
     assert np.sin(0.5 * np.max(np.abs(record.angle))) < usual_excitation().largest_q2
     pulses = manoeuvres(1.0, 3.0 * 0.45 * 2.0 * math.asin(usual_excitation().largest_q2), 45.0)[1]

@@ -1,4 +1,4 @@
-"""Tests that the fit finds the simulated truth within its stated uncertainty, or reports that it cannot."""
+"""Tests that the fit finds the simulated truth within its stated uncertainty, or reports a failure."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NOISE = noise_of(believed())
 
 
 def chi_square(found: list[Identified], off: float = 1.0) -> float:
-    """Return the chi-square of gain, torsion and damping over all worlds; `off` multiplies the true gain."""
+    """Return the chi-square of gain, torsion and damping over all worlds. `off` multiplies the true gain."""
     total = 0.0
     for world, _, made in found:
         error = motion_error(replace(world, dipole=world.dipole * off), made.constants)
@@ -40,7 +40,10 @@ def chi_square(found: list[Identified], off: float = 1.0) -> float:
 
 
 def test_the_truth_lies_within_the_stated_uncertainty_in_all_worlds(identified: list[Identified]) -> None:
-    """The chi-square of 4 worlds x 3 constants is in its 99.8 % band; a gain error of 0.5 % exceeds it."""
+    """The chi-square of 4 worlds x 3 constants is in its 99.8 % band.
+
+    A gain error of 0.5 % exceeds the band.
+    """
     low, high = chi2.ppf([0.001, 0.999], 3 * len(identified))
     assert low < chi_square(identified) < high
     assert chi_square(identified, off=1.005) > high
@@ -78,7 +81,10 @@ def test_a_delay_of_the_coils_is_distinguished_from_the_torque() -> None:
 
 
 def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
-    """The body is held for ten samples and then released, a motion that no constants explain."""
+    """A body that is held for ten samples and then released does not bias the fit.
+
+    No constants explain the motion at the release.
+    """
     record = fly_bare(USUAL, 40.0)
     held = np.arange(len(record.time)) < 10
     noise = record.angle - np.where(held, 0.3, record.angle)
@@ -92,7 +98,10 @@ def test_the_hand_that_lets_the_body_go_late_does_not_count() -> None:
 
 
 def test_coloured_noise_is_noticed_and_the_uncertainty_grows() -> None:
-    """The attitude error lasts half a second, like that of a filter inside the unit."""
+    """Coloured noise is detected and increases the uncertainty.
+
+    The attitude error has a correlation time of half a second, like that of a filter inside the unit.
+    """
     record = fly_bare(USUAL, 40.0)
     rng = np.random.default_rng(8)
     drift = 0.3 * lfilter([1.0], [1.0, -0.95], rng.standard_normal(len(record.time)))
@@ -158,7 +167,7 @@ QUIET = MotionNoise(current=1e-9, angle=2e-3, rate=1e-4)
 
 
 def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
-    """Return the exact record of a body under random currents, integrated by scipy."""
+    """Return the exact record of a body under random currents, as scipy integrates it."""
     time = np.asarray(np.arange(round(seconds / 0.025)) * 0.025, dtype=np.float64)
     current = np.repeat(np.random.default_rng(4).uniform(-0.09, 0.09, len(time) // 20 + 1), 20)[: len(time)]
     switch: FloatArray = time + 0.011
@@ -175,7 +184,7 @@ def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
     states = [state]
     for begin, end in itertools.pairwise(time.tolist()):
         for span in ((begin, begin + 0.017), (begin + 0.017, end)):
-            middle = 0.5 * sum(span)  # middle of a segment of constant current
+            middle = 0.5 * sum(span)  # middle of an interval of constant current
             solution = solve_ivp(lambda _, s, m=middle: motion(m, s), span, state, rtol=1e-11, atol=1e-13)
             state = solution.y[:, -1]
         states.append(state)
@@ -185,7 +194,10 @@ def noiseless(constants: MotionConstants, seconds: float = 12.0) -> Record:
 
 
 def test_a_noiseless_motion_is_predicted_to_a_thousandth_of_the_noise() -> None:
-    """Compare with scipy's integrator at 1e-11; the switching times are between the samples."""
+    """The prediction agrees with scipy's integrator (1e-11) within a thousandth of the noise.
+
+    The currents switch between the samples.
+    """
     passed = innovations(noiseless(TRUE), TRUE, QUIET)
     assert np.max(np.abs(passed.error[:, 0])) < 1e-3 * 2e-3
     assert np.max(np.abs(passed.error[:, 1])) < 1e-3 * 1e-4
@@ -193,7 +205,7 @@ def test_a_noiseless_motion_is_predicted_to_a_thousandth_of_the_noise() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_gradient_is_that_of_the_predictions(name: str) -> None:
-    """Compare with central differences of the whole prediction, to a thousandth."""
+    """The gradient agrees with central differences of the whole prediction within 0.2 %."""
     record = noiseless(TRUE, 6.0)
     size = 1e-5 if name in ("disturbance", "bias") else 1e-4
     there, back = (

@@ -1,4 +1,4 @@
-"""Tests of the identification record of a flight: which data of the log it includes, and which it omits."""
+"""Tests of the identification record of a flight: which data of the log it contains, and which it omits."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ WORLD = World(inertia=1.15e-3, dipole=0.62, field=4.2e-4, stiffness=1.6e-5, damp
 
 
 def recorded(run: Run) -> Record:
-    """Return the record of a run whose coils go to zero 0.25 s after the last command."""
+    """Return the record of a run whose coils return to zero 0.25 s after the last command."""
     return read_record(run, 0.25)
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return 40 s of the excitation in the demonstration's world."""
+    """Return the record of 40 s of the excitation in the world of the demonstration."""
     return flights.fly(excitation_config(believed(), 40.0), tmp_path_factory.mktemp("run"))
 
 
@@ -48,7 +48,7 @@ def test_through_drivers_loop_and_log_the_truth_lies_within_the_uncertainty(tmp_
 def altered(
     run: Run, packet: str, keep: npt.NDArray[np.bool_] | slice = slice(None), **columns: npt.NDArray[Any]
 ) -> Run:
-    """Return a run with some columns of a packet replaced, and only its rows `keep`."""
+    """Return a run with replaced columns of a packet. Only the rows `keep` of this packet are kept."""
     array = run.flight.packets[packet].copy()
     for name, values in columns.items():
         array[name] = values
@@ -137,7 +137,7 @@ def test_values_that_no_flight_writes_are_reported_as_damage(
     values = short[packet][field].copy()
     values[len(values) // 2] = value
     damaged = altered(short, packet, **{field: values})
-    if field == "sample_time_ns":  # host times are irrelevant while the unit's clock runs
+    if field == "sample_time_ns":  # host times are not used while the clock of the unit runs
         damaged = altered(damaged, "imu", device_time_ns=values)
     with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
         recorded(damaged)

@@ -1,6 +1,7 @@
 """Tests of the absolute scale of inertia, dipole and field, and of its uncertainty.
 
-The motion determines only ratios to the inertia. The prior and the magnetometer determine the scale.
+The motion determines only ratios of the constants to the inertia. The prior and the magnetometer determine
+the scale.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ def scaled(found: PlantFit, prior: PlantPrior, field: float | None) -> AbsoluteP
 
 
 def test_over_many_worlds_the_uncertainty_of_all_constants_is_true(identified: list[Identified]) -> None:
-    """The mean chi-square of 80 worlds that are drawn from the prior must be in its band.
+    """The mean chi-square of 80 worlds that are drawn from the prior is in its expected band.
 
-    The constants that the motion determines are the true ones plus random errors of the stated covariance.
+    The constants from the motion are the true constants plus random errors of the stated covariance.
     """
     rng = np.random.default_rng(3)
     _, _, made = identified[0]
@@ -91,7 +92,7 @@ def test_without_a_magnetometer_the_field_is_as_uncertain_as_believed_and_says_s
 
 
 def test_the_share_of_the_prior_is_how_much_the_answer_follows_it(identified: list[Identified]) -> None:
-    """If the prior changes by 1 %, the result changes by the prior's stated share of that 1 %."""
+    """If the prior changes by 1 %, the result changes by 1 % times the stated weight of the prior."""
     world, _, made = identified[0]
     before = scaled(made, PRIOR, world.field)
     moved = replace(PRIOR, inertia=replace(PRIOR.inertia, value=PRIOR.inertia.value * 1.01))

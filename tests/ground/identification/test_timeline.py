@@ -25,7 +25,7 @@ RECORD = Record(
 
 
 def test_the_events_are_samples_switches_and_cuts_of_long_steps_in_order() -> None:
-    """The 0.06 s between the last samples become three steps, because a step has at most 0.025 s."""
+    """An interval of 0.06 s between two samples is divided into three steps of at most 0.025 s."""
     timeline = Timeline.of(RECORD, 0.0)
     times = np.cumsum(timeline.span)
     np.testing.assert_allclose(times, [0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.10])
@@ -52,7 +52,7 @@ LABEL = {
 
 
 def flown(cycles: list[tuple[float, float, float]], samples: int = 240, **label: Any) -> Record:
-    """Return the record of cycles (time, requested and written current), with 40 samples a second."""
+    """Return the record of cycles (time, requested and written current) with 40 samples per second."""
     imu = [
         (
             0.025 * k,
@@ -102,7 +102,7 @@ def test_a_current_counts_from_its_request_and_falls_to_zero_without_commands() 
 def test_a_current_within_3_percent_of_the_limit_may_be_clipped(
     current: float, resistance: float, clipped: bool
 ) -> None:
-    """The limit is the smaller one of 0.15 A and the current of the supply: 3.4 V in 20 or 34 ohm."""
+    """The current limit is the smaller of 0.15 A and the current at 3.4 V through 20 or 34 ohm."""
     record = flown([(0.0, current, current), (0.1, current, current)], coil_resistance=[resistance] * 3)
     assert record.clipped.tolist() == [clipped, clipped]
 

@@ -1,4 +1,4 @@
-"""Simulated testbeds that differ from the configured one by the stated accuracies, and flights in them."""
+"""Simulated testbeds that differ from the configured testbed by the stated accuracies, and their flights."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from tests.support import flights
 
 PERIOD = 0.025
 ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3
-"""Bounds of the uniform noise of the angle (twice q2), of the rate, and of the current in a driven coil."""
+"""Bounds of the uniform noise of the angle (2 q2), of the rate, and of the current in a driven coil."""
 
 
 @dataclass(frozen=True)
 class World:
     """True constants of a testbed.
 
-    `dipole` is n A per commanded ampere, `magnetometer` the sensor's scale.
+    `dipole` is n A per commanded ampere, and `magnetometer` is the scale factor of the sensor.
     """
 
     inertia: float
@@ -66,7 +66,7 @@ def believed() -> TestbedConfig:
 
 
 def drawn(rng: np.random.Generator) -> World:
-    """Return a random world with the stated scale errors and a thread up to three times as stiff as usual."""
+    """Return a random world with the stated scale errors and up to three times the usual stiffness."""
     config = believed()
     plant = config.plant
 
@@ -86,7 +86,10 @@ def drawn(rng: np.random.Generator) -> World:
 
 
 def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
-    """Run the excitation with drivers, loop and log; a wrong coil resistance represents the wrong dipole."""
+    """Run the excitation with drivers, loop and log.
+
+    A wrong coil resistance represents an error of the dipole.
+    """
     config = excitation_config(believed(), duration)
     resistance = config.coils.resistance[0] * config.plant.coil_turns * config.plant.coil_area / world.dipole
     section: Simulation = configuration.replace(
@@ -99,7 +102,7 @@ def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
     record = read_record(flights.fly(config, folder, section=section), config.coils.stale_after)
     if record.field is None:
         return record
-    # The emulated magnetometer measures without a scale error, so the scale error of the world is applied
+    # The emulated magnetometer has no scale error, so the scale error of the world is applied to its samples
     # here.
     field = replace(record.field, magnitude=record.field.magnitude * world.magnetometer)
     return replace(record, field=field)
@@ -114,7 +117,7 @@ def usual_excitation() -> ExcitationSettings:
 def fly_bare(
     world: World, duration: float = 100.0, settings: ExcitationSettings | None = None, noise: float = 1.0
 ) -> Record:
-    """Run the excitation on the bare testbed without drivers and filter; `noise` scales all noise."""
+    """Run the excitation on the testbed without drivers and filter. `noise` multiplies all noise."""
     rng = np.random.default_rng(world.seed)
     plant = plant_of(believed())
     controller = ExcitationController(plant, PERIOD, settings or usual_excitation())
@@ -152,7 +155,7 @@ def fly_bare(
 
 
 def motion_error(world: World, constants: MotionConstants) -> FloatArray:
-    """Return estimated minus true gain, torsion and damping (3,)."""
+    """Return the errors (3,) of gain, torsion and damping: estimated minus true values."""
     return np.asarray(constants.to_array() - world.constants.to_array())[:3]
 
 

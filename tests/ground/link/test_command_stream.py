@@ -1,4 +1,4 @@
-"""Tests of the bytes that a connection may send to the gateway: the token, then command packets."""
+"""Tests of the bytes that a client may send to the gateway: its token, and then command packets."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_byte_that_no_token_has_is_refused_at_once(data: bytes) -> None:
 
 
 def test_how_much_of_a_token_is_right_is_not_disclosed() -> None:
-    """A token with a wrong character at any position is refused only when the line is complete."""
+    """A wrong token is refused only when its line is complete, whichever of its characters is wrong."""
     for right in range(len(TOKEN)):
         wrong = TOKEN[:right] + ("1" if TOKEN[right] == "0" else "0") + TOKEN[right + 1 :]
         stream = CommandStream(TOKEN)

@@ -1,4 +1,4 @@
-"""Tests of commands over the link: reports, key changes, repetition, and files within the data rate."""
+"""Tests of commands over the link: reports, key changes, repetition, and files within a data rate."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def report(stage: Stage, text: str = "", counter: int = 0, spi: int = 1) -> Repo
 
 
 class FakeTerminal:
-    """A test double of the terminal, which stores sent packets and replies with given reports."""
+    """A test double of the terminal, which stores sent packets and answers with given reports."""
 
     packet_bytes = LONGEST_PACKET
 
@@ -64,7 +64,7 @@ class FakeTerminal:
 
 
 def terminal(vault: Vault | None = None, *answers: list[Report]) -> Any:
-    """Return a test double of the terminal that replies to each command with a list of reports."""
+    """Return a test double of the terminal that answers each command with a list of reports."""
     return FakeTerminal(vault, *answers)
 
 
@@ -118,7 +118,7 @@ def vault(tmp_path: Path) -> Vault:
 
 
 def sent_key(packet: bytes) -> NewKey:
-    """Return the key change in a command packet."""
+    """Return the key change that a command packet contains."""
     directive = directives.unpack(packet)
     assert isinstance(directive, NewKey)
     return directive
@@ -269,7 +269,7 @@ def test_a_checksum_is_that_of_the_file(tmp_path: Path) -> None:
 
 
 def _answering(server: socket.socket, answer: bytes) -> threading.Thread:
-    """Reply to one datagram in a thread."""
+    """Answer one datagram in a thread."""
 
     def run() -> None:
         data, sender = server.recvfrom(4096)

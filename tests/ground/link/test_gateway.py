@@ -1,4 +1,4 @@
-"""Tests of the gateway with clients that have the token, clients without it, and a web page."""
+"""Tests of the gateway with authorised clients, clients without the token, and a web page."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ class Satellite:
 
     @property
     def commands(self) -> list[bytes]:
-        """Uplinked packets other than the gateway's own pings."""
+        """Uplinked packets, without the pings that the gateway sends."""
         ping = CommandPacker().pack(Ping(), 1)[:2]
         return [packet for packet in self.up if packet[:2] != ping]
 
 
 @dataclass
 class Station:
-    """A gateway with its token, a test double of the satellite, and the reported errors."""
+    """A gateway with its token, a test double of the satellite, and the errors that the gateway reports."""
 
     gateway: Gateway
     token: str
@@ -122,7 +122,7 @@ def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
 
 
 def closed(line: socket.socket) -> bool:
-    """Return whether the other end has closed a connection without sending any byte."""
+    """Return whether the gateway has closed a connection without sending any byte."""
     try:
         return line.recv(1) == b""
     except ConnectionResetError:
@@ -217,7 +217,7 @@ class Opened:
     errors: Path
 
     def command(self) -> int | None:
-        """Return the length of the next frame that is not the gateway's own ping, or None after 3 s."""
+        """Return the length of the next frame that is not a ping of the gateway, or None after 3 s."""
         until = time.monotonic() + 3.0
         while (left := until - time.monotonic()) > 0.0:
             self.frames.settimeout(left)

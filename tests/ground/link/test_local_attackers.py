@@ -1,7 +1,8 @@
-"""Tests that web pages and other users of the ground's machine are refused by gateway and console.
+"""Tests that gateway and console refuse web pages and other users of the same machine.
 
-Both programs run as commands on one link. A socket of this test receives the frames and authenticates them
-with the satellite's keys. The tests in Chromium need Debian's packages `chromium` and the extra `playwright`.
+Both programs run as commands on one link. The test receives the frames of the link by a socket, and
+authenticates them with the satellite's keys. The tests in Chromium need the Debian package `chromium` and the
+Python extra `playwright`.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ NOBODY = 65534
 
 @dataclass
 class Ground:
-    """A gateway and a console with one folder of keys, and the satellite's end of their link."""
+    """A gateway and a console that share a folder of keys, and the satellite's end of their link."""
 
     gateway: int
     console: int
@@ -54,7 +55,7 @@ class Ground:
     frames: socket.socket
 
     def obeyed(self, seconds: float = 0.5) -> list[bytes]:
-        """Return the commands other than pings that arrive until the link is silent."""
+        """Return the commands, without pings, that arrive until the link is silent."""
         found, until = list[bytes](), time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             self.frames.settimeout(left)
@@ -68,7 +69,7 @@ class Ground:
 
 @pytest.fixture(scope="module")
 def ground() -> Iterator[Ground]:
-    """Start both programs in a folder that every user of the machine can enter."""
+    """Start gateway and console in a folder that every user of the machine can enter."""
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="knightcube-")))
         satellite, keys = make_keys(place / "keys")
@@ -106,7 +107,7 @@ def _said(process: subprocess.Popen[str], pattern: str) -> tuple[str, ...]:
 
 @pytest.fixture(scope="module")
 def cookie(ground: Ground) -> str:
-    """Open the console's address, as the operator's browser does, and return its cookie."""
+    """Open the address of the console as the operator's browser does, and return its cookie."""
     status, _, cookie = _asked(ground.console, "GET", ground.url.partition(str(ground.console))[2])
     assert status == 200
     return cookie.partition(";")[0]
@@ -157,7 +158,7 @@ REQUESTS: list[tuple[str, str, dict[str, str], str | None]] = [
 def test_no_forged_request_is_obeyed_even_by_the_operators_browser(
     ground: Ground, cookie: str, forged: dict[str, str]
 ) -> None:
-    """The requests have the cookie, and come from a page with a rebound DNS name or from other origins."""
+    """Requests of the operator's browser are refused if they come from a rebound name or another origin."""
     headers = {name: text.replace("PORT", str(ground.console)) for name, text in forged.items()}
     for method, path, more, body in REQUESTS:
         status, text, _ = _asked(ground.console, method, path, {**headers, **more, "Cookie": cookie}, body)
@@ -167,7 +168,7 @@ def test_no_forged_request_is_obeyed_even_by_the_operators_browser(
 
 @pytest.mark.parametrize("session", ["", "knightcube-console-PORT=", "knightcube-console-PORT=" + "A" * 43])
 def test_without_the_token_nothing_is_obeyed(ground: Ground, cookie: str, session: str) -> None:
-    """The requests come from a program on the same machine, which can state any Host and Origin."""
+    """A program on the same machine without the token is refused, whatever Host and Origin it states."""
     del cookie  # the token in the printed address is already used
     used = ground.url.partition("?")[2]
     headers = {
@@ -209,7 +210,7 @@ def _rest(line: socket.socket) -> bytes:
 
 
 def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
-    """An accepted request shows that the other tests' requests are refused because of their sender."""
+    """An authorised request is accepted, so the requests of the other tests are refused for their sender."""
     with socket.create_connection(("127.0.0.1", ground.gateway), PATIENCE_S) as line:
         line.sendall(token_path(ground.keys, ground.gateway).read_bytes() + SAFE)
         assert len(ground.obeyed(PATIENCE_S)) == 1
@@ -222,7 +223,10 @@ def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
 def test_another_user_finds_no_token(ground: Ground) -> None:
-    """In this test all users may enter the key folders, although no command creates such folders."""
+    """Another user cannot read a token, even if all users may enter the key folders.
+
+    No command creates such folders.
+    """
     places = [token_path(ground.keys, ground.gateway), *sorted(ground.keys.glob("spi-*"))]
     places += [Path(f"/proc/{pid}/{name}") for pid in ground.processes for name in ("environ", "mem")]
     token = places[0].read_text(encoding="ascii").strip()
@@ -242,7 +246,7 @@ def _become_nobody() -> None:
 
 
 def _readable(path: Path) -> str:
-    """Return the text of a file, empty if it may not be read."""
+    """Return the text of a file, or an empty text if reading is not permitted."""
     with suppress(OSError):
         return path.read_bytes().decode(errors="replace")
     return ""
@@ -273,9 +277,9 @@ _REQUESTS = """async ([page, gateway, command, packet]) => {
   }
   return found;
 }"""
-"""JavaScript of a page that sends requests to both programs.
+"""JavaScript of a page that sends requests to gateway and console.
 
-The request begins with zeros, which could be read as packets of 7 bytes.
+The request begins with zeros, which a reader could take as packets of 7 bytes.
 """
 _FORM = """(page) => {
   const form = document.createElement("form");
@@ -297,11 +301,11 @@ _OWN = """([page, command]) => {
 
 @pytest.fixture(scope="module")
 def context(ground: Ground, cookie: str) -> Iterator[Any]:
-    """Open Chromium with the operator's session; the host name evil.example resolves to 127.0.0.1."""
+    """Open Chromium with the session of the operator. The host name evil.example resolves to 127.0.0.1."""
     if lacks := browser.missing():
         pytest.skip(lacks)
     rules = "--host-resolver-rules=MAP evil.example 127.0.0.1"
-    # Recent browsers ask the user before a web page may reach loopback; older browsers do not.
+    # Recent browsers ask the user before a web page may connect to loopback. Older browsers do not ask.
     with browser.browsing(rules, "--disable-features=LocalNetworkAccessChecks") as chromium:
         opened = chromium.new_context(viewport={"width": 1000, "height": 800})
         name, _, value = cookie.partition("=")
@@ -311,7 +315,7 @@ def context(ground: Ground, cookie: str) -> Iterator[Any]:
 
 
 def _attacked(ground: Ground, context: Any, origin: str, host: str) -> list[object]:
-    """Make a page at `origin` send its requests to both programs at `host`, and return the results."""
+    """Let a page at `origin` send its requests to both programs at `host`, and return the results."""
     page = context.new_page()
     page.goto(origin)
     console, gateway = (f"http://{host}:{port}/" for port in (ground.console, ground.gateway))
@@ -325,7 +329,7 @@ def _attacked(ground: Ground, context: Any, origin: str, host: str) -> list[obje
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["127.0.0.1", "evil.example"])
 def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, context: Any, name: str) -> None:
-    """The pages are on a different port of the same host (with cookies), and on a different site."""
+    """Pages on another port of the same host (with cookies), and on another site, are refused."""
     with browser.another_origin() as url:
         found = _attacked(ground, context, url.replace("127.0.0.1", name), "127.0.0.1")
     assert set(found) <= {0, "refused"}, "0 is the status of an answer that the page may not read"
@@ -334,7 +338,7 @@ def test_another_page_of_the_operators_browser_is_not_obeyed(ground: Ground, con
 
 @pytest.mark.slow
 def test_a_page_whose_name_is_rebound_to_loopback_is_not_obeyed(ground: Ground, context: Any) -> None:
-    """The page has the origin of the console's port, so the browser permits it to read all responses."""
+    """A page whose name is rebound to the console's port is refused, although it may read all responses."""
     origin = f"http://evil.example:{ground.console}/start"
     context.route(origin, lambda route: route.fulfill(content_type="text/html", body="<!doctype html>"))
     found = _attacked(ground, context, origin, "evil.example")

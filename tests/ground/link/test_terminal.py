@@ -56,7 +56,7 @@ def test_the_defaults_are_those_of_the_configuration() -> None:
 
 
 class SharedLine:
-    """A line shared by several terminals; `before` is called before each sent frame."""
+    """A line that several terminals share. `before` is called before each frame is sent."""
 
     def __init__(self) -> None:
         self.frames: list[bytes] = []
@@ -77,7 +77,10 @@ class SharedLine:
 
 
 def test_programs_that_share_the_keys_send_in_the_order_of_their_counters(keys: Path) -> None:
-    """The gateway reserves a block of counters and stops before it sends; then the console sends."""
+    """Frames of gateway and console are sent in the order of their counters.
+
+    The console sends while the gateway has reserved a counter and has not yet sent its frame.
+    """
     slow, line = SharedLine(), SharedLine()
     slow.frames = line.frames
     gateway, console = (Terminal(one, Vault(keys), TerminalSettings()) for one in (slow, line))

@@ -1,6 +1,6 @@
 """Plots of artificial runs. `drawn_examples.json` contains their descriptions.
 
-`python -m tests.ground.report.drawn_examples` writes the record again after an intended change of the plots.
+`python -m tests.ground.report.drawn_examples` writes new descriptions after an intended change of the plots.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CONTROL_S = 0.1
 
 
 def attitude(x: float, y: float, z: float) -> list[float]:
-    """Return the attitude of a rotation vector, rad."""
+    """Return the attitude quaternion of a rotation vector (rad)."""
     return [float(part) for part in from_rotation_vector(np.array([x, y, z]))]
 
 
@@ -140,7 +140,7 @@ def run_of_a_testbed(truth: bool = True) -> Run:
 
 
 def run_in_orbit(truth: bool = True) -> Run:
-    """Return a run of forty minutes in orbit with detumbling, shadow and two targets."""
+    """Return a run of forty minutes in orbit with detumbling, a shadow and two targets."""
     times = [20.0 * k for k in range(120)]
 
     def error(t: float) -> list[float]:
@@ -250,7 +250,7 @@ def run_in_orbit(truth: bool = True) -> Run:
 
 
 def planned_slew(limit: float = 0.02) -> tuple[Any, Any]:
-    """Return an artificial slew across the edge of the sky map with two exclusion cones, and its command."""
+    """Return an artificial slew across the edge of the sky map with two keep-out cones, and its command."""
     times = np.linspace(0.0, 200.0, 9)
     angle = 2.4 * (times / 200.0) ** 2 * (3.0 - 2.0 * times / 200.0)
     rate = 2.4 * 6.0 * (times / 200.0) * (1.0 - times / 200.0) / 200.0
@@ -366,7 +366,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "slew": lambda: orbit_figures.slew_figure(*planned_slew()),
     "slew far from its limits": lambda: orbit_figures.slew_figure(*planned_slew(5.0)),
 }
-"""Pictures by name."""
+"""Plots by name."""
 
 
 def recorded(name: str) -> Any:
@@ -375,7 +375,7 @@ def recorded(name: str) -> Any:
 
 
 def rounded(value: Any) -> Any:
-    """Return a description after conversion to JSON and back, with seven digits of each number."""
+    """Return a description as it is read back from JSON, with seven digits of each number."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -386,7 +386,7 @@ def rounded(value: Any) -> Any:
 
 
 def main() -> None:
-    """Write the record of all plots."""
+    """Write the descriptions of all plots."""
     lines = [
         f"{json.dumps(name)}: {json.dumps(rounded(described(make())))}" for name, make in PICTURES.items()
     ]

@@ -1,7 +1,7 @@
-"""Description of a matplotlib figure as plain numbers, for comparison with a record.
+"""Description of a matplotlib figure as plain numbers, for comparison with a recorded description.
 
-Texts are reduced to their numbers and style, because the wording may change. Curves are reduced to five
-points and the mean.
+Of each text, only its numbers and style are kept, because the wording may change. Of each curve, only five
+points and the mean are kept.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from matplotlib.text import Annotation, Text
 from matplotlib.ticker import FixedLocator, LogLocator
 
 FRACTIONS = (0.0, 0.21, 0.5, 0.83, 1.0)
-"""Positions along a curve that are kept, as fractions of its length."""
+"""Positions along a curve whose points are kept, as fractions of the curve's length."""
 
 
 def described(figure: Figure) -> dict[str, Any]:
@@ -181,7 +181,7 @@ def _mark(mark: Artist | None) -> list[Any]:
 
 
 def _curve(values: Any) -> list[Any]:
-    """Return the length, the finite mean, and five values of an array."""
+    """Return the length of an array, the mean of its finite values, and five of its values."""
     values = np.ma.filled(np.ma.asarray(values, float), np.nan)
     if not len(values):
         return [0]
@@ -195,7 +195,7 @@ def _numbers(values: Any) -> list[float | None]:
 
 
 def _words(text: str) -> Any:
-    """Return the numbers in a text, or whether there is any text."""
+    """Return the numbers in a text, or, without numbers, whether the text is empty."""
     return re.findall(r"\d+\.?\d*", text) or bool(text and not text.startswith("_child"))
 
 

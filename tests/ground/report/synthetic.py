@@ -30,7 +30,7 @@ STREAK_ERROR = 2e-4  # error of each streak rate about the thread, rad/s, altern
 
 @dataclass(frozen=True)
 class Recipe:
-    """Parameters of a run: `duration` of `planned` s, a target every `hold` s, `rate_hz`, and extras.
+    """Parameters of a run. It lasts `duration` of `planned` s, and has a new target every `hold` s.
 
     `bus_power` (W) is measured each second by a monitor in the coils' supply; None without a monitor.
     """
@@ -174,7 +174,7 @@ def _truth(packer: Packer, stamp: int, q2: float, rate: float, current: float, s
 
 
 def _plan(packer: Packer, stamp: int, number: int, start: float, target: float) -> bytes:
-    """Return a cubic from rest to rest on eight nodes."""
+    """Return a plan of eight nodes on a cubic from rest to rest."""
     part = 0.5 * (lgl_rule(8).nodes + 1.0)
     node_q2 = np.full(table.MAX_NODES, np.nan)
     node_q2[:8] = start + (target - start) * (3.0 * part**2 - 2.0 * part**3)
@@ -199,10 +199,10 @@ def _plan(packer: Packer, stamp: int, number: int, start: float, target: float) 
 
 
 def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> bytes:
-    """Return the mean rate over the last second with the error `STREAK_ERROR` and its square as variance."""
+    """Return the mean rate over the last second, with the error `STREAK_ERROR` and its square as variance."""
     mean = float(np.mean(0.5 * (rates[1:] + rates[:-1])))
     error = STREAK_ERROR if sequence % 2 == 0 else -STREAK_ERROR
-    variance = STREAK_ERROR**2 / 3.0  # only one of three axes has an error, so that e' P^-1 e / 3 is 1
+    variance = STREAK_ERROR**2 / 3.0  # only one of three axes has an error, so e' P^-1 e / 3 is 1
     return packer.pack(
         table.STREAK,
         stamp,
@@ -221,7 +221,7 @@ def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> byt
 
 
 def _stars(packer: Packer, stamp: int, sequence: int, q2: float) -> bytes:
-    """Return an attitude with the error `STAR_ERROR` about the thread and its square as variance."""
+    """Return an attitude with the error `STAR_ERROR` about the thread, and a variance of its square."""
     half = np.arcsin(q2) + 0.5 * (STAR_ERROR if sequence % 2 == 0 else -STAR_ERROR)
     variance = STAR_ERROR**2 / 3.0
     return packer.pack(

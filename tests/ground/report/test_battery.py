@@ -1,4 +1,4 @@
-"""Tests of the report's section on the battery with known packets."""
+"""Tests of the battery section of the report, from packets with known values."""
 
 from __future__ import annotations
 

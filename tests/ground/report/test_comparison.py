@@ -19,7 +19,7 @@ LONG = Recipe(duration=90.0, planned=90.0, hold=30.0, rate_hz=10.0)
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return two runs. The second run is shorter, has no truth, and has a different planning horizon."""
+    """Return two runs. The second run is shorter, has no truth log, and has a different planning horizon."""
     place = tmp_path_factory.mktemp("pair")
     first = make_run(place / "a", LONG)
     second = make_run(place / "b", Recipe(60.0, 60.0, 30.0, 10.0, truth=False))
@@ -117,7 +117,7 @@ SHORT = Recipe(duration=4.0, planned=4.0, hold=2.0, rate_hz=10.0)
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Path:
-    """Return an archive of a complete run, a run with a torn tail, a run without log, and another folder."""
+    """Return an archive of a complete run, an incomplete run, a run without log, and another folder."""
     make_run(tmp_path / "run-000001", SHORT)
     torn = make_run(tmp_path / "run-000002", SHORT) / "flight-0001.ccsds"
     torn.write_bytes(torn.read_bytes()[:-30])

@@ -1,4 +1,4 @@
-"""Tests that damaged packets and impossible values in flight logs are reported and add no packet."""
+"""Tests that damaged packets and impossible values in flight logs are reported and not used."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IMPOSSIBLE = (b"\x7f\xf8\0\0\0\0\0\0", b"\x7f\xf0\0\0\0\0\0\0", b"\xff" * 8, byt
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
-    """Return the packets of the three logs of a run."""
+    """Return the packets in the three logs of a run."""
     run = make_run(tmp_path_factory.mktemp("run"), Recipe(duration=12.0, planned=12.0, hold=3.0, rate_hz=4.0))
     packets: dict[str, list[bytes]] = {stem: [] for stem in STEMS}
     for stem in STEMS:

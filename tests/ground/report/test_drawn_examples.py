@@ -1,4 +1,4 @@
-"""Tests that plots of artificial runs match recorded ones: curves, areas, colours, scales and labels."""
+"""Tests that plots of artificial runs have the recorded curves, areas, colours, scales and labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.packed_run import packed_run
 
 
 def unlike_record(*names: str) -> list[str]:
-    """Return the differences between plots and their record."""
+    """Return the differences between the plots and their recorded descriptions."""
     return [
         f"{name}{line}"
         for name in names

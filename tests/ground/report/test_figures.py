@@ -1,4 +1,4 @@
-"""Tests that plots show all data that a run has, and do not use matplotlib's global state."""
+"""Tests that plots show all data of a run, and do not use the global state of matplotlib."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def is_drawn(path: Path) -> bool:
-    """Return whether a plot contains more than white pixels."""
+    """Return whether a plot has pixels that are not white."""
     return bool(imread(path)[..., :3].std() > 0.01)
 
 
@@ -72,7 +72,10 @@ def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
 
 
 def test_the_thesis_line_stands_beside_the_supply_power_and_r_i_squared_apart(tmp_path: Path) -> None:
-    """A current of 0.1 A for a tenth of the time takes 34 mW at 3.4 V and 50 mW from the bus."""
+    """A coil with 0.1 A for a tenth of the time takes 34 mW at 3.4 V, and 50 mW from the bus.
+
+    The plot has separate lines for the thesis's limit, for the supply power and for R I^2.
+    """
     signals, ax = RunSignals(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots()
     panels.power(ax, signals)
     drawn = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in ax.get_lines()}

@@ -1,4 +1,4 @@
-"""Tests of an orbit run's results: pointing errors, fulfilled requirements, and residual dipole."""
+"""Tests of an orbit run's results: pointing errors, requirements that were met, and residual dipole."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LIMITS = "requirements: {slow_within: 100.0, knowledge_deg: 0.1, pointing_deg: %
 
 
 def flown(folder: Path, limit_deg: float) -> Path:
-    """Write a run that drifts from two targets by `OFF_DEG`, with its configuration and logs."""
+    """Write a run whose attitude differs from two targets by `OFF_DEG`, with its configuration and logs."""
     clock, packer = ManualClock(0), Packer()
     flight, truth = (
         FlightLog(folder, stem, clock=clock, sync_period_ns=None) for stem in ("flight", "truth")
@@ -79,7 +79,7 @@ def flown(folder: Path, limit_deg: float) -> Path:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a run whose axis error is 5 deg while 4.9 deg are permitted."""
+    """Return the folder of a run whose axis error is 5 deg, while the requirement is 4.9 deg."""
     place = tmp_path_factory.mktemp("orbit")
     return flown(place, 4.9)
 
@@ -121,7 +121,7 @@ def test_without_the_configuration_nothing_is_judged_and_the_report_says_so(
 
 
 def power_labels(signals: RunSignals) -> list[str]:
-    """Return the texts in the legend of the panel of the coil power."""
+    """Return the texts of the legend in the plot of the coil power."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     from ground.report import panels  # noqa: PLC0415 - needs matplotlib
@@ -162,7 +162,7 @@ TRUE = np.array([6e-4, 0.0, 8e-4])
 
 
 def dipole_flight(known: bool = True) -> Run:
-    """Return a run whose dipole error is half, later a tenth, and in shadow a fifth of the dipole."""
+    """Return a run whose dipole error is 50 %, later 10 %, and in shadow 20 % of the dipole."""
     times = np.arange(END)
     share = np.where(times < SHADOW - JUDGED, 0.5, np.where(times < SHADOW, 0.1, 0.2))
     packets = np.zeros(END, dtype=[("time_ns", "i8"), ("residual_dipole", "f8", 3)])

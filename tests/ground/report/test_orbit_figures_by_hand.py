@@ -1,4 +1,4 @@
-"""Tests of an orbit run's results from artificial packets, against values computed by hand."""
+"""Tests of an orbit run's results from artificial packets. Expected values are computed by hand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
 
 def turned(x: float, y: float = 0.0, z: float = 0.0) -> list[float]:
-    """Return the attitude of a small rotation vector, rad."""
+    """Return the attitude quaternion of a small rotation vector (rad)."""
     return [float(part) for part in from_rotation_vector(np.array([x, y, z]))]
 
 
@@ -82,9 +82,9 @@ def test_detumbling_has_the_rates_of_its_period_and_the_error_of_the_magnetomete
 
 
 def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
-    """The errors about x are 1 mrad (coarse), 2 and 3 mrad (with stars) and 6 mrad (without).
+    """Attitude errors count while the attitude is fine, and shortly after star fixes.
 
-    Sigma is 1 mrad.
+    The errors about x are 1 mrad (coarse), 2 and 3 mrad (with stars) and 6 mrad (without). Sigma is 1 mrad.
     """
     levels = [(0.0, 0), (1.0, 1), (2.0, 2), (30.0, 2)]
     sigma = {"angle_sigma": [1e-3] * 3}
@@ -140,7 +140,10 @@ def test_the_error_of_the_dipole_is_relative_to_its_size() -> None:
 
 
 def test_an_estimate_after_the_last_true_state_is_compared_with_that_state() -> None:
-    """The packets of a flight and of its truth log do not end at the same time."""
+    """An estimate that is later than the last true state is compared with the last true state.
+
+    The flight log and the truth log of a run do not end at the same time.
+    """
     run = packed_run(
         navigation=[(t, {"residual_dipole": [2e-3, 0.0, 0.0]}) for t in (1.0, 1.5)],
         orbit_truth=[
@@ -224,7 +227,7 @@ def test_the_star_camera_is_judged_without_its_misalignment_and_the_body_with_it
     sigmas = {f"{name}_sigma": [0.1] * 9 for name in matrices}
     inertia = [0.3, 0.3, 0.4, 0.0, 0.0, 0.1]
     doubled = [2.0 * one for one in inertia]
-    # The error of the body's attitude is the whole misalignment; that of the star camera's attitude is 1e-4
+    # The attitude error of the body includes the misalignment. The attitude error of the star camera is 1e-4
     # rad about x.
     body = from_rotation_vector(tilt + np.array([1e-4, 0.0, 0.0])).tolist()
     run = packed_run(

@@ -1,4 +1,4 @@
-"""Tests of the signals of a run from artificial packets, against values computed by hand."""
+"""Tests of the signals of a run from artificial packets. Expected values are computed by hand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ def test_the_energy_and_averages_weigh_each_interval_by_its_length() -> None:
 
 
 def test_the_truth_is_interpolated_between_close_records_and_unknown_elsewhere() -> None:
-    """The body rotates by 0.02 rad per 0.025 s; the second record has the quaternion's opposite sign."""
+    """The true attitude is interpolated between close records, and is NaN elsewhere.
+
+    The body rotates by 0.02 rad per 0.025 s. The second record has a quaternion with the opposite sign.
+    """
     times = (0.0, 1.0, 1.01, 1.025, 1.5, 2.0, 2.01)
     half = {1.0: 0.0, 1.01: 0.004, 1.025: 0.01, 2.0: 0.05}
     sign = {1.0: 1.0, 1.025: -1.0, 2.0: 1.0}
@@ -102,7 +105,10 @@ def test_covariances_are_unpacked_in_the_order_xx_yy_zz_xy_xz_yz() -> None:
 
 
 def test_the_mean_rate_over_an_exposure_is_the_integral_of_the_truth() -> None:
-    """The rate about x equals the time, so the mean rate equals the time of mid-exposure."""
+    """The mean rate over an exposure is the mean of the true rate.
+
+    The rate about x equals the time, so its mean equals the time of mid-exposure.
+    """
     run = packed_run(truth=[(float(t), {"rate": [float(t), 2.0, -1.0]}) for t in range(6)])
     start, stop = np.array([1.0, -0.5, 4.5, 2.0, 0.0]), np.array([3.0, 1.0, 5.5, 2.0, 5.0])
     means = signals.mean_rates(run["truth"], start, stop)
@@ -155,7 +161,7 @@ def test_star_attitudes_are_compared_with_the_truth_at_the_middle_of_the_exposur
 
 
 def test_the_true_misalignment_of_the_camera_is_not_an_error_of_its_frames() -> None:
-    """A camera measures the rate in its own axes, which are rotated from the body axes."""
+    """The rate of a frame is compared in camera axes, so the camera's misalignment is no error of it."""
     tilt, body = np.array([2e-3, -1e-3, 3e-3]), from_rotation_vector(np.array([0.2, -0.7, 0.4]))
     camera, rate = from_rotation_vector(tilt), np.array([0.1, 0.2, -0.05])
     truth = [(float(t), {"quaternion": body.tolist(), "rate": rate.tolist()}) for t in range(4)]

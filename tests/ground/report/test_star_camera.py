@@ -1,4 +1,4 @@
-"""Tests of the fraction of unobstructed instants at which the star camera gave an attitude or a rate."""
+"""Tests of the star camera's availability: the fraction of unobstructed instants with attitude or rate."""
 
 from __future__ import annotations
 
@@ -27,12 +27,11 @@ PERIOD, FINE_PERIOD, FINE_FROM = 5, 10, 100
 """Periods (s) of the configured camera, and the time (s) from which the attitude is fine."""
 FAST_UNTIL, HIDDEN = 20, (50, 80)
 """Time (s) until which the body is too fast for the camera, and interval (s) with the Earth in the
-exclusion cone.
-"""
+exclusion cone."""
 
 
 def packets(packet: Packet, times: list[float], **fields: Any) -> PacketArray:
-    """Return packets at times (n,), s, with zeros in the remaining fields."""
+    """Return packets at times (n,), s. Fields that are not given are zero."""
     rows = np.zeros(len(times), dtype=Layout(packet).dtype)
     rows["time_ns"] = (np.array(times) * 1e9).astype(np.int64)
     for name, values in fields.items():
@@ -51,9 +50,9 @@ def config() -> OrbitConfig:
 
 
 def flight(gave: list[float]) -> Run:
-    """Return a run with frames at the times `gave`, alternately with a rate and an attitude.
+    """Return a run with frames at the times `gave`, which alternately have a rate and an attitude.
 
-    The camera points to the zenith with the Sun behind the Earth, and to the limb during `HIDDEN`.
+    The camera points to the zenith, with the Sun behind the Earth. During `HIDDEN` it points to the limb.
     """
     seconds = [float(at) for at in range(END + 1)]
     limb = math.pi - math.asin(EARTH_RADIUS / 7e6) - 0.1

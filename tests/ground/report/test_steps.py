@@ -1,4 +1,4 @@
-"""Tests of the step results of Table 5.3, with signals whose results have a closed form."""
+"""Tests of the step results of Table 5.3, for signals whose results have a closed form."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ def step_of(command: StepCommand, progress: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("damping", [0.3, 0.5, 0.7])
 @pytest.mark.parametrize("frequency", [0.4, 1.0])
 def test_a_second_order_step_has_its_textbook_figures(damping: float, frequency: float) -> None:
-    """The overshoot is exp(-pi z/sqrt(1 - z^2)); rise and settling times follow from the exact response."""
+    """The overshoot of a second-order step is exp(-pi z/sqrt(1 - z^2)).
+
+    The times follow from the exact response.
+    """
     since = np.maximum(TIME - STEP.time, 0.0)
     found = response(TIME, step_of(STEP, second_order(since, damping, frequency)), STEP)
 
@@ -107,9 +110,10 @@ def test_steps_run_from_target_to_target_and_the_first_from_the_release() -> Non
 
 
 def test_a_step_begins_where_the_body_was_unless_the_body_held_the_target_before() -> None:
-    """The second target is commanded when the body is half way to the first target.
+    """A step begins at the body's attitude, or at the previous target if the body has held it.
 
-    A mode change ends the third step.
+    The second target is commanded when the body is half way to the first target. A mode change ends the third
+    step.
     """
     listed = commanded_steps([0, 1, 1], np.array([0.0, 2.0, 60.0]), np.array([0.2, 0.4, -0.2]), 0.0, 100.0)
     time = np.arange(0.0, 100.0, 0.1)

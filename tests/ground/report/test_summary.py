@@ -1,4 +1,4 @@
-"""Tests that the summary reports the facts of a run, and names the unknown facts."""
+"""Tests that the summary reports the results of a run, and names results that are unknown."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
 
 
 def test_supply_power_and_heat_are_means_from_the_true_energies(full: Run) -> None:
-    """The coil carries 0.1 A for a tenth of the time."""
+    """Mean powers and energies are those of a coil that carries 0.1 A for a tenth of the time."""
     power = summarise(full)["power"]
     assert power["source"] == "truth"
     assert power["heat_average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
@@ -136,7 +136,7 @@ def test_a_step_of_no_size_is_distinguished_from_one_never_made(tmp_path: Path) 
 
 
 def test_an_interrupted_step_is_not_judged(tmp_path: Path) -> None:
-    """Three seconds are too few for this response to reach 90 % of its step."""
+    """A step that ends after 3 s is not judged, because 3 s are too few to reach 90 % of the step."""
     summary = summarise(short(tmp_path, duration=6.0, planned=6.0, hold=3.0))
     assert not any(step["complete"] for step in summary["steps"])
     assert "step 1: interrupted after 3.0 s, not judged" in summary["notes"]
@@ -163,7 +163,7 @@ def test_frames_without_rate_and_attitude_are_listed_with_the_reason(full: Run, 
 
 
 def test_a_step_never_settled_is_a_miss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forty seconds are too few for a response this slow to reach 90 % of its step."""
+    """A step that has not settled after 40 s is a miss. This response is too slow to reach 90 % in 40 s."""
     monkeypatch.setattr("tests.ground.report.synthetic.FREQUENCY", 0.02)
     summary = summarise(short(tmp_path, duration=80.0, planned=80.0, hold=40.0))
     assert summary["steps"][1]["settling_s"] is None
@@ -180,7 +180,10 @@ def test_without_a_monitor_the_power_at_the_bus_is_unknown(tmp_path: Path) -> No
 
 
 def test_the_supply_power_is_judged_by_the_thesis_whatever_r_i_squared_is(tmp_path: Path) -> None:
-    """Powers of 0.11 W at the coils and 0.16 W at the bus exceed 0.10 W; R I^2 is only 0.01 W."""
+    """The requirement of 0.10 W applies to the supply power, not to R I^2.
+
+    The powers are 0.11 W at the coils and 0.16 W at the bus, and R I^2 is only 0.01 W.
+    """
     log, packer = FlightLog(tmp_path, "truth", clock=ManualClock()), Packer()
     for i in range(100):
         log.write(
@@ -240,7 +243,7 @@ def test_slots_without_a_control_packet_are_counted(full: Run, tmp_path: Path) -
 
 
 def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
-    """The artificial estimate and each streak rate have errors of exactly one sigma."""
+    """The normalised errors of the estimate and of each streak rate are one, as each error is one sigma."""
     summary = summarise(full)
     assert summary["estimate"]["rate_rms_rad_s"] == pytest.approx(RATE_BIAS, rel=1e-6)
     assert summary["estimate"]["rate_normalised"] == pytest.approx(1.0, rel=1e-6)
@@ -257,7 +260,7 @@ def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
 
 
 def test_the_mean_rate_over_an_exposure_is_the_turn_over_its_time() -> None:
-    """The mean of a linearly growing rate is the rate at mid-exposure."""
+    """The mean of a linearly increasing rate is the rate at mid-exposure."""
     packer = Packer()
     raw = b"".join(
         packer.pack(TRUTH, i * 25_000_000, quaternion=(0, 0, 0, 1), rate=(0, 0.01 * 0.025 * i, 0),

@@ -45,7 +45,7 @@ LOGS = (
 
 
 def blocks(**changes: Any) -> list[str]:
-    """Return the sections of the report between the headline and the sections on loop, logs and notes."""
+    """Return the sections of the report after the headline, without the sections on loop, logs and notes."""
     found = format_report({**EMPTY, **changes}).removesuffix("\n").split("\n\n")
     assert found[0] == "Run runs/a: 12.3 s"
     assert found[-2:] == [LOGS, "note: one\nnote: two"]

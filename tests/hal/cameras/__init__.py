@@ -1,1 +1,1 @@
-"""Tests of cameras: V4L2 with a replaced ioctl, Aravis with its fake camera, and the emulated camera."""
+"""Tests of cameras: V4L2 with replaced ioctls, Aravis with its fake camera, and the emulated camera."""

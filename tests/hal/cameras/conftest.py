@@ -28,7 +28,7 @@ def kernel(tmp_path: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture(params=["emulated", "v4l2", "aravis"])
 def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    """Build each frame source in turn."""
+    """Return each type of frame source in turn."""
     if request.param == "emulated":
         made = emulated_rig()
     elif request.param == "aravis":

@@ -1,7 +1,7 @@
-"""Replacement of the kernel's /dev/videoN: a free-running camera that performs the ioctls of V4L2.
+"""Test double of the kernel's /dev/videoN: a free-running camera that performs the ioctls of V4L2.
 
-The buffers are in a memfd that the binding maps. The queue has the kernel's rules (Linux Media userspace API,
-"Streaming I/O (Memory Mapping)"), and calls out of order get the errno stated there.
+The buffers are in a memfd, which the driver's binding maps. The queue follows the kernel's rules (Linux Media
+userspace API, "Streaming I/O (Memory Mapping)"). Calls in a wrong order fail with the errno of that document.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ MILLISECOND_NS = 1_000_000
 
 @dataclass(slots=True)
 class Knob:
-    """A camera control: its bounds and its value."""
+    """A camera control with its bounds and its value."""
 
     minimum: int
     maximum: int
@@ -41,15 +41,15 @@ class IoctlCamera:
     Attributes:
         sizes: image sizes of the formats, {fourcc: (columns, rows)}.
         padding: bytes after each row.
-        shortest_ns: shortest interval of frames, ns; long exposures lengthen it.
+        shortest_ns: shortest interval of frames, ns; the interval is longer for long exposures.
         readout_ns: time from the end of an exposure to the end of the frame, ns.
         lag: number of frames until a changed control takes effect.
-        stamp_source, clock_flag, stamp_offset_ns: claimed source and clock of the time stamps, and their
+        stamp_source, clock_flag, stamp_offset_ns: reported source and clock of the time stamps, and their
             error.
-        stamps_packets: whether time stamps are those of the first packet, as with uvcvideo.
-        spoil, shorten: numbers of the frames with an error flag, and of those with half their bytes.
+        stamps_packets: whether time stamps are those of the first USB packet, as with uvcvideo.
+        spoil, shorten: numbers of the frames with an error flag, and of the frames with half their bytes.
         frozen: whether the sequence number stays constant.
-        belies_exposure: whether frames come every `shortest_ns`, whatever exposure is set.
+        belies_exposure: whether frames come every `shortest_ns`, independent of the exposure.
         stopped: whether the camera has stopped sending frames.
         absurd: wrong time stamps of single frames, by frame number.
         raw: content of each frame instead of a pattern, and its number of used bytes.
@@ -96,7 +96,7 @@ class IoctlCamera:
         self._forget()
 
     def unplug(self) -> None:
-        """Unplug the camera: each call and each opening fails."""
+        """Unplug the camera. Each later call and each opening fails."""
         self.plugged = False
         self.path.unlink()
 
@@ -113,7 +113,7 @@ class IoctlCamera:
         self._pending: list[tuple[int, int]] = []  # delay (frames), exposure
 
     def __call__(self, _: int, request: int, argument: Any) -> int:
-        """Perform one ioctl like the kernel. Raises OSError like the kernel."""
+        """Perform one ioctl. Raises OSError as the kernel does."""
         if not self.plugged:
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
         answers: dict[int, Callable[[Any], None]] = {
@@ -223,13 +223,13 @@ class IoctlCamera:
         knob = self.knobs[argument.id]
         _require(knob.minimum <= argument.value <= knob.maximum, errno.ERANGE)
         if argument.id == v4l2.EXPOSURE_ABSOLUTE:
-            # Like UVC, a camera with automatic exposure refuses a set exposure.
+            # Like UVC cameras, the camera refuses a set exposure while its exposure is automatic.
             _require(self.knobs[v4l2.EXPOSURE_AUTO].value == v4l2.EXPOSURE_MANUAL, errno.EACCES)
             self._pending.append((self.lag, argument.value))
         knob.value = argument.value
 
     def _run(self) -> None:
-        """Finish each frame whose end is due; without a free buffer a frame is lost."""
+        """Finish each frame whose end is due. A frame without a free buffer is lost."""
         while self._streaming and not self.stopped:
             exposure_ns = self._exposure * v4l2.EXPOSURE_UNIT_NS
             start_ns = self._next_ns
@@ -270,7 +270,7 @@ class IoctlCamera:
         self._filled.append(buffer)
 
     def _draw(self, index: int, level: int) -> None:
-        """Write an image whose pixel (x, y) is level + x + 100 y, in the low bits, padding 255."""
+        """Write an image whose pixel (x, y) is level + x + 100 y in the low bits. Padding bytes are 255."""
         columns, rows = self.sizes[self._kind]
         kind = np.dtype("u1") if self._kind == "GREY" else np.dtype("<u2")
         bits = {"GREY": 8, "Y10": 10, "Y12": 12, "Y16": 16}[self._kind]

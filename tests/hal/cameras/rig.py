@@ -1,4 +1,4 @@
-"""Frame sources for tests, each with a clock that supports waiting."""
+"""Frame sources for tests, each with a clock that tests can advance or wait for."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SETTLED_NS = 400_000_000
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A frame source, its clock, and the function that unplugs it (None if it cannot be unplugged)."""
+    """A frame source, its clock, and a function that unplugs the source, or None."""
 
     source: FrameSource
     clock: Clock
@@ -54,7 +54,7 @@ class Rig:
         return None
 
     def next_frame(self) -> Frame:
-        """Trigger and return the frame."""
+        """Trigger an exposure and return the frame."""
         self.source.trigger(EXPOSURE_NS)
         frame = self.frame_within(2_000_000_000)
         assert frame is not None, "no frame came"
@@ -72,7 +72,7 @@ class VideoRig:
 
 
 class _World:
-    """Runs an emulated camera with a clock."""
+    """Runs an emulated camera while its clock advances."""
 
     def __init__(self, camera: EmulatedCamera) -> None:
         self._camera = camera
@@ -123,7 +123,7 @@ def video_rig(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> Vid
 
 
 def settled(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> VideoRig:
-    """Return a camera whose frames all have the exposure that was set."""
+    """Return a camera whose delivered frames all have the exposure that was set."""
     made = video_rig(kernel, clock, **changes)
     made.rig.wait(SETTLED_NS)
     return made
@@ -131,7 +131,7 @@ def settled(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> Video
 
 def require_aravis() -> None:
     """Skip the test if Aravis is not available in this Python."""
-    with warnings.catch_warnings(action="ignore"):  # warnings of PyGObject's importer are ignored
+    with warnings.catch_warnings(action="ignore"):  # the import of PyGObject emits warnings
         try:
             aravis_camera.library("Fake_1")
         except Refused as error:
