@@ -1,4 +1,4 @@
-"""Tests of IMUs of separate sensors: starts, failures, attitude, and the SPI device of Linux."""
+"""Tests of IMUs that consist of separate sensors: starts, failures, attitude, and Linux's SPI device."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Sensor:
 
 
 class Bench:
-    """A unit with one sensor; `starts` counts the starts of the sensor."""
+    """An IMU with one sensor; `starts` counts the starts of this sensor."""
 
     def __init__(self) -> None:
         self.clock, self.sensor, self.starts = SimClock(), Sensor(), 0
@@ -160,7 +160,7 @@ def test_another_or_no_part_on_the_spi_bus_is_refused(answer: bytes, error: type
 def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    """The numbers and the 32 bytes of struct spi_ioc_transfer are those of linux/spi/spidev.h."""
+    """The ioctl numbers and the 32 bytes of struct spi_ioc_transfer equal those of linux/spi/spidev.h."""
     device = tmp_path / "spidev0.0"
     device.touch()
     calls: list[tuple[int, bytes]] = []
@@ -189,7 +189,7 @@ def test_an_spi_device_that_is_missing_is_named_with_the_cure() -> None:
 
 
 def test_the_duration_of_a_job_does_not_lower_its_rate() -> None:
-    """Reading the sensors takes milliseconds, and the control loop expects 40 readings a second."""
+    """A job of 10 ms that is due every 20 ms starts every 20 ms, so a slow job does not lower its rate."""
     clock, begun = SystemClock(), []
 
     def job() -> None:
@@ -199,5 +199,5 @@ def test_the_duration_of_a_job_does_not_lower_its_rate() -> None:
     ticker = clock.ticker("slow", 20_000_000, job)
     clock.sleep_until_ns(clock.now_ns() + 400_000_000)
     ticker.stop()
-    # On a busy machine runs may be late, but then the next period is shorter than job and period together.
+    # On a busy machine a run may be late. The next run then follows after less than period plus job (30 ms).
     assert np.diff(begun).min() < 26_000_000

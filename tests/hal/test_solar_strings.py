@@ -36,7 +36,10 @@ class Bench:
 
 
 def bench(peak: float = 0.5, after_noon: float = 0.0) -> Bench:
-    """Return strings of `peak` A in an orbit that begins `after_noon` degrees behind the Sun's meridian."""
+    """Return solar strings of `peak`
+
+    A in an orbit that begins `after_noon` degrees behind the Sun's meridian.
+    """
     clock = SimClock()
     orbit = OrbitSection(local_time=12.0, true_anomaly_deg=after_noon)
     body = FreeBody(FreeBodySection(orbit=orbit, release=TipOff(speed=0.0)), lambda: np.zeros(3))
@@ -76,7 +79,10 @@ def test_a_reading_is_the_current_to_a_step_of_the_converter_and_no_older_than_i
 
 
 def test_a_reset_of_the_whole_bus_costs_a_round_and_no_more() -> None:
-    """The software reset that makes a PWM chip use its own clock again also resets the converters."""
+    """After a reset of the whole bus, one round of readings is lost.
+
+    The software reset of a PWM chip also resets the converters.
+    """
     flown = bench()
     flown.wait(2.1)
     before = flown.driver.latest()
@@ -152,13 +158,16 @@ def test_wirings_and_periods_that_cannot_be_are_refused() -> None:
 
 
 def test_the_words_are_those_of_the_data_sheet() -> None:
-    """By SBAS444 Table 8-3: OS 1, MUX 1xx, PGA 010, MODE 1, DR 100, COMP_QUE 11; 0x8583 at power-on."""
+    """The configuration is OS 1, MUX 1xx, PGA 010, MODE 1, DR 100, COMP_QUE 11 (SBAS444, Table 8-3).
+
+    The power-on value is 0x8583.
+    """
     assert [config_for(channel) for channel in range(4)] == [0xC583, 0xD583, 0xE583, 0xF583]
     clock = SimClock()
     bus = EmulatedI2cBus([EmulatedAds1115(0x48, clock.now_ns, lambda channel: 0.5 * channel)])
     assert bus.read_i2c_block_data(0x48, 1, 2) == [0x85, 0x83]
     bus.write_i2c_block_data(0x48, 1, [0xE5, 0x83])
-    assert bus.read_i2c_block_data(0x48, 1, 2) == [0x65, 0x83]  # the converter is busy
+    assert bus.read_i2c_block_data(0x48, 1, 2) == [0x65, 0x83]  # the converter is still converting
     clock.sleep_until_ns(8_000_000)
     assert bus.read_i2c_block_data(0x48, 1, 2) == [0xE5, 0x83]
     assert bus.read_i2c_block_data(0x48, 0, 2) == list(round(1.0 / 2.048 * 32768).to_bytes(2, "big"))

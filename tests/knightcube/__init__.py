@@ -1,1 +1,1 @@
-"""Tests of the library."""
+"""Tests of the library knightcube."""

@@ -139,7 +139,7 @@ def require_aravis() -> None:
 
 
 def aravis_rig(**changes: object) -> Rig:
-    """Return Aravis' Fake camera in real time."""
+    """Return the Fake camera of Aravis, in real time."""
     require_aravis()
     clock = SystemClock()
     wanted: dict[str, object] = {
@@ -155,10 +155,10 @@ def aravis_rig(**changes: object) -> Rig:
 
 
 def kernel_in(folder: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
-    """Replace the kernel's V4L2 by a test double."""
+    """Replace the kernel's V4L2 interface by a test double."""
     kernel = IoctlCamera(folder, clock.now_ns)
     monkeypatch.setattr("hal.drivers.v4l2_camera.ioctl", kernel)
-    # A file in `folder` replaces the file in which the machine's own kernel reports a setting of its UVC
-    # driver.
+    # The machine's kernel reports a setting of its UVC driver in a file. A file in `folder` replaces this
+    # file.
     monkeypatch.setattr("hal.drivers.v4l2_camera.UVC_STAMPS", folder / "hwtimestamps")
     return kernel

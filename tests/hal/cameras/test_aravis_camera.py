@@ -1,4 +1,4 @@
-"""Tests of the GenICam driver with Aravis' Fake camera, and of its message if Aravis is missing."""
+"""Tests of the GenICam driver with the Fake camera of Aravis, and of its message if Aravis is missing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MILLISECOND_NS = 1_000_000
 
 @pytest.fixture
 def fake() -> Iterator[AravisCamera]:
-    """Open Aravis' Fake camera without a ServedCamera."""
+    """Open the Fake camera of Aravis without a ServedCamera."""
     require_aravis()
     camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono16", EXPOSURE_NS, None), SystemClock())
     camera.open()
@@ -93,7 +93,7 @@ def test_a_camera_whose_control_is_lost_is_reported_and_opened_again() -> None:
 def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None:
     clock = SystemClock()
     deadline_ns = clock.now_ns() + 500 * MILLISECOND_NS
-    while clock.now_ns() < deadline_ns:  # the Fake camera runs freely, so frames arrive
+    while clock.now_ns() < deadline_ns:  # the Fake camera sends frames without a trigger
         assert fake.collect() is None
         clock.sleep_until_ns(clock.now_ns() + 10 * MILLISECOND_NS)
     fake.expose(EXPOSURE_NS, clock.now_ns())

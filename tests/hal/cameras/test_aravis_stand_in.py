@@ -1,4 +1,4 @@
-"""Tests of the Aravis driver with a test double of the library: set-up, exposures, accepted frames."""
+"""Tests of the Aravis driver with a test double of the library: configuration, exposures, accepted frames."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class FakeBuffer:
 
 
 class FakeStream:
-    """A stream with a queue of finished buffers."""
+    """A stream with a queue of completed buffers."""
 
     def __init__(self) -> None:
         self.finished: list[FakeBuffer] = []
@@ -203,7 +203,7 @@ class Rig:
         return found
 
     def arrive(self, number: int, status: int = 0, size: int = 640 * 480 * 2) -> None:
-        """Make a frame arrive."""
+        """Complete a buffer of the stream."""
         data = (np.arange(size // 2) % 4096).astype("<u2").tobytes()
         self.stream.finished.append(FakeBuffer(number, data, status))
 

@@ -1,4 +1,4 @@
-"""Tests that each frame source keeps the contract of hal.interfaces.devices.FrameSource."""
+"""Tests that each frame source fulfils the contract of hal.interfaces.devices.FrameSource."""
 
 from __future__ import annotations
 

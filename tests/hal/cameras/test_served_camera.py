@@ -1,4 +1,4 @@
-"""Tests of a camera served by a separate process: the loop never waits, and frame numbers increase."""
+"""Tests of a camera that a separate process serves: the loop never waits, and frame numbers increase."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_neither_trigger_nor_poll_waits_for_a_camera_that_hangs() -> None:
     camera = ServedCamera(device, clock)
     camera.trigger(1_000_000)
     assert device.begun.wait(WAIT_S)
-    # The job is now waiting inside the camera. If it held a lock, the following calls would block forever.
+    # The job now waits inside the camera. If the job held a lock, the following calls would block forever.
     camera.trigger(2_000_000)
     assert camera.poll() is None
     device.go.set()

@@ -1,4 +1,4 @@
-"""Tests of the V4L2 driver: the frame of a trigger, dropped frames, and messages after a refusal."""
+"""Tests of the V4L2 driver: the frame that belongs to a trigger, dropped frames, and messages of refusals."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_frames_that_lay_in_the_queue_are_not_the_triggered_one(
     with VideoDevice(str(kernel.path)) as device:
         device.set_format(64, 48, "GREY")
         assert device.start(3) == 3
-        # No frame is dequeued: three old frames are queued, and later frames are lost.
+        # The driver dequeues no frame. Three old frames are in the queue, and later frames are lost.
         clock.advance(SECOND_NS)
         numbers = []
         while (filled := device.dequeue()) is not None:
@@ -310,7 +310,10 @@ def test_a_broken_exchange_is_not_a_crash(
 def test_an_input_output_error_that_passes_costs_no_reopening(
     kernel: IoctlCamera, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """According to the kernel's documentation of VIDIOC_DQBUF, EIO may mean a temporary loss of signal."""
+    """A temporary EIO does not lead to a reopening of the camera.
+
+    The kernel's documentation of VIDIOC_DQBUF states that EIO may mean a temporary loss of signal.
+    """
     video = settled(kernel, clock)
     fetched = kernel._dqbuf
 
@@ -327,7 +330,10 @@ def test_an_input_output_error_that_passes_costs_no_reopening(
 
 
 def test_a_name_cut_inside_a_character_is_accepted(kernel: IoctlCamera, clock: ManualClock) -> None:
-    """The fields have 32 bytes, so that a longer name is cut."""
+    """A device name that the kernel has cut within a character is accepted.
+
+    The kernel's fields have 32 bytes.
+    """
     kernel.card = "Caméra de précision à l'été, é".encode()[:31]
     kernel.knobs[v4l2.GAIN].name = b"Verst\xc3"
     with pytest.raises(UnicodeDecodeError):
@@ -371,14 +377,14 @@ def test_no_such_camera_names_the_cure(tmp_path: Path, kernel: IoctlCamera, cloc
 def test_a_path_that_is_not_a_video_device_is_refused(tmp_path: Path, clock: ManualClock) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"")
-    kernel = IoctlCamera(tmp_path, clock.now_ns)  # the binding calls the real kernel here
+    kernel = IoctlCamera(tmp_path, clock.now_ns)  # the driver calls the real kernel in this test
     with pytest.raises(Refused, match="is not a V4L2 device"):
         video_rig(kernel, clock, path=str(path))
     kernel.close()
 
 
 def test_a_node_that_captures_nothing_is_refused(kernel: IoctlCamera, clock: ManualClock) -> None:
-    kernel.capabilities = v4l2.CAP_STREAMING  # like the metadata node of a UVC camera
+    kernel.capabilities = v4l2.CAP_STREAMING  # capabilities as of the metadata node of a UVC camera
     with pytest.raises(Refused, match="cannot capture video: use its capture device"):
         video_rig(kernel, clock)
 

@@ -1,4 +1,4 @@
-"""Fixtures of one rig on two buses: the emulated bus in memory, and smbus2 with replaced ioctls."""
+"""Fixtures of one rig with two buses: an emulated bus in memory, and smbus2 with replaced ioctls."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from tests.manual_clock import ManualClock
 
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> IoctlWire:
-    """Replace the kernel's I2C by an emulated bus. Every file that can be opened then acts as an adapter."""
+    """Replace the kernel's I2C interface by an emulated bus.
+
+    Every file that can be opened is then an adapter.
+    """
     wire = Wire(ManualClock(), THESIS, uncertainty=0.0)
     return _replace_ioctl(monkeypatch, wire)
 
 
 @pytest.fixture(params=["emulated", "smbus2"])
 def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    """Build a rig, not yet started, on either bus."""
+    """Return a rig on each of the two buses. The coils are not started."""
     if request.param == "emulated":
         yield Rig()
         return

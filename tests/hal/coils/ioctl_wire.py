@@ -1,4 +1,4 @@
-"""Replacement of the kernel's /dev/i2c-N: an emulated bus performs the ioctls of smbus2."""
+"""Replacement of the kernel's /dev/i2c-N, in which an emulated bus performs the ioctls of smbus2."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class IoctlWire:
 
     Attributes:
         wire: the emulated bus that performs the transfers.
-        settings: requests and values of all timeout and retry settings, in order.
+        settings: (request, value) of each change of timeout or retries, in order.
         functions: the adapter's functionality mask.
-        slave_error: errno raised by selecting an address, or 0.
+        slave_error: errno with which the selection of an address fails, or 0.
     """
 
     def __init__(self, wire: EmulatedI2cBus) -> None:
@@ -33,7 +33,7 @@ class IoctlWire:
         self.slave_error = 0
 
     def __call__(self, descriptor: int, request: int, argument: Any = 0) -> int:
-        """Perform one ioctl like the kernel. Raises OSError like the kernel."""
+        """Perform one ioctl. Raises OSError as the kernel does."""
         if request == smbus2.I2C_FUNCS:
             argument.value = self.functions
         elif request == smbus2.I2C_SLAVE:

@@ -45,9 +45,9 @@ class Wire:
 
 
 class Rig:
-    """Coil driver and bus on a manual clock, with started coils.
+    """Coil driver and bus on a manual clock.
 
-    `bus` replaces the emulated bus.
+    If `bus` is given, it replaces the emulated bus.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Rig:
 
     @property
     def duties(self) -> list[float]:
-        """The duty cycle of each channel of the chip."""
+        """Duty cycle of each channel of the chip."""
         return [self.wire.chip.duty(channel) for channel in range(16)]
 
     def currents(self) -> list[float]:
@@ -80,5 +80,5 @@ class Rig:
 
 
 def limited_to(current_limit: float, settings: CoilSettings = UNEQUAL) -> CoilSettings:
-    """Return settings with the given current limit."""
+    """Return coil settings with the given current limit."""
     return dataclasses.replace(settings, current_limit=current_limit)

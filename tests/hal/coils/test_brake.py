@@ -1,4 +1,4 @@
-"""Tests of a bridge with a leg stuck high: the coil's current, and the commands that keep it at zero."""
+"""Tests of a bridge with a leg stuck high: the current of its coil, and commands that end this current."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Y = frozenset({1})
 
 
 def stuck(condition: CoilCondition = CoilCondition.A_HIGH) -> Rig:
-    """Return a rig that has been started, with a leg of coil y's bridge broken."""
+    """Return a rig whose coils are started, with one leg of coil y's bridge stuck."""
     rig = Rig()
     rig.coils.start()
     rig.wire.circuit.become(1, condition)
@@ -28,7 +28,10 @@ def stuck(condition: CoilCondition = CoilCondition.A_HIGH) -> Rig:
 def test_a_leg_stuck_high_drives_its_coil_at_zero_and_a_brake_ends_it(
     condition: CoilCondition, sign: float
 ) -> None:
-    """The brake sets both inputs high, so that the stuck leg need not be known."""
+    """A leg stuck high drives its coil at zero command, until the brake sets both inputs high.
+
+    The brake works for either leg, so the driver need not know which leg is stuck.
+    """
     rig = stuck(condition)
     rig.command(0.0, 0.0, 0.0)
     assert rig.currents() == pytest.approx([0.0, sign * FULL, 0.0])
@@ -50,7 +53,10 @@ def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig
 
 
 def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
-    """A bridge does not stay braked on suspicion alone: the current is checked, and the brake released."""
+    """With a leg stuck low, the brake would drive the coil.
+
+    So the current is checked after a brake, and the brake is released if the current remains.
+    """
     rig = stuck(CoilCondition.A_LOW)
     assert rig.currents() == [0.0, 0.0, 0.0]
     rig.coils.brake(Y)
@@ -86,7 +92,10 @@ def test_close_leaves_a_stuck_leg_braked() -> None:
 
 
 def test_a_brown_out_lifts_a_brake_for_half_a_second_at_most() -> None:
-    """The chip loses its registers, so that the leg drives its coil until the next check of the set-up."""
+    """After a brown-out of the chip, a stuck leg drives its coil for at most 0.6 s.
+
+    The chip loses its registers. The next check of its configuration restores the brake.
+    """
     rig = stuck()
     rig.coils.brake(Y)
     rig.wire.chip.brown_out()

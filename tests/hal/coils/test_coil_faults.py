@@ -1,4 +1,4 @@
-"""Tests of the torque coils with a failing bus and chip: retries, counters, and zero current in doubt."""
+"""Tests of the torque coils with faults of bus and chip: retries, counters, and zero current in doubt."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def test_a_passing_fault_is_retried_and_counted(rig: Rig, fault: str) -> None:
 
 
 def test_a_write_that_fails_for_good_ends_at_zero_and_says_why(rig: Rig) -> None:
-    """Three attempts are cut after ten bytes: coil x has its new value and coil y does not.
+    """If three attempts of a write fail, the driver writes zero to all coils and reports the error.
 
-    Then zero is written.
+    Each attempt fails after ten bytes, so that coil x has its new value and coil y has its old one.
     """
     rig.coils.start()
     rig.command(0.1, 0.1, 0.1)
@@ -63,7 +63,10 @@ def test_a_dead_chip_keeps_its_error_until_it_is_back_and_then_obeys(rig: Rig) -
 
 
 def test_a_dead_chip_is_asked_once_a_period_and_with_zero(rig: Rig) -> None:
-    """On a hung bus each transaction takes a timeout, so that the job must make few transactions."""
+    """A chip that does not respond is accessed once per period of 50 ms, by one transaction that writes zero.
+
+    On a hung bus, each transaction lasts until its timeout.
+    """
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)
     rig.wire.bus.nack(PCA, times=None)
@@ -84,7 +87,10 @@ def test_a_job_that_is_late_for_close_writes_nothing(rig: Rig) -> None:
 
 @pytest.mark.parametrize("action", ["off", "close"])
 def test_zero_asked_for_just_before_a_write_is_not_undone_by_it(action: str) -> None:
-    """The call is made as by a signal handler that interrupts the writing thread."""
+    """A call of `off` or `close` just before a write is not undone by this write.
+
+    The call is made as by a signal handler that interrupts the writing thread.
+    """
 
     class Interrupted(EmulatedI2cBus):
         signal: Callable[[], None] | None = None
@@ -149,7 +155,10 @@ def test_a_brown_out_is_mended_within_a_second_and_counted(rig: Rig) -> None:
 
 
 def test_bits_flipped_in_a_zero_do_not_outlast_one_period(rig: Rig) -> None:
-    """I2C has no checksum: the full-OFF value of coil x's input A is changed into a duty cycle of a half."""
+    """A write of zero with flipped bits is corrected after one period of 50 ms.
+
+    I2C has no checksum. The full-OFF value of coil x's input A becomes a duty cycle of a half.
+    """
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)
     rig.wire.bus.flip_bits(PCA, index=3, mask=0x18)

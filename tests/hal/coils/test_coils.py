@@ -1,4 +1,4 @@
-"""Tests of the torque coils from driver to current: correct values, and zero in case of doubt."""
+"""Tests of the torque coils from driver to current: correct currents, and zero current in doubt."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ USUAL = st.floats(-0.25, 0.25)
 def test_the_world_feels_what_was_commanded_within_half_a_count(
     command: tuple[float, float, float], limit: float
 ) -> None:
-    """The coils have unequal resistances, and one coil is connected with reversed polarity."""
+    """The coil currents equal the commanded currents within half a count of the PWM.
+
+    The coils have unequal resistances, and one coil is connected with reversed polarity.
+    """
     rig = Rig(limited_to(limit))
     rig.coils.start()
     rig.command(*command)
@@ -52,7 +55,10 @@ def test_the_world_feels_what_was_commanded_within_half_a_count(
 
 
 def test_six_coils_carry_their_own_currents_through_the_chip_and_brake_alone() -> None:
-    """The fifth coil has reversed polarity and the sixth has its own channels."""
+    """Six coils on one chip carry their commanded currents, and each coil can be braked alone.
+
+    The fifth coil has reversed polarity, and the sixth coil has its own channels.
+    """
     coils = [CoilWiring(2 * k, 2 * k + 1, 20.0 + k, sign=-1 if k == 4 else 1) for k in range(5)]
     rig = Rig(replace(THESIS, coils=(*coils, CoilWiring(15, 12, 30.0))))
     rig.coils.start()
@@ -76,7 +82,7 @@ def test_six_coils_carry_their_own_currents_through_the_chip_and_brake_alone() -
 
 def test_saturation_is_reported_and_only_when_it_happens(rig: Rig) -> None:
     rig.coils.start()
-    rig.command(0.148, 0.0, 0.0)  # V/R is 0.14783 A
+    rig.command(0.148, 0.0, 0.0)  # the largest current, V/R, is 0.14783 A
     assert rig.coils.state().saturated
     assert rig.coils.state().current[0] == pytest.approx(3.4 / 23.0)
     rig.command(0.147, 0.0, 0.0)
@@ -94,7 +100,7 @@ def test_both_inputs_are_low_at_zero_and_the_idle_one_otherwise(rig: Rig) -> Non
 
 
 def test_start_leaves_a_running_chip_at_zero(rig: Rig) -> None:
-    """A previous process has ended while its coils were driven."""
+    """The start zeroes the coils that a previous process has left driven."""
     rig.pca.configure()
     rig.pca.write_channels(0, [(0, 3000), (0, 4096)])
     assert rig.currents()[0] != 0.0

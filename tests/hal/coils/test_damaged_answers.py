@@ -20,7 +20,7 @@ from tests.support.damaged import Files, assert_one_line, chances, offer
 
 
 class Nonsense:
-    """A bus whose devices keep some of the written bytes, return random data, or fail."""
+    """A bus whose devices keep some of the written bytes, return random bytes, or fail."""
 
     def __init__(self, chance: Random) -> None:
         self._chance = chance

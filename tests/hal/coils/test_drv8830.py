@@ -1,4 +1,4 @@
-"""Tests of DRV8830 bridges: mean current, brakes, brown-outs, and the writes that stop them."""
+"""Tests of DRV8830 bridges: mean current, brakes, brown-outs, and the writes that stop the bridges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SETTINGS = CoilSettings(
 
 
 class Bench:
-    """A coil driver on emulated bridges."""
+    """A coil driver with emulated bridges."""
 
     def __init__(self) -> None:
         self.clock = SimClock()
@@ -29,7 +29,7 @@ class Bench:
         self.coils.start()
 
     def mean(self, currents: list[float], seconds: float = 1.0) -> FloatArray:
-        """Return the mean coil currents while a command is repeated at 40 Hz."""
+        """Return the mean coil currents (A) while a command is repeated at 40 Hz."""
         seen = []
         for step in range(round(seconds * 1000)):
             if step % 25 == 0:
@@ -41,7 +41,10 @@ class Bench:
 
 @pytest.mark.parametrize("currents", [[0.148, -0.148, 0.0], [0.004, -0.0115, 0.02], [0.1, 0.05, -0.0333]])
 def test_the_mean_current_is_the_command_although_the_steps_are_coarse(currents: list[float]) -> None:
-    """One step of the bridge is 3.5 mA, and its smallest driven current is 21 mA."""
+    """The mean current equals the command within 0.6 mA, although one step of the bridge is 3.5 mA.
+
+    The smallest driven current of the bridge is 21 mA.
+    """
     np.testing.assert_allclose(Bench().mean(currents), currents, atol=6e-4)
 
 
@@ -87,7 +90,10 @@ def test_a_voltage_is_within_half_a_step(volts: float) -> None:
 def test_a_voltage_beyond_the_range_becomes_the_largest_voltage_of_the_same_sign(
     volts: float, sign: float
 ) -> None:
-    """The register has eight bits, six of them for the voltage, whose largest value is 5.06 V."""
+    """A voltage beyond the range of the register becomes the largest voltage of the same sign, 5.06 V.
+
+    Six of the eight bits of the register contain the voltage.
+    """
     control = control_of(sign * volts)
     assert 0 <= control <= 0xFF
     assert volts_of(control) == pytest.approx(sign * 5.06, abs=0.01)

@@ -1,4 +1,4 @@
-"""Tests of the conversion from current to PWM counts: Table 5.2, limits and resolution."""
+"""Tests of the conversion from current to PWM counts: Table 5.2 of the thesis, limits and resolution."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_no_counts_are_ever_equal_and_both_inputs_are_never_driven_at_once() -> 
 
 
 def test_full_drive_is_the_thesis_maximum_current() -> None:
-    """3.4 V across 23 ohm give 0.1478 A; the thesis states 0.148 A (ch. 5)."""
+    """The largest current is 3.4 V / 23 ohm = 0.1478 A. The thesis states 0.148 A (ch. 5)."""
     assert largest_counts(STEP, 0.148) == 4096
     assert mean_current(4096, STEP) == pytest.approx(3.4 / 23.0, rel=1e-15)
 
@@ -75,7 +75,7 @@ def test_counts_are_the_nearest_and_limits_are_reported(current: float, counts: 
 
 
 def test_a_duty_of_a_half_is_half_of_the_supply() -> None:
-    """Sease 5.33: V_equivalent = duty x V_supply, here 1.7 V over 23 ohm."""
+    """By Sease 5.33, V_equivalent = duty x V_supply. A duty cycle of 0.5 gives 1.7 V across 23 ohm."""
     assert counts_for(1.7 / 23.0, STEP, 4096) == (2048, False)
 
 

@@ -1,4 +1,4 @@
-"""Tests that unchanged smbus2 makes each kind of transfer on the emulated bus through ioctls."""
+"""Tests that the unchanged smbus2 performs each kind of transfer on the emulated bus by ioctls."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def bus(kernel: IoctlWire) -> Iterator[SMBus]:
 
 
 def test_words_are_little_endian_on_the_wire(bus: SMBus) -> None:
-    assert bus.read_word_data(INA, 0x00) == 0x9F39  # Config 0x399F, which the part sends high byte first
+    assert bus.read_word_data(INA, 0x00) == 0x9F39  # Config is 0x399F, and the chip sends the high byte first
     bus.write_word_data(INA, 0x05, 0x3412)
     assert bus.read_i2c_block_data(INA, 0x05, 2) == [0x12, 0x34]
     assert bus.process_call(INA, 0x05, 0x7856) == 0x7856
@@ -71,7 +71,10 @@ def test_faults_of_the_wire_meet_messages_too(bus: SMBus, kernel: IoctlWire) -> 
 def test_what_the_adapter_cannot_do_is_refused_like_the_kernels(
     kernel: IoctlWire, size: int, code: int
 ) -> None:
-    """The refused transfers are a block with length from the device, a block process call, and 33 bytes."""
+    """An adapter refuses transfers that it does not support, with the errors of the kernel.
+
+    The refused transfers are a block with a length from the device, a block process call, and 33 bytes.
+    """
     with pytest.raises(OSError, match=r"not supported|33 bytes") as caught:
         smbus(kernel.wire, PCA, True, 0x06, size, bytes((33,)))
     assert caught.value.errno == code

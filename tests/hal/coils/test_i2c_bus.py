@@ -1,4 +1,4 @@
-"""Tests of the contract of hal.interfaces.wires.I2cBus with both buses, and of Linux's timeouts."""
+"""Tests that both buses fulfil the contract of hal.interfaces.wires.I2cBus, and of Linux's timeouts."""
 
 from __future__ import annotations
 
@@ -85,7 +85,10 @@ def test_a_time_out_of_nothing_is_refused(kernel: IoctlWire) -> None:
 
 
 def test_the_descriptor_is_reopened_after_the_line_failed_but_not_after_a_nack(kernel: IoctlWire) -> None:
-    """Each opening of the bus sets the timeout once, so the openings are counted by these settings."""
+    """The bus is opened again after a timeout, but not after a NACK.
+
+    Each opening sets the timeout of the adapter once, so the test counts the openings by these settings.
+    """
     bus = LinuxI2cBus("/dev/null")
     with pytest.raises(OSError, match="no acknowledge"):
         bus.read_byte_data(0x22, 0x00)
@@ -103,7 +106,7 @@ def test_no_descriptor_leaks_when_opening_fails() -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(5):
         with pytest.raises(NotResponding, match="not a usable I2C bus"):
-            LinuxI2cBus("/dev/null")  # the real kernel reports that the file is not an I2C adapter
+            LinuxI2cBus("/dev/null")  # the real kernel reports that this file is no I2C adapter
     assert len(os.listdir("/proc/self/fd")) == before
 
 
@@ -134,7 +137,10 @@ def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path
 def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_else(
     kernel: IoctlWire, tmp_path: Path
 ) -> None:
-    """Guardian and `check` open the bus without exclusive access, so that they are never refused."""
+    """Only one flight can open a bus exclusively, and its lock precedes all other accesses.
+
+    Guardian and `check` open the bus without exclusive access, so they are never refused.
+    """
     node = tmp_path / "i2c"
     node.touch()
     first = LinuxI2cBus(str(node), exclusive=True)
@@ -165,7 +171,10 @@ def test_adapters_are_read_from_sysfs(tmp_path: Path) -> None:
 
 
 def test_a_transaction_that_never_ends_does_not_hold_the_others_for_ever(kernel: IoctlWire) -> None:
-    """If an adapter ignores its timeout, the next caller gets an error, and the bus can be closed."""
+    """If a transaction never ends because the adapter ignores its timeout, the next caller gets an error.
+
+    The bus can still be closed.
+    """
     entered, leave = threading.Event(), threading.Event()
 
     class Stuck(IoctlWire):

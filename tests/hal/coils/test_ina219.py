@@ -36,7 +36,7 @@ def test_what_cannot_be_measured_is_refused(current: float, shunt: float) -> Non
 
 
 def test_readings_follow_the_coils(rig: Rig) -> None:
-    """Two fully driven coils draw 2 x 3.4 V/23 ohm, read to 0.1 mA; 3.4 V is 850 steps."""
+    """With two fully driven coils, the monitor reads 2 x 3.4 V/23 ohm to 0.1 mA, and 3.4 V to 4 mV."""
     rig.coils.start()
     monitor: PowerMonitor = Ina219(rig.bus, INA, rig.clock)
     assert monitor.latest() is None
@@ -57,7 +57,10 @@ def test_readings_follow_the_coils(rig: Rig) -> None:
 
 
 def test_a_chopped_current_is_read_to_the_7_percent_of_five_conversions(rig: Rig) -> None:
-    """0.1 A and -0.05 A draw 0.15 A together on average; a single conversion may be 18 % off."""
+    """The mean of five ADC samples of a chopped current of 0.15 A is within 7 %.
+
+    Currents of 0.1 A and -0.05 A draw 0.15 A together. A single ADC sample may be 18 % off.
+    """
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)
     newest = set()
@@ -76,7 +79,10 @@ def test_a_chopped_current_is_read_to_the_7_percent_of_five_conversions(rig: Rig
 def test_a_chopped_current_is_averaged_over_several_conversions(
     averaged: int, least: float, most: float
 ) -> None:
-    """Pulses of 10 % of 19.988 ms are integrated exactly; the worst of 20 s of readings is checked."""
+    """A mean of five ADC samples of a chopped current is within 7 %. A single sample is up to 18.5 % off.
+
+    Pulses of 10 % of 19.988 ms are integrated exactly. The largest error in 20 s of readings is checked.
+    """
     period, duty, amps = 19.988e6, 0.1, 3.4 / 23.0
 
     def charge(time_ns: int) -> float:
@@ -102,7 +108,7 @@ def test_a_chopped_current_is_averaged_over_several_conversions(
 
 
 def test_a_negative_shunt_voltage_is_a_negative_current() -> None:
-    """A monitor with a reversed shunt must not read 6.5 kA."""
+    """A monitor with a reversed shunt reads a negative current, and not 6.5 kA."""
     clock = ManualClock()
     rig = Rig(clock=clock)
     rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, -0.12)))
@@ -126,9 +132,9 @@ def test_no_conversion_is_counted_twice() -> None:
 
 
 def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
-    """A short circuit gives 1 A, beyond the range of 0.8 A.
+    """A current beyond the range of 0.8 A is reported as 0.8 A and as clipped.
 
-    Without a reading, the shorted coil would not be found.
+    A short circuit gives 1 A. Without a reading, the shorted coil would not be found.
     """
     clock = ManualClock()
     rig = Rig(clock=clock)
@@ -138,7 +144,7 @@ def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
     found = []
     for current in (0.2, 1.0, 0.1):
         amps[0] = current
-        clock.advance(1400 * MS)  # until the mean again includes only valid samples
+        clock.advance(1400 * MS)  # until the mean contains only samples of this current
         reading = monitor.latest()
         assert reading is not None
         assert monitor.error() == ""
@@ -147,7 +153,10 @@ def test_a_current_beyond_the_range_is_given_as_at_least_the_range() -> None:
 
 
 def test_an_overflow_of_the_chips_mathematics_is_an_error() -> None:
-    """Another program has written Calibration, so that 7000 x 65534 / 4096 exceeds the register Current."""
+    """An overflow of the chip's multiplication is reported as an error.
+
+    Another program has changed Calibration, so that 7000 x 65534 / 4096 exceeds the register Current.
+    """
     clock = ManualClock()
     rig = Rig(clock=clock)
     rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, 0.7)))
@@ -214,7 +223,10 @@ def test_a_monitor_that_stops_converting_is_an_error() -> None:
 
 
 def test_the_newest_conversion_is_returned_with_the_time_that_it_averages(rig: Rig) -> None:
-    """After a step of the current, an ADC sample that began before the step is not used."""
+    """An ADC sample is returned with the start of its averaging time.
+
+    A sample that began before a step of the current is not used for the time after the step.
+    """
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.clock.advance(2000 * MS)
@@ -235,7 +247,7 @@ def test_the_newest_conversion_is_returned_with_the_time_that_it_averages(rig: R
 
 @pytest.mark.parametrize("amps", [0.0, 0.05])
 def test_a_monitor_that_always_gives_the_same_is_reported_at_any_current(rig: Rig, amps: float) -> None:
-    """The ready bit stays set although the sample was read; this is detected even at a constant current."""
+    """A monitor whose ready bit stays set after a read is reported as stuck, even at a constant current."""
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)
 

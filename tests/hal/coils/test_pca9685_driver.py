@@ -38,7 +38,7 @@ class Recorder(EmulatedI2cBus):
 
 @pytest.fixture
 def recorder() -> tuple[Pca9685, Recorder, EmulatedPca9685]:
-    """Make a driver, its recorded bus and its chip."""
+    """Return a driver, the bus that records its writes, and its chip."""
     clock = ManualClock()
     chip = EmulatedPca9685(PCA, clock.now_ns)
     bus = Recorder(chip, clock)
@@ -47,7 +47,7 @@ def recorder() -> tuple[Pca9685, Recorder, EmulatedPca9685]:
 
 @pytest.mark.parametrize(("frequency", "prescale"), [(50.0, 121), (200.0, 30), (1525.0, 3), (24.0, 253)])
 def test_prescale_values_of_the_data_sheet(frequency: float, prescale: int) -> None:
-    """200 Hz is the power-on 0x1E, the data sheet's own example; 50 Hz is 0x79."""
+    """For 200 Hz, PRE_SCALE is the power-on value 0x1E of the data sheet's example; for 50 Hz it is 0x79."""
     assert prescale_for(frequency) == prescale
 
 
@@ -60,12 +60,15 @@ def test_a_frequency_that_the_chip_cannot_make_is_refused(frequency: float) -> N
 def test_set_up_follows_the_data_sheet_with_all_off_first(
     recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
 ) -> None:
-    """The sequence is all off, sleep, PRE_SCALE, wake with auto-increment, wait of 500 us, totem pole."""
+    """The set-up of the chip follows the data sheet, after all channels were switched off.
+
+    The sequence is all off, sleep, PRE_SCALE, wake with auto-increment, a wait of 500 us, totem pole.
+    """
     pca, bus, chip = recorder
     pca.configure()
     assert [(register, values) for register, values, _ in bus.written] == [
         (0xFD, [0x10]),
-        (0x00, [0x11]),  # after power-on, MODE1 has SLEEP set and keeps ALLCALL until wake-up
+        (0x00, [0x11]),  # at power-on, SLEEP of MODE1 is set; ALLCALL is kept until the wake-up
         (0xFE, [0x79]),
         (0x00, [0x20]),
         (0x01, [0x04]),
@@ -78,7 +81,7 @@ def test_set_up_follows_the_data_sheet_with_all_off_first(
 def test_a_chip_left_running_is_switched_off_before_anything_else(
     recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
 ) -> None:
-    """A previous process has left MODE1 = 0x20 and driven channels."""
+    """Channels that a previous process has left driven, with MODE1 = 0x20, are switched off first."""
     pca, bus, chip = recorder
     pca.configure()
     pca.write_channels(0, [FULL_ON, (0, 100)])
@@ -128,16 +131,19 @@ def test_a_brown_out_is_noticed_and_mended(rig: Rig) -> None:
 
 
 def test_another_part_at_the_address_is_refused_with_the_cure(rig: Rig) -> None:
-    """Both chips have the default address 0x40.
+    """Another chip at the address is refused with a remedy. Both chips have the default address 0x40.
 
-    An INA219 acknowledges each write but keeps no such register.
+    An INA219 acknowledges each write, but it does not have the registers of a PCA9685.
     """
     with pytest.raises(Refused, match="another chip at this address"):
         Pca9685(rig.bus, INA, rig.clock).configure()
 
 
 def test_an_outer_clock_that_an_upset_has_chosen_is_cleared_by_a_software_reset(rig: Rig) -> None:
-    """The bit is sticky: no write clears it. No channel is driven during the set-up."""
+    """EXTCLK of MODE1, set by an upset, is cleared by a software reset. No channel is driven meanwhile.
+
+    The bit is sticky: no write of the register clears it.
+    """
     rig.pca.configure()
     rig.wire.chip.flip(0x00, 6)
     rig.pca.write_channels(0, [FULL_ON])
@@ -166,7 +172,7 @@ def test_a_silent_chip_is_named_with_what_to_check(rig: Rig) -> None:
 
 
 def test_switch_off_works_in_every_state_of_the_chip(rig: Rig) -> None:
-    switch_off(rig.bus, PCA)  # the chip is in its state after power-on, with SLEEP set
+    switch_off(rig.bus, PCA)  # SLEEP is set, as in the state after power-on
     rig.pca.configure()
     rig.pca.write_channels(0, [FULL_ON] * 8)
     rig.pca.write_channels(8, [(0, 2000)] * 8)
@@ -187,6 +193,6 @@ def test_switch_off_tries_again_and_then_says_so(rig: Rig) -> None:
 
 
 def test_the_guardian_imports_no_numpy() -> None:
-    """The process that switches the coils off must start fast, with few dependencies."""
+    """The guardian, which switches the coils off, does not import numpy, so that it starts fast."""
     code = "import sys, hal.drivers.pca9685, hal.buses.i2c_bus; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=30).returncode == 0

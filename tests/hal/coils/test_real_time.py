@@ -1,6 +1,6 @@
 """Tests in real time with the bus job on its own thread.
 
-Commands never wait for the bus, and the command of zero current reaches the coils.
+A command never waits for the bus. A command of zero current always reaches the coils.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def test_a_command_reaches_the_coils_and_falls_to_zero_when_no_other_comes() -> 
 
 
 def test_a_command_does_not_wait_for_a_hung_bus() -> None:
-    """Each transaction hangs for 0.5 s; 20 commands take less time than one transaction."""
+    """If each transaction hangs for 0.5 s, 20 commands together take less time than one transaction."""
     coils, wire = started()
     release = threading.Event()
 

@@ -1,4 +1,4 @@
-"""An emulated GPS receiver in orbit and its driver, joined by a serial line in memory."""
+"""An emulated GPS receiver in orbit and its driver, connected by a serial line in memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class GpsBench:
     driver: UbloxReceiver
 
     def fly(self, seconds: float) -> list[GpsReading]:
-        """Poll at 10 Hz for a while; return all readings."""
+        """Poll at 10 Hz for some time, and return all readings."""
         readings = []
         for _ in range(round(10 * seconds)):
             self.clock.sleep_until_ns(self.clock.now_ns() + SECOND_NS // 10)

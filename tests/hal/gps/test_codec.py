@@ -40,7 +40,7 @@ def test_our_driver_reads_what_another_author_builds() -> None:
 def test_a_command_is_what_another_author_builds() -> None:
     built = UBXMessage("CFG", "CFG-MSG", 1, msgClass=1, msgID=7, rateUART1=1)
     ours = frame(CFG_MSG, bytes((*NAV_PVT, 1)))
-    assert ours[:6] == SYNC + b"\x06\x01\x03\x00"  # short form of the message: class, identifier, rate
+    assert ours[:6] == SYNC + b"\x06\x01\x03\x00"  # short message form: class, identifier and rate
     assert built.serialize()[6:8] == ours[6:8]
     assert UBXReader.parse(ours, msgmode=1).identity == "CFG-MSG"
 
@@ -51,7 +51,7 @@ def test_a_good_frame_is_found_behind_any_noise_in_pieces_of_any_size(
 ) -> None:
     parser = UbxParser(longest=120)
     sound = frame(NAV_PVT, PVT.packed())
-    # The zeros end each false packet start that waits for more bytes.
+    # A false start of a packet waits for more bytes. The zeros complete each false packet.
     data = noise + sound + behind + bytes(140)
     found = [kind for at in range(0, len(data), piece) for kind, _, _ in parser.feed(data[at : at + piece])]
     assert NAV_PVT in found

@@ -1,4 +1,4 @@
-"""Tests with the output of real receivers: unresolved time, rollover, refusals, other protocols."""
+"""Tests with the output of real receivers: unresolved time, week rollover, refusals, other protocols."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ NAV_SAT: Kind = (0x01, 0x35)
 
 
 class OneWayPort:
-    """Serial port that delivers one portion of given bytes per poll, and stores the sent bytes."""
+    """Serial port that delivers one portion of the given bytes per poll, and stores the bytes sent to it."""
 
     def __init__(self, pieces: Iterable[bytes], clock: SimClock) -> None:
         self.baud_rate = 115200
@@ -66,7 +66,7 @@ class OneWayPort:
 
 
 def received(pieces: list[bytes], step: float = 0.1) -> tuple[list[GpsReading], UbloxReceiver, OneWayPort]:
-    """Return the readings of a driver that polls once for each portion, the driver, and its port."""
+    """Return the readings of a driver that polls once per portion, the driver itself, and its port."""
     clock = SimClock()
     port = OneWayPort(pieces, clock)
     driver = UbloxReceiver(port, clock)

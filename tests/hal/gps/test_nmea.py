@@ -29,7 +29,7 @@ def gga(clock: str = "120000.00", quality: str = "1", altitude: str = "100.0") -
 
 
 class Line:
-    """A serial port whose received bytes the test gives."""
+    """A serial port that delivers the bytes which a test gives."""
 
     baud_rate = 9600
 

@@ -1,4 +1,4 @@
-"""Tests of the GPS receiver in orbit with driver, emulator and line, and of an independent client."""
+"""Tests of the GPS receiver in orbit with driver, emulator and line, and tests with an independent client."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from tests.hal.gps.fixes import PVT
 
 
 def test_a_fix_is_where_the_satellite_was_at_the_epoch() -> None:
-    """Positions agree to centimetres, the resolution of the protocol.
+    """The position of a fix is that of the satellite at its epoch, within centimetres (protocol resolution).
 
-    The flight software propagates fixes.
+    The flight software propagates fixes to later times.
     """
     gps = bench()
     reading = [reading for reading in gps.fly(12.0) if reading.valid][-1]
@@ -35,7 +35,7 @@ def test_a_fix_is_where_the_satellite_was_at_the_epoch() -> None:
     gps.body.advance_to(gps.clock.now_ns())
     around = gps.body.surroundings()
     state = fix.at(UNIX_EPOCH + gps.body.utc_ns() * 1e-9 / DAY)
-    # The resolution of a Julian date is 40 us, or 0.3 m along the orbit.
+    # A Julian date is resolved to 40 us, which is 0.3 m along the orbit.
     np.testing.assert_allclose(state.position, around.position, atol=1.0)
     np.testing.assert_allclose(state.velocity, around.velocity, atol=5e-3)
     assert reading.utc_ns % SECOND_NS == 0

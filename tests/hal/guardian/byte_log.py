@@ -1,7 +1,7 @@
 """A bus that logs written bytes; a guardian opens it as `tests.hal.guardian.byte_log:open_bus`.
 
-The module has few imports, because the guardian must stay small. While FILE.broken exists, the bus fails like
-a silent device.
+The module has few imports, because the guardian must stay small. If the file FILE.broken exists, transfers
+fail as with a device that does not respond.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Stops, hangs and kills one flight process in several ways, and measures for how long current flows."""
+"""Stops, hangs and kills one flight process in several ways, and measures how long coil current flows."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _CALM_S = 1.2
 
 @dataclass(frozen=True)
 class Hurt:
-    """Result of one test action (`act`): a stop, hang or kill of a process.
+    """Result of one test action, `act`: a process was stopped, hung or killed.
 
-    Times are in s, and the current in A. `recovered` is counted from the end of the action, and None if the
-    process died.
+    Times are in s, and the current is in A. `recovered` is the time from the end of the action, or None if
+    the process died.
     """
 
     act: str
@@ -31,7 +31,7 @@ class Hurt:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Results of all test actions, the truth and events of the run, and the successive guardian processes."""
+    """Results of all test actions, truth and events of the run, and the guardian processes in order."""
 
     hurts: list[Hurt]
     truth: CoilTruth
@@ -41,10 +41,7 @@ class Campaign:
 
 
 def hurt_in_every_way(folder: Path) -> Campaign:
-    """Stop and hang the flight process (two ways), kill and stop the guardian, and kill the flight process.
-
-    These test actions take about ten seconds.
-    """
+    """Stop and hang the flight process in two ways, kill and stop the guardian, and kill the flight."""
     times: list[tuple[str, int, int | None]] = []
     guardians: list[int] = []
     lost_ns: list[int] = []
@@ -61,7 +58,7 @@ def hurt_in_every_way(folder: Path) -> Campaign:
             time.sleep(HANG_S + _CALM_S)
             times.append((name, begin_ns, begin_ns + round(HANG_S * 1e9)))
         flight.wait_until_driven()
-        # Without a guardian, the devices continue to drive the coil.
+        # Without a guardian, the devices keep driving the coil after the end of the flight process.
         os.kill(flight.guardian(), signal.SIGSTOP)
         begin_ns = flight.do(signal.SIGSTOP)
         time.sleep(STOPPED_S)
@@ -93,7 +90,7 @@ def _measured(truth: CoilTruth, name: str, begin_ns: int, end_ns: int | None) ->
 
 
 def _end_devices(children: list[int]) -> None:
-    """End the emulated devices, and wait until their log is complete."""
+    """End the emulated devices, and wait until they have written their log."""
     for child in children:
         command = Path(f"/proc/{child}/cmdline")
         if command.exists() and b"sim_hal" in command.read_bytes():
@@ -104,7 +101,7 @@ def _end_devices(children: list[int]) -> None:
 
 
 def lives(process: int) -> bool:
-    """Return whether a process runs; a zombie has no command line."""
+    """Return whether a process runs. A zombie process has no command line."""
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes() != b""
     except (FileNotFoundError, ProcessLookupError):

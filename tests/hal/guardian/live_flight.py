@@ -1,7 +1,7 @@
 """A real-time flight process with emulated devices, which tests stop, hang and kill.
 
-The truth log of the devices has the coils' currents; the service manager's end of the notification
-socket shows when the flight was ready.
+The truth log of the devices contains the coil currents. The service manager's end of the notification socket
+receives the message that the flight is ready.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ HANG_S = 1.0
 DRIVEN_A = 1e-3
 
 SLEEPS, SPINS = signal.SIGUSR1, signal.SIGUSR2
-"""Signals that hang the control thread alone, or all threads by holding the interpreter's lock."""
+"""Signals that hang only the control thread, or all threads by holding the interpreter's lock."""
 
 FLIGHT = f"""
 import ctypes, os, signal, time
@@ -43,7 +43,7 @@ _MAIN = "raise SystemExit(main())"
 
 
 def write_config(folder: Path) -> Path:
-    """Write the step demonstration without camera, which starts fast and drives the coils all the time."""
+    """Write the step demonstration without a camera, which starts fast and always drives the coils."""
     text = CONFIG.read_text(encoding="utf-8")
     before, _, rest = text.partition("\ncamera:")
     path = folder / "flight.yaml"
@@ -65,7 +65,7 @@ class LiveFlight:
         *more: str,
         before: str = "",
     ) -> None:
-        """Start the flight; `before` is a line of Python that its process runs first."""
+        """Start the flight process. The process first runs `before`, a line of Python."""
         self._notifications = notifications
         self.folder = folder / "run"
         words = [
@@ -89,7 +89,7 @@ class LiveFlight:
         )
 
     def wait_for(self, word: str, patience: float = 30.0) -> int:
-        """Wait until the service manager receives `word`, and return the monotonic time, ns."""
+        """Wait until the service manager receives `word`; return the monotonic time (ns)."""
         deadline = time.monotonic() + patience
         while (left := deadline - time.monotonic()) > 0.0 and self.process.poll() is None:
             if select.select([self._notifications], [], [], min(left, 0.2))[0]:
@@ -99,7 +99,7 @@ class LiveFlight:
         raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
 
     def wait_until_driven(self, patience: float = 30.0) -> None:
-        """Wait until the log of true states ends with a quarter of a second in which the coil was driven.
+        """Wait until the coil was driven for the last quarter of a second in the log of true states.
 
         Raises AssertionError if this takes longer than `patience` s.
         """
@@ -115,12 +115,12 @@ class LiveFlight:
         raise AssertionError(f"the coil was not driven within {patience:g} s: {self.end()}")
 
     def do(self, number: signal.Signals) -> int:
-        """Send a signal to the flight process, and return its monotonic time, ns."""
+        """Send a signal to the flight process; return the monotonic time (ns) of the signal."""
         self.process.send_signal(number)
         return time.monotonic_ns()
 
     def guardian(self) -> int:
-        """Return the process identifier of the guardian on watch."""
+        """Return the process identifier of the active guardian."""
         for child in self.children():
             if b"hal.guardian" in Path(f"/proc/{child}/cmdline").read_bytes():
                 return child
@@ -132,7 +132,7 @@ class LiveFlight:
         return [int(child) for task in tasks for child in task.read_text().split()]
 
     def end(self) -> str:
-        """Stop the flight process by SIGTERM, and return its standard error."""
+        """End the flight process by SIGTERM, and return its standard error."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
             self.process.terminate()
@@ -145,7 +145,7 @@ class LiveFlight:
 
 @contextmanager
 def devices_running(folder: Path) -> Iterator[Path]:
-    """Serve emulated devices that exist before the flight process, with their truth in `folder`."""
+    """Serve emulated devices, started before the flight process, with their truth log in `folder`."""
     facts = folder / "facts.json"
     words = [sys.executable, "-m", "sim_hal", "serve", str(write_config(folder))]
     words += ["--folder", str(folder), "--facts", str(facts)]
@@ -160,7 +160,7 @@ def devices_running(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[LiveFlight]:
-    """Start a flight process with `more` command-line arguments, and end it on exit."""
+    """Start a flight process with the additional arguments `more`, and end it when the context ends."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
         notifications.bind(str(folder / "notify"))
         flight = LiveFlight(folder, write_config(folder), notifications, duration, *more)
@@ -171,15 +171,15 @@ def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[Li
 
 
 class CoilTruth:
-    """True coil currents on the machine's monotonic clock; `current` (n,), A, is the current of coil x."""
+    """True coil currents on the machine's monotonic clock; `current` (n,), A, is that of coil x."""
 
     def __init__(self, folder: Path, devices: Path | None = None) -> None:
-        """Read the run in `folder`, after moving the truth there from a separate folder `devices`."""
+        """Read the run in `folder`, after the truth log was moved there from the folder `devices`."""
         for path in find_segments(devices, "truth") if devices is not None else ():
             path.rename(folder / path.name)
         self.run: Run = read_run(folder)
         start = self.run["run"][0]
-        # Both clocks are read at the same time, because the run states mission time zero in UTC only.
+        # Mission time zero of the run is stated in UTC only, so both clocks are read at the same time.
         epoch_ns = int(start["utc_ns"]) - (time.time_ns() - time.monotonic_ns())
         truth = self.run["truth"]
         self.time_ns: npt.NDArray[np.int64] = truth["time_ns"].astype(np.int64) + epoch_ns
@@ -187,15 +187,15 @@ class CoilTruth:
         self.epoch_ns = epoch_ns
 
     def before(self, act_ns: int) -> float:
-        """Return the largest current, A, in the quarter of a second before a signal was sent.
+        """Return the largest current (A) in the quarter of a second before a signal was sent.
 
-        On a busy machine, the flight switches the current off for a cycle or two if a reading is late.
+        On a busy machine, a late reading makes the flight switch the current off for one or two cycles.
         """
         shortly = (self.time_ns > act_ns - 250_000_000) & (self.time_ns <= act_ns)
         return float(np.abs(self.current[shortly]).max(initial=0.0))
 
     def zero_after(self, act_ns: int, until_ns: int) -> float:
-        """Return the time, s, from a signal until the current was zero and stayed zero until `until_ns`."""
+        """Return the time (s) from a signal until the current was zero and stayed zero until `until_ns`."""
         inside = (self.time_ns >= act_ns) & (self.time_ns <= until_ns)
         driven = np.flatnonzero(inside & (self.current != 0.0))
         first = int(driven[-1]) + 1 if len(driven) else int(np.flatnonzero(inside)[0])
@@ -204,7 +204,7 @@ class CoilTruth:
         return float(self.time_ns[first] - act_ns) * 1e-9
 
     def driven_after(self, act_ns: int) -> float:
-        """Return the time, s, from a signal until a coil was driven."""
+        """Return the time (s) from a signal until a coil was driven again."""
         any_current = np.any(self.run["truth"]["current"] != 0.0, axis=1)
         driven = np.flatnonzero((self.time_ns >= act_ns) & any_current)
         return float(self.time_ns[driven[0]] - act_ns) * 1e-9 if len(driven) else float("inf")

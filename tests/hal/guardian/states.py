@@ -1,4 +1,4 @@
-"""Reads the state of a process, and waits for it without a timeout that a busy machine would exceed."""
+"""Reads the state of a process, and waits for a state without a timeout that fails on busy machines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _PATIENCE_S = 60.0
 
 
 def state(process: int) -> str:
-    """Return the letter of a process's state, such as T for stopped and Z for dead (proc(5)); "" for none."""
+    """Return the state letter of a process, such as T (stopped) or Z (zombie) of proc(5); "" for none."""
     try:
         stat = Path(f"/proc/{process}/stat").read_text(encoding="ascii")
     except (FileNotFoundError, ProcessLookupError):
@@ -19,7 +19,7 @@ def state(process: int) -> str:
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds. Raises AssertionError if the condition is not met."""
+    """Wait until a condition is true. Raises AssertionError if it never becomes true."""
     deadline = time.monotonic() + _PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, "it did not come"

@@ -1,4 +1,4 @@
-"""Tests that the coils are at zero within half a second of any end of the flight process."""
+"""Tests that the coils carry no current within half a second after any end of the flight process."""
 
 from __future__ import annotations
 

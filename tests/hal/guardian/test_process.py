@@ -37,14 +37,14 @@ def guardian(log: Path) -> Iterator[GuardianLine]:
 
 
 def zeros(log: Path) -> list[int]:
-    """Return the monotonic time, ns, at which zero was commanded."""
+    """Return the monotonic times (ns) at which zero current was commanded."""
     lines = [line.split() for line in log.read_text(encoding="ascii").splitlines()]
     assert all(line[1:] == [str(ADDRESS), str(ALL_LED_OFF_H), str(FULL)] for line in lines)
     return [int(line[0]) for line in lines]
 
 
 def beat_for(guardian: GuardianLine, seconds: float) -> int:
-    """Send heartbeats at 40 Hz, and return the time of the last one."""
+    """Send heartbeats at 40 Hz for a time, and return the time of the last heartbeat."""
     end_ns = time.monotonic_ns() + round(seconds * 1e9)
     while time.monotonic_ns() < end_ns:
         guardian.beat()
@@ -54,7 +54,7 @@ def beat_for(guardian: GuardianLine, seconds: float) -> int:
 
 
 def news_until(guardian: GuardianLine, wanted: GuardianNews, patience: float = 10.0) -> list[GuardianNews]:
-    """Return the reports up to the given one."""
+    """Return the reports up to and including the given report."""
     news: list[GuardianNews] = []
     deadline = time.monotonic() + patience
     while wanted not in news:
@@ -135,7 +135,7 @@ def test_a_killed_guardian_is_replaced_and_reported(guardian: GuardianLine) -> N
 def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
     guardian: GuardianLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If no file descriptor is free for the guardian's line, its supervisor continues."""
+    """If the process has no free file descriptor for a new guardian, a guardian is started later."""
 
     def no_line(*_: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
@@ -150,7 +150,7 @@ def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
 def test_a_guardian_that_hangs_is_replaced_and_reported(guardian: GuardianLine) -> None:
     first = guardian.process_id
     os.kill(first, signal.SIGSTOP)
-    for _ in range(400):  # ten seconds of heartbeats, more than its pipe can hold
+    for _ in range(400):  # ten seconds of heartbeats, more than the pipe of the guardian can hold
         guardian.beat()
     news_until(guardian, GuardianNews.READY)
     assert guardian.process_id != first

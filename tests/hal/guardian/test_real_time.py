@@ -1,4 +1,4 @@
-"""Tests that real-time privileges are requested, and reported as obtained."""
+"""Tests that real-time privileges are requested, and that the report states which were granted."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_kernel_reports_locked_memory_or_the_refusal_is_explained() -> None:
-    """With locking on page fault, reserved address space that is not used takes no memory."""
+    """Memory is locked when a page is first used, so unused address space takes no memory.
+
+    If the kernel refuses the lock, the refusal is explained.
+    """
     script = (
         "import mmap; from hal.buses import linux_process\n"
         "said = linux_process.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"

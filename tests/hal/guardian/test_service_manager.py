@@ -1,4 +1,4 @@
-"""Tests of sd_notify(3) messages, which must never block a flight process."""
+"""Tests of the messages by sd_notify(3), which must never block a flight process."""
 
 from __future__ import annotations
 

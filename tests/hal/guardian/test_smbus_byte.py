@@ -1,4 +1,4 @@
-"""Tests of the transfer of a byte by the kernel's SMBus call against the layout of smbus2."""
+"""Tests that a byte is transferred by the kernel's SMBus ioctl with the memory layout of smbus2."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.buses import smbus_byte
 
 
 class Kernel:
-    """Replacement of ioctl(2) that records each call and the data that its pointer refers to."""
+    """Test double of ioctl(2) that records each call and the data to which its pointer refers."""
 
     def __init__(self, failing: int = 0) -> None:
         self.calls: list[tuple[int, object]] = []

@@ -1,4 +1,4 @@
-"""Tests of the times at which the guardian commands zero, on a manual clock."""
+"""Tests of the times at which the guardian commands zero current, on a manual clock."""
 
 from __future__ import annotations
 

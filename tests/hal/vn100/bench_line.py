@@ -1,4 +1,4 @@
-"""A driver and an emulated VN-100 on one serial line in simulated time."""
+"""A driver and an emulated VN-100, connected by a serial line in simulated time."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ def at_rest(time_ns: int) -> BodyMotion:
 
 
 def turning(time_ns: int) -> BodyMotion:
-    """Return the motion of a body that rotates through q2 = 0 at 0.1 rad/s."""
+    """Return the motion of a body that rotates at 0.1 rad/s, with q2 = 0 at time zero."""
     return about_thread(time_ns, 0.1 * (time_ns * 1e-9 - 2.0), 0.1, 4.5e-4)
 
 
 @dataclass(frozen=True, slots=True)
 class Alone:
-    """A world that consists of one VN-100."""
+    """A simulated world that contains only one VN-100."""
 
     unit: Vn100Emulator
 
     def next_event_ns(self) -> int:
-        """Return the unit's next event."""
+        """Return the time (ns) of the unit's next event."""
         return self.unit.next_event_ns()
 
     def advance_to(self, time_ns: int) -> None:
@@ -60,7 +60,7 @@ class BenchLine:
     driver: Vn100
 
     def run(self, seconds: float) -> list[ImuReading]:
-        """Poll at 40 Hz for a while; return all readings."""
+        """Poll at 40 Hz for some time, and return all readings."""
         readings: list[ImuReading] = []
         end_ns = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < end_ns:

@@ -12,7 +12,7 @@ from sim_hal.worlds.world import about_thread
 
 
 class Bench:
-    """An emulated VN-100 on a serial line, and a host that reads bytes."""
+    """An emulated VN-100 on a serial line, and a host that reads the bytes of the line."""
 
     def __init__(self, unit: Vn100EmulatorSettings | None = None) -> None:
         rng = np.random.default_rng(2)
@@ -27,13 +27,13 @@ class Bench:
         self.parser = StreamParser()
 
     def run(self, seconds: float) -> list[BinaryPacket | AsciiLine]:
-        """Return all bytes that the VN-100 sends in a time."""
+        """Return all bytes that the VN-100 sends in a given time."""
         self.now_ns += round(seconds * 1e9)
         self.unit.advance(self.now_ns)
         return [item for at, data in self.line.host.receive() for item in self.parser.feed(at, data)]
 
     def exchange(self, line: bytes, seconds: float = 0.02) -> list[Sentence]:
-        """Return the sentences that arrive after a command."""
+        """Return the sentences that arrive after a command was sent."""
         self.line.host.send(line)
         return [item.sentence for item in self.run(seconds) if isinstance(item, AsciiLine)]
 

@@ -30,7 +30,7 @@ VNQMR = (
     b"$VNQMR,+0.021375,-0.049923,+0.797361,-0.601055,-0.2354,+0.8029,+1.8875,"
     b"+00.795,-00.412,-09.709,-00.0201,-00.0055,-00.0149*76\r\n"
 )
-# The manual's example of register 15, and a VNQMR line with a count from the tests of a public parser.
+# The example of register 15 in the manual, and a VNQMR line with a counter from the tests of a public parser.
 AT_REST = (
     b"$VNRRG,15,-0.017057,-0.000767,+0.056534,+0.998255,+1.0670,-0.2568,+3.0696,"
     b"-00.019,+00.320,-09.802,-0.002801,-0.001186,-0.001582*65\r\n",
@@ -173,20 +173,23 @@ def test_error_answers_are_read_as_hexadecimal() -> None:
 
 @pytest.mark.parametrize("line", AT_REST)
 def test_the_units_quaternion_is_ours_from_ned_to_body(line: bytes) -> None:
-    """For two real VN-100s at rest, tilted by 2 and 1 deg, the specific force in NED is 1 g upwards."""
+    """The unit's quaternion is the attitude from NED to body.
+
+    For two real VN-100s at rest, tilted by 2 and 1 deg, the specific force in NED is 1 g upwards.
+    """
     (item,) = StreamParser().feed(0, line)
     assert isinstance(item, AsciiLine)
     fields = [float(text) for text in item.sentence.fields if text[0] in "+-"]
     matrix, accel = attitude_matrix(np.array(fields[:4])), np.array(fields[7:10])
     force = matrix.T @ accel
     assert force == pytest.approx([0.0, 0.0, -9.8], abs=0.13)
-    # The result is level to 0.03 m/s^2; the inverse rotation would double the tilt.
+    # The horizontal force is below 0.03 m/s^2. With the inverse rotation, the tilt would be doubled.
     assert np.hypot(*force[:2]) < 0.03
     assert np.hypot(*(matrix @ accel)[:2]) > 0.15
 
 
 def test_the_testbeds_constant_rotation_is_that_of_its_definition() -> None:
-    """Sensor y points down, and the field, which defines north, is along sensor -z."""
+    """The axis y of the sensor points down, and the field, which defines north, is along -z of the sensor."""
     matrix = attitude_matrix(NED_TO_TESTBED)
     assert matrix == pytest.approx(np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]]), abs=1e-15)
     north, east, down = np.eye(3)

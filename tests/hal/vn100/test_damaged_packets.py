@@ -25,7 +25,7 @@ GOOD = layout_of(OUTPUT_SET).pack(
 
 
 class ScriptedPort:
-    """A serial line that delivers prepared chunks."""
+    """A serial line that delivers prepared portions of bytes."""
 
     baud_rate = 115_200
 
@@ -79,7 +79,7 @@ def test_readings_are_finite_and_in_range_and_whole_packets_come_out(chance: Ran
 
 
 PAYLOAD = ("q0", "q1", "q2", "q3", *(f"rate {axis}" for axis in "xyz"), *(f"acceleration {a}" for a in "xyz"))
-"""Names of the numbers after the time in the packet's group 1; the magnetic field follows in group 3."""
+"""Names of the numbers after the time in group 1 of the packet. The magnetic field follows in group 3."""
 NAMES = (*PAYLOAD, *(f"magnetic field {axis}" for axis in "xyz"))
 
 

@@ -137,8 +137,8 @@ def test_the_data_sheets_noise_has_its_density_at_the_drivers_windows() -> None:
     bench = bench_line(at_rest, MISSION, Vn100EmulatorSettings(noise=PROFILES["datasheet"]))
     bench.driver.configure()
     readings = bench.run(50.0)
-    # Window 20 gives 0.016 deg/s and 0.63 mG. From 2000 samples a deviation is known to 1.6 %; five times
-    # that is 8 %.
+    # A window of 20 samples gives 0.016 deg/s and 0.63 mG. The standard deviation of 2000 samples is known to
+    # 1.6 %, and five times this uncertainty is 8 %.
     rate = np.array([r.rate for r in readings])
     field = np.array([r.field for r in readings])
     assert rate.std(axis=0) == pytest.approx(np.full(3, np.radians(0.0035) * 20 / np.sqrt(20)), rel=0.08)
@@ -160,7 +160,7 @@ def test_ascii_output_gives_the_same_without_device_time() -> None:
 
 
 def test_the_unit_may_be_found_in_any_state() -> None:
-    """The VN-100 sends other outputs, and half a command of a dead host is in its buffer."""
+    """A VN-100 with other outputs, and with half a command of a dead host in its buffer, is configured."""
     bench = bench_line()
     bench.line.host.send(b"\r\n" + build("WRG", 76, 1, 40, "01", "0729"))
     bench.clock.sleep_until_ns(100_000_000)
@@ -179,7 +179,7 @@ def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
     readings = bench.run(1.0)
     assert bench.unit.registers.read(6) == ("14",)
     assert len(readings) > 45
-    # Packets are delayed by VNYMR lines, so the time of the sample is compared with the device clock.
+    # VNYMR lines delay the packets, so the time of a sample is compared with the device clock.
     sampled_ns = readings[-1].device_time_ns - QUIET.uptime_ns
     assert readings[-1].quaternion == pytest.approx(turning(sampled_ns).quaternion, abs=2 * FLOAT32)
 
@@ -285,7 +285,7 @@ def test_faults_on_the_wire_cost_readings_but_never_falsify_one(
     bench.line.to_host.faults = faults
     readings = bench.run(2.0)
     after = bench.driver.link()
-    # At most one packet was in transmission when the fault began.
+    # One packet may have been in transmission when the fault began.
     assert least <= len(readings) <= most + 1
     for reading in readings:
         truth = turning(reading.time_ns - faults.delay_ns)
@@ -317,7 +317,7 @@ def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
     silent = Vn100(bench.line.host, bench.clock, replace(MISSION, configure=False))
     bench = replace(bench, driver=silent)
     bench.line.host.send(build("RST"))
-    assert len(bench.run(3.0)) <= 1  # the VN-100 boots and then sends VNYMR lines, which are not readings
+    assert len(bench.run(3.0)) <= 1  # the VN-100 boots and sends only VNYMR lines, which are no readings
     assert silent.link().last_byte_ns > bench.clock.now_ns() - 50_000_000
     silent_to_unit = bench.unit.registers.read(6)
     assert silent_to_unit == ("14",)
@@ -367,7 +367,7 @@ def test_a_sample_of_which_only_the_rate_is_invalid_is_given_without_a_rate(
 
 
 def received(values: dict[int, float]) -> tuple[Sequence[ImuReading], ImuLink]:
-    """Return the readings and the counters after one packet at rest, whose values at some indices differ."""
+    """Return the readings and counters after one packet at rest with changed values at some indices."""
     bench = bench_line()
     payload = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]
     for index, value in values.items():

@@ -1,4 +1,4 @@
-"""Tests that a VN-100 with unexpected output is detected and configured at its baud rate."""
+"""Tests that a VN-100 with unexpected output is detected, and then configured at its own baud rate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INPUT = Path(__file__).resolve().parents[4] / "shared/data/inputs/vn-gnss.bin"
 
 
 def packet(header: bytes, length: int) -> bytes:
-    """Return a packet with a header (group byte and words) and a payload of `length` bytes."""
+    """Return a packet with a header (group byte and field words) and a payload of `length` bytes."""
     body = header + bytes(range(length % 200)) + bytes(length - length % 200)
     return b"\xfa" + body + crc16(body).to_bytes(2, "big")
 
@@ -35,7 +35,7 @@ def save(bench: BenchLine, sent: bytes, divisor: int = 20) -> None:
 
 
 def heard_rates(bench: BenchLine) -> list[int]:
-    """Return the list to which each change of the host's baud rate is appended from now on."""
+    """Return a list to which each later change of the host's baud rate is appended."""
     rates: list[int] = []
     change = bench.line.host.set_baud_rate
 
@@ -48,7 +48,7 @@ def heard_rates(bench: BenchLine) -> list[int]:
 
 
 def seconds_until_readings(bench: BenchLine) -> float:
-    """Return the time (s) until readings arrive at 40 Hz for half a second, at most 8 s."""
+    """Return the time (s), at most 8 s, until readings have arrived at 40 Hz for half a second."""
     seconds = 0.0
     while seconds < 8.0:
         seconds += 0.5

@@ -33,7 +33,7 @@ def client() -> Iterator[Any]:
 
 def test_a_polling_client_reads_tares_and_is_refused_like_on_a_real_unit(client: Any) -> None:
     assert client.read_model_number().startswith("VN-100")
-    accelerations = client.read_ypr_body_accel_gyro()  # register 239
+    accelerations = client.read_ypr_body_accel_gyro()  # the client reads register 239
     assert len(accelerations) == 9
     assert math.hypot(*client.read_accel().values()) == pytest.approx(9.81, abs=0.1)
     assert math.hypot(*client.read_mag().values()) == pytest.approx(4.5, rel=0.05)

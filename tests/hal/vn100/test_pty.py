@@ -72,9 +72,9 @@ def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.
     assert set(np.diff(times)) == {25_000_000}
     angles = np.array([angle_about_axis_y(r.quaternion) for r in readings])
     slope = np.polyfit(times * 1e-9, angles, 1)[0]
-    # 60 angles with an error of 2 mrad over 1.5 s give the rate to 0.6 mrad/s.
+    # 60 angles with an error of 2 mrad, over 1.5 s, determine the rate to 0.6 mrad/s.
     assert slope == pytest.approx(np.radians(3.0), abs=3e-3)
-    assert driver.link().discarded_bytes < 200  # message that was partly sent when the port was opened
+    assert driver.link().discarded_bytes < 200  # end of a message that was cut when the port was opened
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=5) == 0
 
@@ -125,7 +125,8 @@ def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
     while words != b"again" and clock.now_ns() < deadline_ns:
         try:
             words += b"".join(data for _, data in port.receive())
-            # Data that arrive before the port is open again are discarded, so they are sent afterwards.
+            # Data that arrive before the port is open again are discarded, so the test sends its data
+            # afterwards.
             sent = sent or (plugged and os.write(second[0], b"again") > 0)
         except NotResponding:
             if not plugged:
@@ -200,14 +201,14 @@ def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_r
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
     assert port._write_timeout < 1.0 / CONTROL_RATE_HZ
     with pytest.raises(NotResponding, match="the output queue is full"):
-        port.send(bytes(1 << 20))  # at this time, no process reads the other end
+        port.send(bytes(1 << 20))  # no process reads the other end at this time
     os.close(near)
     port.close()
     os.close(far)
 
 
 class InterruptedClock(SystemClock):
-    """A clock that advances by a second at each reading, like that of an interrupted thread."""
+    """A clock that advances by a second at each reading, as for a thread that is interrupted often."""
 
     def __init__(self) -> None:
         super().__init__()

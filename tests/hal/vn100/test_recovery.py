@@ -1,4 +1,4 @@
-"""Tests that a lost VN-100 is found and configured again within two seconds, without blocking polls."""
+"""Tests that a lost VN-100 is found and configured again within two seconds, and that polls do not block."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def bench() -> BenchLine:
 
 
 def poll(bench: BenchLine) -> list[ImuReading]:
-    """Poll once at the next cycle; a missing port gives no readings.
+    """Poll once at the next cycle. A missing port gives no readings.
 
     Simulated time must not advance during a poll.
     """
@@ -41,7 +41,7 @@ def poll(bench: BenchLine) -> list[ImuReading]:
 
 
 def seconds_until_readings(bench: BenchLine, limit: float = 5.0) -> float:
-    """Return the time until a reading arrives in each cycle."""
+    """Return the time (s) until a reading arrives in each cycle."""
     begin_ns = bench.clock.now_ns()
     in_a_row = 0
     while (bench.clock.now_ns() - begin_ns) * 1e-9 < limit:
@@ -53,7 +53,7 @@ def seconds_until_readings(bench: BenchLine, limit: float = 5.0) -> float:
 
 def reset(bench: BenchLine) -> None:
     bench.line.host.send(build("RST"))
-    bench.run(1.0)  # the VN-100 starts, and the fault has ended when it sends
+    bench.run(1.0)  # the VN-100 boots, and the fault has ended before it sends data
 
 
 def lose_power(bench: BenchLine) -> None:
@@ -138,7 +138,10 @@ def test_readings_come_again_within_two_seconds_after_the_fault(
 
 
 def test_a_unit_that_was_reset_on_saved_binary_output_is_set_up_too(bench: BenchLine) -> None:
-    """The packets resume without a command, so that only the device clock shows the restart."""
+    """After a reset, a VN-100 that resumes its saved binary output is configured again.
+
+    The packets continue without a command, so only the device clock shows the reset.
+    """
     bench.unit.registers.save()
     bench.unit.registers.write(85, ("0", "4", "4", "4", "0", "0", "3", "3", "3", "0"))
     bench.unit.registers.save()

@@ -1,4 +1,4 @@
-"""Tests of the commands that configure a VN-100 against VectorNav UM001 v2.43, chapter 5."""
+"""Tests of the commands that configure a VN-100, by VectorNav UM001 v2.43, chapter 5."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ASCII = ["RRG 1", "WRG 6 0", "WRG 44 0 1 5", "WRG 85 20 20 20 4 0 3 3 3 3 0", "W
 
 
 def converse(settings: Vn100Settings, answers: Mapping[str, tuple[str, ...]] | None = None) -> list[str]:
-    """Return the commands of the set-up; commands without a given response are echoed."""
+    """Return the commands of the set-up. The unit echoes each command for which no response is given."""
     dialogue = set_up(settings)
     asked: list[str] = []
     question = next(dialogue)
@@ -90,7 +90,10 @@ def test_an_answer_belongs_to_its_command_and_register() -> None:
 
 
 def test_only_errors_of_the_line_are_worth_another_try() -> None:
-    """The error codes are those of UM001 Table 18; -1 is an unreadable code."""
+    """Only errors of the line are retried.
+
+    The codes are those of UM001 Table 18; -1 is an unreadable code.
+    """
     assert {-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF} == PASSING_ERRORS
     assert BAUD_RATES == (115200, 230400, 921600, 460800, 57600, 38400, 19200, 9600)
 
@@ -103,10 +106,10 @@ def test_only_errors_of_the_line_are_worth_another_try() -> None:
         ("binary", 30, 921600, False),
         ("ascii", 16, 921600, False),
         ("ascii", 25, 115200, True),
-        ("binary", 40, 38400, True),  # 67 bytes x 40 Hz x 10 bits = 26800 bit/s, 70 %
-        ("binary", 50, 38400, False),  # 87 %
-        ("ascii", 50, 115200, True),  # 137 bytes: 59 %
-        ("ascii", 100, 115200, False),  # 119 %
+        ("binary", 40, 38400, True),  # 67 bytes x 40 Hz x 10 bits = 26800 bit/s, 70 % of the line
+        ("binary", 50, 38400, False),  # 87 % of the line
+        ("ascii", 50, 115200, True),  # 137 bytes, 59 % of the line
+        ("ascii", 100, 115200, False),  # 119 % of the line
     ],
 )
 def test_a_rate_must_be_one_of_the_unit_and_fit_into_80_percent_of_the_line(

@@ -1,4 +1,4 @@
-"""Tests of the stream parser with noise, gaps and damage of a serial line."""
+"""Tests of the stream parser with noise, gaps and damaged bytes of a serial line."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ good = st.one_of(
     st.integers(0, 1000).map(packet),
     st.integers(0, 1000).map(lambda n: build("YPR", f"{n:+08.3f}", "+000.278", "-002.026", checksum="crc16")),
 )
-# Strategy for noise that contains many starts of packets and lines.
+# Strategy for noise that contains many false starts of packets and lines.
 noise = st.lists(
     st.sampled_from([b"\xfa", b"\xfa\x01", b"\xfa\x05\x31", b"$", b"$VN", b"\r\n", b"*", b"\0", b"A"])
     | st.binary(max_size=8),
@@ -76,7 +76,7 @@ def test_every_chunking_gives_the_same(
 def test_good_packets_are_found_behind_any_garbage(parts: list[tuple[bytes, bytes]]) -> None:
     parser = StreamParser()
     data = b"".join(itertools.chain.from_iterable(parts))
-    # A false packet start waits for the announced number of bytes; enough zeros end each wait.
+    # A false start of a packet waits for the announced number of bytes. The zeros complete each false packet.
     found = contents(parser.feed(0, data)) + contents(parser.feed(0, bytes(1024)))
     remaining = iter(found)
     assert all(any(item == sound for item in remaining) for _, sound in parts)
@@ -104,7 +104,7 @@ def test_no_single_flipped_bit_passes_and_the_next_packet_is_found() -> None:
 
 
 def test_no_burst_within_the_payload_passes() -> None:
-    """CRC-16 detects every error burst of up to 16 bits."""
+    """A burst of errors of up to 16 bits within the payload never passes the CRC-16."""
     rng = np.random.default_rng(5)
     sound = packet(1)
     for _ in range(500):
@@ -134,7 +134,7 @@ def test_packets_within_a_chunk_carry_the_time_of_their_own_last_byte() -> None:
     first, second = parser.feed(1_000_000, sound + sound)
     assert second.arrival_ns == 1_000_000
     assert first.arrival_ns == 1_000_000 - 100 * len(sound)
-    # Delayed bytes cannot be older than the portion that arrived before them.
+    # Delayed bytes cannot have arrived before the previous portion.
     third, _ = parser.feed(1_000_500, sound + sound)
     assert third.arrival_ns == 1_000_000
 

@@ -1,4 +1,4 @@
-"""Tests of public functions of Sun, field, eclipse and orbit against independent computations."""
+"""Tests of the public functions of Sun, field, eclipse and orbit against independent computations."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ SECOND = "2 25544  51.6400 200.0000 0005000 100.0000 260.0000 15.50000000539990"
 
 
 def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
-    """The simulator's Sun is accurate to 42"; the aberration by the satellite's own 7.6 km/s is 5.2"."""
+    """The Sun direction agrees with an almanac of 42" accuracy, and includes the aberration of 5.2".
+
+    The almanac is the simulator's. The satellite's own velocity of 7.6 km/s causes the aberration.
+    """
     for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
         apparent, distance = apparent_sun(date, np.zeros(3), np.zeros(3))
         almanac = sun_position(terrestrial_time(date))
@@ -51,8 +54,8 @@ def test_the_suns_direction_is_that_of_the_almanac() -> None:
     direction = sun_direction(TIME)
     assert np.linalg.norm(direction) == pytest.approx(1.0, abs=1e-12)
     assert direction @ almanac == pytest.approx(np.linalg.norm(almanac), rel=1e-7)
-    # An observer that is displaced across the Sun direction, by a thousandth of the distance, measures the
-    # parallax.
+    # An observer that is displaced by a thousandth of the Sun's distance, normal to the Sun direction,
+    # measures the parallax.
     across = np.cross(direction, [0.0, 0.0, 1.0])
     moved = sun_direction(TIME, 1e-3 * ASTRONOMICAL_UNIT * across / np.linalg.norm(across))
     assert np.linalg.norm(moved - direction) == pytest.approx(1e-3, rel=0.05)

@@ -1,4 +1,4 @@
-"""Tests of the chi-square bound against scipy."""
+"""Tests of the upper quantile and the tail probability of chi-square against scipy."""
 
 from __future__ import annotations
 

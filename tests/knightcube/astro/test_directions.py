@@ -1,4 +1,4 @@
-"""Tests of the tangent plane of a direction."""
+"""Tests of the basis of the tangent plane of a direction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of inertia tensors: principal axes near the body axes, and impossible tensors."""
+"""Tests of inertia tensors: principal axes near the body axes, and tensors that no body can have."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_diagonal_tensor_keeps_its_moments_exactly() -> None:
 @pytest.mark.parametrize(
     ("inertia", "words"),
     [
-        (np.diag([1.0, 1.0, 2.0]), ""),  # a thin disc, the limit of possible moments
+        (np.diag([1.0, 1.0, 2.0]), ""),  # moments of a thin disc, the limit of possible moments
         (np.diag([1.0, 1.0, 2.001]), "largest must not exceed the sum of the other two (2)"),
         (np.diag([1.0, 1.0, -0.5]), "moments -0.5, 1, 1: all must be positive"),
         (np.diag([1.0, 1.0, 0.0]), "all must be positive"),
@@ -56,7 +56,8 @@ def test_a_diagonal_tensor_keeps_its_moments_exactly() -> None:
             "row 1, column 2 is 0.1, and row 2, column 1 is -0.1",
         ),
         (np.array([[2.0, 3.0, 0.0], [3.0, 2.0, 0.0], [0.0, 0.0, 2.0]]), "all must be positive"),
-        # The diagonal satisfies the triangle inequality, but the principal moments 0.2, 2 and 3.8 do not.
+        # The diagonal elements satisfy the triangle inequality, but the principal moments 0.2, 2 and 3.8 do
+        # not.
         (np.array([[2.0, 1.8, 0.0], [1.8, 2.0, 0.0], [0.0, 0.0, 2.0]]), "moments 0.2, 2, 3.8: the largest"),
     ],
 )

@@ -63,7 +63,10 @@ def test_attitude_matrix_is_eulers_formula(axis: FloatArray, angle: float) -> No
 
 
 def test_a_turn_about_z_carries_the_frame_with_it() -> None:
-    """After +90 degrees about z the body's x axis is the reference's y, which is (1, 0, 0) in body axes."""
+    """A rotation of +90 deg about z moves the body's x axis to the reference's y axis.
+
+    In body axes, the reference's y axis is then (1, 0, 0).
+    """
     q = quaternion.from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi]))
     assert _close(quaternion.attitude_matrix(q) @ [0.0, 1.0, 0.0], np.array([1.0, 0.0, 0.0]))
 
@@ -97,7 +100,7 @@ def test_matrix_round_trip(q: FloatArray) -> None:
 
 @pytest.mark.parametrize("axis", np.eye(3))
 def test_matrix_of_a_half_turn_has_no_singularity(axis: FloatArray) -> None:
-    """At a rotation of pi the scalar part is 0, so a method that divides by it would fail."""
+    """At a rotation by pi the scalar part is 0. The conversion from a matrix must not divide by it."""
     q = np.append(axis, 0.0)
     assert _close(np.abs(quaternion.from_matrix(quaternion.attitude_matrix(q))), np.abs(q))
 
@@ -110,9 +113,9 @@ def test_rotation_vector_round_trip(axis: FloatArray, angle: float) -> None:
 
 @given(UNIT_QUATERNIONS)
 def test_rotation_vector_agrees_with_scipy(q: FloatArray) -> None:
-    """The quaternion is the same in both conventions; only the matrix differs.
+    """The rotation vector equals that of scipy, although the attitude matrix is the transpose of scipy's.
 
-    At a rotation of pi, both signs are correct.
+    At a rotation by pi, both signs of the vector are correct.
     """
     vector = quaternion.to_rotation_vector(q)
     assume(np.linalg.norm(vector) < np.pi - 1e-6)
@@ -130,7 +133,7 @@ def test_small_rotation_vectors_keep_their_digits(size: float) -> None:
 def test_constant_rate_turns_the_attitude_from_the_left(
     rate: FloatArray, start: FloatArray, t: float
 ) -> None:
-    """A(t) = expm(-[w x] t) A(0), the solution of dA/dt = -[w x] A (Wertz 16-1)."""
+    """At a constant rate, A(t) = expm(-[w x] t) A(0), which solves dA/dt = -[w x] A (Wertz 16-1)."""
     q = quaternion.multiply(quaternion.from_rotation_vector(rate * t), start)
     expected = expm(-_cross(rate) * t) @ quaternion.attitude_matrix(start)
     assert _close(quaternion.attitude_matrix(q), expected, 1e-10)
@@ -148,7 +151,10 @@ def test_derivative_is_the_limit_of_small_turns(q: FloatArray, rate: FloatArray)
 def test_a_fixed_star_moves_with_minus_omega_cross_v(
     q: FloatArray, rate: FloatArray, star: FloatArray
 ) -> None:
-    """The derivative alone determines the sign of the rate."""
+    """The direction of a fixed star changes by -omega x v.
+
+    This derivative determines the sign of the rate.
+    """
     h = 1e-6
     ahead = quaternion.normalise(q + h * quaternion.derivative(q, rate))
     behind = quaternion.normalise(q - h * quaternion.derivative(q, rate))
@@ -165,7 +171,7 @@ def test_angle_between_is_the_angle_turned(q: FloatArray, axis: FloatArray, angl
 
 @given(st.floats(1e-12, 1e-6))
 def test_angle_between_is_accurate_near_zero(angle: float) -> None:
-    """An arc cosine of the dot product would not resolve angles below 1e-8."""
+    """Angles below 1e-8 are accurate. The arc cosine of a dot product would not resolve them."""
     q = quaternion.about_axis_y(angle)
     assert quaternion.angle_between(q, quaternion.IDENTITY) == pytest.approx(angle, rel=1e-9)
 
@@ -180,7 +186,7 @@ def test_turns_about_axis_y_round_trip(angle: float) -> None:
 
 @given(ANGLES, st.floats(0.0, 6.28), st.floats(0.0, 1.5))
 def test_the_twist_about_y_leaves_out_a_tilt(angle: float, azimuth: float, tilt: float) -> None:
-    """A tilt of the thread (a rotation about a horizontal axis) does not change the twist."""
+    """The twist about y does not change if the thread is tilted, i.e. rotated about a horizontal axis."""
     swing = quaternion.from_rotation_vector(tilt * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)]))
     q = quaternion.multiply(swing, quaternion.about_axis_y(angle))
     assert quaternion.angle_about_axis_y(q) == pytest.approx(angle, abs=1e-9)

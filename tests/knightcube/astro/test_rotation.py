@@ -1,4 +1,4 @@
-"""Tests that the quaternion algebra of tuples of floats equals that of arrays."""
+"""Tests that the quaternion algebra for tuples of floats equals the algebra for arrays."""
 
 from __future__ import annotations
 

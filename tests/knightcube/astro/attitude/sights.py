@@ -1,4 +1,4 @@
-"""Star directions measured by a simulated camera, and the information that they give about the attitude."""
+"""Star directions that a simulated camera measures, and their information about the attitude."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Sight:
 
 
 def information(observed: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return the Fisher information (3, 3) of small rotations, 1/rad^2: the sum of (1 - b b^T)/sigma^2."""
+    """Return the Fisher information (3, 3), 1/rad^2, of small rotations: the sum of (1 - b b^T)/sigma^2."""
     weighted = observed / sigma[:, None]
     return np.asarray(np.sum(1.0 / sigma**2) * np.eye(3) - weighted.T @ weighted)
 
 
 def unit(vectors: FloatArray) -> FloatArray:
-    """Return the vectors (..., 3) at unit length."""
+    """Return the vectors (..., 3), scaled to unit length."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
@@ -40,8 +40,8 @@ def sight(
 ) -> Sight:
     """Return n stars within `half_field` rad of a random boresight, or in the whole sky if it is None.
 
-    `sigma` (rad) is the approximate error of each measured direction; `angle` (rad) is the rotation about a
-    random axis; if None, the rotation is drawn uniformly from all rotations.
+    `sigma` (rad) is the approximate error of each measured direction. `angle` (rad) is the rotation about a
+    random axis. If `angle` is None, the attitude is drawn uniformly from all rotations.
     """
     drawn = rng.normal(size=(n, 3))
     if half_field is not None:

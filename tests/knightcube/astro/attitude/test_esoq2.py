@@ -78,7 +78,8 @@ def test_it_is_the_solution_of_scipy() -> None:
         observed = _observed(rng, normalise(rng.normal(size=4)), reference, sigma)
         found = _solve(observed, reference, sigma)
         rotation, root_loss = Rotation.align_vectors(observed, reference, weights=1.0 / sigma**2)
-        # scipy's quaternion rotates vectors and ours rotates axes, hence the conjugate.
+        # scipy's quaternion rotates vectors, and this library's quaternion rotates axes, so the conjugate is
+        # used.
         assert angle_between(found.quaternion, conjugate(rotation.as_quat())) < 1e-10
         assert found.loss == pytest.approx(0.5 * root_loss**2, rel=1e-6)
 
@@ -89,9 +90,9 @@ def test_it_is_the_solution_of_scipy() -> None:
 )
 @pytest.mark.parametrize("n", [2, 6])
 def test_no_angle_and_no_axis_is_singular(angle: float, axis: tuple[float, float, float], n: int) -> None:
-    """ESOQ2's axis is undefined at 0 deg and its scalar part vanishes at 180 deg.
+    """The solver has no singular rotation angle or axis, due to the method of sequential rotations.
 
-    The method of sequential rotations solves both cases.
+    Without this method, the axis is undefined at 0 deg, and the scalar part is zero at 180 deg.
     """
     q = from_rotation_vector(angle * unit(np.array(axis)))
     reference = _reference(np.random.default_rng(44), n, _NARROW)
@@ -123,8 +124,8 @@ def test_the_covariance_and_the_loss_are_those_of_the_errors() -> None:
         error = to_rotation_vector(multiply(found.quaternion, conjugate(q)))
         squared.append(error @ np.linalg.solve(found.covariance, error))
         losses.append(2.0 * found.loss)
-    # The expected means are those of chi-squares with 3 and with 2n - 3 = 9 degrees of freedom, to three
-    # standard errors.
+    # The expected means are those of chi-squares with 3 and with 2n - 3 = 9 degrees of freedom. The tolerance
+    # is three standard errors.
     assert np.mean(squared) == pytest.approx(3.0, abs=3.0 * np.sqrt(6.0 / runs))
     assert np.mean(losses) == pytest.approx(9.0, abs=3.0 * np.sqrt(18.0 / runs))
 

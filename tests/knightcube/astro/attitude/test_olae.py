@@ -51,7 +51,7 @@ def test_it_agrees_with_an_svd_solution_of_wahbas_problem_far_below_the_noise() 
     weights = rng.uniform(0.2, 1.0, 25)
     found = attitude_matrix(rotation_between(starts, ends, weights).quaternion)
     difference = found @ _wahba(starts, ends, weights).T
-    # The two losses differ in second order, by the noise times the rotation of 0.02 rad.
+    # The losses of both solvers differ in second order, by the noise times the rotation of 0.02 rad.
     skew = 0.5 * np.array([difference[2, 1], difference[0, 2], difference[1, 0]])
     assert np.linalg.norm(skew) < 0.05 * sigma
 
@@ -62,7 +62,7 @@ def test_the_gain_is_the_derivative_of_the_rotation_vector() -> None:
     ends = rotate(starts, rotation)
     weights = np.linspace(0.5, 1.5, 7)
     solution = rotation_between(starts, ends, weights)
-    # Opposite errors of b and r change only their difference d = b - r.
+    # Opposite errors of b and r change the difference d = b - r, but not the sum.
     error = 1e-6 * np.array([0.3, -0.5, 0.2])
     moved_starts, moved_ends = starts.copy(), ends.copy()
     moved_starts[2] -= 0.5 * error

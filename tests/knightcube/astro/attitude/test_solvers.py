@@ -1,4 +1,4 @@
-"""Tests of all attitude solvers against each other, scipy and their covariances, and of degenerate cases."""
+"""Tests of all attitude solvers against each other, scipy and their covariances, and in degenerate cases."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
 ) -> None:
     seen = sight(np.random.default_rng(seed), n, half_field, sigma, angle)
     if _least_eigenvalue(seen) < (30.0 * sigma) ** 2:
-        return  # The solvers need not agree on stars whose separation is within their errors.
+        return  # two stars whose separation is within their errors do not determine the attitude
     fixes = {name: _by(name, seen) for name in OPTIMAL}
     for fix in fixes.values():
         assert angle_between(fix.quaternion, fixes[DEFAULT].quaternion) < 1e-10
-        # Attitudes of different solvers differ by about 1e-15 rad, which limits the agreement of their
+        # The attitudes of different solvers differ by about 1e-15 rad, which limits the agreement of the
         # losses.
         assert fix.loss == pytest.approx(fixes[DEFAULT].loss, rel=1e-6, abs=1e-9 + 3e-15 / sigma)
         assert fix.quaternion[3] >= 0.0
@@ -80,7 +80,10 @@ def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
 def test_a_solver_loses_no_more_than_the_profile_matrix_has_lost(
     name: str, angle: float | None, n: int, half_field: float | None
 ) -> None:
-    """Before the refinement the error is the rounding error divided by the gap between K's eigenvalues."""
+    """A solver's loss exceeds the optimum by no more than rounding errors in the profile matrix allow.
+
+    Before the refinement, the error is the rounding error divided by the gap between the eigenvalues of K.
+    """
     rng = np.random.default_rng([61, n])
     for _ in range(20):
         seen = sight(rng, n, half_field, 1e-5, angle)
@@ -98,8 +101,8 @@ def test_the_polynomials_root_is_the_largest_eigenvalue(seed: int, n: int) -> No
         unit(rng.normal(size=(n, 3))), unit(rng.normal(size=(n, 3))), np.full(n, 1.0 / n)
     )
     values = np.linalg.eigvalsh(davenport_matrix(profile))
-    # The error of a simple root is the rounding error divided by the slope; that of two close roots is the
-    # square root of the rounding error.
+    # The error of a simple root is the rounding error divided by the slope. The error of two close roots is
+    # the square root of the rounding error.
     slope = np.prod(values[3] - values[:3])
     assert largest_eigenvalue(profile) == pytest.approx(values[3], abs=min(1e-6, 1e-14 / slope))
 
@@ -112,15 +115,18 @@ def test_directions_without_noise_give_the_true_attitude(name: str) -> None:
             true = sight(rng, n, half_field, 1e-5, angle)
             exact = true.reference @ attitude_matrix(true.quaternion).T
             fix = SOLVERS[name](unit(exact), true.reference, true.sigma)
-            # Directions have a rounding error of 1e-16, so the rotation about the boresight has this error
-            # divided by the separation.
+            # Directions have a rounding error of 1e-16. The error of the rotation about the boresight is this
+            # error divided by the separation.
             assert angle_between(fix.quaternion, true.quaternion) < 1e-15 / np.sqrt(_least_eigenvalue(true))
 
 
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (-1, 1, 1)])
 @pytest.mark.parametrize("name", _ALL)
 def test_half_a_turn_about_any_axis_is_solved(name: str, axis: tuple[int, int, int]) -> None:
-    """The boresight of the stars may be the rotation axis, and may be reversed by the rotation."""
+    """Rotations by 180 deg about any axis are solved.
+
+    The axis may be the boresight, or be normal to the boresight, which the rotation then reverses.
+    """
     q = from_rotation_vector(np.pi * unit(np.array(axis, dtype=float)))
     drawn = np.random.default_rng(63).normal(size=(6, 3)) * [_FIELD, _FIELD, 0.0]
     reference = unit(np.array([0.0, 0.0, 1.0]) + drawn)
@@ -134,16 +140,18 @@ def test_the_default_is_scipys_solution() -> None:
         seen = sight(rng, 20, _FIELD, 1e-5)
         rotation, root_loss = Rotation.align_vectors(seen.observed, seen.reference, weights=seen.sigma**-2.0)
         fix = solve(seen.observed, seen.reference, seen.sigma)
-        # scipy's quaternion rotates vectors and ours rotates axes, hence the conjugate.
+        # scipy's quaternion rotates vectors, and this library's quaternion rotates axes, so the conjugate is
+        # used.
         assert angle_between(fix.quaternion, conjugate(rotation.as_quat())) < 1e-10
-        # scipy's loss is a difference of numbers 1e11 times as large.
+        # scipy computes the loss as a difference of numbers that are 1e11 times larger.
         assert fix.loss == pytest.approx(0.5 * root_loss**2, rel=1e-3)
 
 
 def test_two_close_stars_are_settled_to_the_digits_that_their_directions_have() -> None:
-    """The profile matrix B gives the rotation about stars 1e-4 rad apart only to 1e-8 rad.
+    """For two close stars, the attitude is as accurate as the directions of the stars.
 
-    A closed form is exact.
+    The profile matrix B alone gives the rotation about stars 1e-4 rad apart only to 1e-8 rad. A closed form
+    is exact.
     """
     rng = np.random.default_rng(65)
     for _ in range(20):
@@ -162,7 +170,7 @@ def test_errors_are_as_large_as_the_covariance_says(name: str, n: int, half_fiel
     runs, total, losses = 120, 0.0, 0.0
     for _ in range(runs):
         seen = sight(rng, n, half_field, 1e-5)
-        # Two stars at nearly the same position have errors that no covariance describes.
+        # No covariance describes the errors of two stars that are nearly at the same position.
         while _least_eigenvalue(seen) < 1e-5:
             seen = sight(rng, n, half_field, 1e-5)
         fix = _by(name, seen)
@@ -178,20 +186,24 @@ def test_errors_are_as_large_as_the_covariance_says(name: str, n: int, half_fiel
 
 @pytest.mark.parametrize("name", ["olae", "triad"])
 def test_what_is_not_optimal_is_off_the_optimum_by_the_difference_of_the_covariances(name: str) -> None:
-    """An efficient estimate is uncorrelated with its difference from any other, so the variances subtract."""
+    """Solvers that are not optimal differ from the optimum as the difference of the covariances states.
+
+    An efficient estimate is uncorrelated with its difference from any other estimate, so the variances
+    subtract.
+    """
     rng = np.random.default_rng(67)
     runs, ratios, worse = 400, [], []
     for _ in range(runs):
         seen = sight(rng, 8, None, 1e-5)
         fix, best = _by(name, seen), _by(DEFAULT, seen)
         excess = fix.covariance - best.covariance
-        # Both covariances are computed from directions with errors of 1e-5.
+        # The covariances are computed from directions that have errors of 1e-5.
         assert np.linalg.eigvalsh(excess)[0] > -1e-4 * np.trace(best.covariance)
         apart = _error(fix, best.quaternion)
         ratios.append(float(apart @ apart / np.trace(excess)))
         worse.append(np.trace(fix.covariance) / np.trace(best.covariance))
         assert fix.loss >= best.loss * (1.0 - 1e-9)
-    # The variance of the squared length is at most twice the square of its mean.
+    # The variance of the squared length is at most twice the square of the mean of the squared length.
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / runs))
     assert np.median(worse) > 1.001
 
@@ -233,13 +245,17 @@ def test_directions_that_share_no_attitude_give_the_least_loss_or_none(name: str
 
 @pytest.mark.parametrize("name", _ALL)
 def test_a_field_seen_backwards_has_no_attitude(name: str) -> None:
-    """If all three axes are measured reversed, a rotation by 180 deg about any axis fits equally well."""
+    """A mirrored field has no attitude.
+
+    If all three axes are measured reversed, a rotation by 180 deg about any axis fits equally well.
+    """
     axes = np.eye(3)
     if name in OPTIMAL:
         with pytest.raises(AttitudeError):
             SOLVERS[name](-axes, axes, np.full(3, 1e-5))
     else:
-        # Solvers that fit part of the data exactly show by their loss that the other data contradict it.
+        # Some solvers fit a part of the data exactly. Their loss shows that the other data contradict the
+        # attitude.
         try:
             fix = SOLVERS[name](-axes, axes, np.full(3, 1e-5))
         except AttitudeError:

@@ -1,4 +1,4 @@
-"""Tests that errors of a least-squares attitude with full covariances agree with its covariance."""
+"""Tests that the errors of a least-squares attitude agree with its covariance, for full input covariances."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def scene(
     observations = []
     for reference, sigma in zip(references[:2], (SUN_SIGMA, NADIR_SIGMA), strict=True):
         root = sigma * np.eye(3)
-        if lopsided:  # a short arc of limb has a ten times larger error along one direction
+        if lopsided:  # for a short arc of the limb, the error is ten times larger along one direction
             axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
             root = sigma * axes * np.array([1.0, 3.0, 10.0])
         seen = attitude_matrix(truth) @ reference + root @ rng.standard_normal(3)
@@ -47,7 +47,7 @@ def error(truth: FloatArray, fix: AttitudeFix) -> FloatArray:
 
 
 def by_sigma(solver: str, *observations: VectorObservation) -> AttitudeFix:
-    """Return the attitude that a solver finds with one sigma per direction."""
+    """Return the attitude that a solver finds if each direction has only one sigma."""
     return SOLVERS[solver](
         np.array([one.observed for one in observations]),
         np.array([one.reference for one in observations]),
@@ -67,7 +67,7 @@ WAYS: dict[
 
 @pytest.mark.parametrize("way", WAYS)
 def test_errors_are_as_large_as_the_covariance_says(way: str) -> None:
-    """The mean NEES of 150 attitudes is in its 99.9 % band if the full covariances are used."""
+    """With full covariances, the mean NEES of 150 attitudes is in its 99.9 % band."""
     make, lopsided = WAYS[way]
     rng = np.random.default_rng(SEED)
     total = 0.0

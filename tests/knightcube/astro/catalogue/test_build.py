@@ -1,4 +1,4 @@
-"""Tests of the build of the star table: written values, and refused sources."""
+"""Tests of the program that builds the star table: the written values, and sources that are refused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from knightcube.errors import UsageError
 
 
 def _source() -> build.Source:
-    """Return an artificial source catalogue with the published counts per magnitude."""
+    """Return an artificial source catalogue with the published numbers of stars per magnitude."""
     rows = build.ENTRIES
     magnitude: npt.NDArray[Any] = np.full(rows, 9.0)
     limits = sorted(build.PUBLISHED_COUNTS.items(), reverse=True)

@@ -1,4 +1,4 @@
-"""Tests of the star table against published counts and positions."""
+"""Tests of the star table against published numbers and positions of stars."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from tests.pace import ordinary_seconds
 
 STARS = catalogue.load()
 
-# Hipparcos entries with V below each limit (hardware notes, 0.1), and how many of them have no position.
+# Number of Hipparcos entries with V below each limit (hardware notes, 0.1), and number of these entries
+# without a position.
 PUBLISHED = {6.0: (4_995, 3), 6.5: (8_789, 4), 7.0: (15_404, 7), 8.0: (41_074, 17), 8.5: (61_320, 27)}
 
-# SIMBAD, ICRS, epoch J2000 (van Leeuwen 2007; 61 Cygni A is Gaia's): the old and the new reduction of
-# Hipparcos differ by some mas/yr for the brightest stars, and by 13 mas/yr for 61 Cygni.
+# Positions of SIMBAD (ICRS, epoch J2000) by van Leeuwen 2007; 61 Cygni A is from Gaia. The old and the new
+# reduction of Hipparcos differ by some mas/yr for the brightest stars, and by 13 mas/yr for 61 Cygni.
 POSITIONS = {
     "Sirius": (32349, "06 45 08.91728", "-16 42 58.0171", -1.44, 0.002),
     "Canopus": (30438, "06 23 57.10988", "-52 41 44.3810", -0.62, 0.005),
@@ -56,9 +57,10 @@ def _index(hip: int) -> int:
 def test_counts_are_the_published_ones_less_the_entries_without_a_position(
     limit: float, published: int, unplaced: int
 ) -> None:
-    """The table includes three of the stars without position.
+    """The numbers of stars are the published ones, without the entries that have no position.
 
-    One of them, HIP 115125, has magnitude V = 6.97, so it is counted only with the limit 7.
+    The table contains three stars without a position. HIP 115125 has V = 6.97, so it counts only for the
+    limit 7.
     """
     added = 2 if limit < 6.97 else 3
     assert len(STARS.brighter_than(limit)) == published - unplaced + added
@@ -73,7 +75,7 @@ def test_position_at_j2000_is_the_published_one(name: str) -> None:
 
 
 def test_61_cygni_moves_as_measured() -> None:
-    """The measured proper motion is 5.28" a year towards position angle 51.9 degrees."""
+    """61 Cygni moves by 5.28" per year towards the position angle 51.9 deg, as was measured."""
     star = _index(104214)
     a, b = STARS.directions_at(2000.0)[star], STARS.directions_at(2010.0)[star]
     assert _arcseconds(a, b) == pytest.approx(52.81, abs=0.02)

@@ -17,8 +17,7 @@ def test_every_named_star_is_in_the_catalogue_and_names_are_not_shared() -> None
 @pytest.mark.parametrize(
     ("name", "right_ascension_h", "declination_deg", "magnitude"),
     [
-        # Right ascension (h) and declination (deg), J2000, and V as in the Bright Star Catalogue, 5th
-        # edition.
+        # Right ascension (h), declination (deg) and V of the Bright Star Catalogue, 5th edition, J2000.
         ("Sirius", 6.7525, -16.716, -1.46),
         ("Vega", 18.6156, 38.784, 0.03),
         ("Polaris", 2.5303, 89.264, 2.02),

@@ -1,1 +1,1 @@
-"""Tests of the Earth, its field and orbits around it."""
+"""Tests of the Earth, its magnetic field and orbits around the Earth."""

@@ -1,4 +1,4 @@
-"""Tests of the drag torque on bodies other than boxes, computed from projected areas."""
+"""Tests of the drag torque on bodies that are not boxes, computed from projected areas."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ SPEED, DENSITY = 7_600.0, 1e-12
 
 @pytest.mark.parametrize("name", ["knightcube", "cubesat_3u"])
 def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> None:
-    """Coefficients fitted to the drag torque at ten attitudes also fit 190 other attitudes.
+    """Torque coefficients that are fitted at ten attitudes predict the drag torque at 190 other attitudes.
 
-    If the projected areas are ignored, the errors are more than twice as large.
+    Without the projected areas, the errors are more than twice as large.
     """
     craft = CRAFTS[name]
     faces = box(craft.size, ARM, np.zeros(6))

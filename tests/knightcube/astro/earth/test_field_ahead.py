@@ -1,4 +1,4 @@
-"""Tests of the incrementally predicted field against the full model along the orbit."""
+"""Tests of the incremental prediction of the field against the full model along the orbit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WHOLE = predict(STATE, 3600.0)
 
 
 def apart(ahead: FloatArray, since: float) -> FloatArray:
-    """Return the angles (n,), rad, between the predicted field and the field of the full model."""
+    """Return the angles (n,), rad, between the predicted field and the full model's field."""
     true = WHOLE.field_at(since + TIMES)
     across = np.linalg.norm(np.cross(ahead, true), axis=1)
     return np.asarray(np.arctan2(across, np.sum(ahead * true, axis=1)))

@@ -1,4 +1,4 @@
-"""Tests of the two field models against NOAA's published values and each other."""
+"""Tests of the two field models against NOAA's published values and against each other."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from knightcube.errors import UsageError
 from sim_hal.worlds import magnetic_field as true
 from tests.support import build_igrf
 
-# NOAA NCEI, WMM2025 test values (WMM2025_TEST_VALUES.txt in the PyPI package AHRS 0.4.0): year, height km,
-# latitude and longitude deg, north, east and down nT.
+# WMM2025 test values of NOAA NCEI (WMM2025_TEST_VALUES.txt in the PyPI package AHRS 0.4.0). The columns are
+# year, height (km), latitude and longitude (deg), and north, east and down (nT).
 NOAA = (
     (2025.0, 0.0, 80.0, 0.0, 6521.6, 145.9, 54791.5),
     (2025.0, 0.0, 0.0, 120.0, 39677.8, -109.6, -10580.2),
@@ -38,7 +38,7 @@ def julian_date(year: float) -> float:
 
 @pytest.mark.parametrize("row", NOAA)
 def test_the_field_on_board_is_the_one_that_was_published(row: tuple[float, ...]) -> None:
-    """The tolerance of 0.06 nT is half the last digit plus rounding."""
+    """The field of the flight software equals NOAA's values to 0.06 nT, half the last digit plus rounding."""
     year, height, latitude, longitude, *published = row
     found = believed.field_on_ground_axes(year, np.radians(latitude), np.radians(longitude), 1e3 * height)
     np.testing.assert_allclose(1e9 * found, published, atol=0.06)
@@ -46,7 +46,10 @@ def test_the_field_on_board_is_the_one_that_was_published(row: tuple[float, ...]
 
 @pytest.mark.parametrize("row", NOAA)
 def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tuple[float, ...]) -> None:
-    """IGRF-14 at NOAA's points is computed from positions and converted back to the ellipsoid's axes."""
+    """The fields of IGRF-14 and WMM2025 at NOAA's points differ as expected of two models.
+
+    IGRF-14 is computed from positions, and converted back to the axes of the ellipsoid.
+    """
     year, height, latitude, longitude, *published = row
     up, along = np.radians(latitude), np.radians(longitude)
     a, f = 6_378_137.0, 1.0 / 298.257223563
@@ -65,7 +68,7 @@ def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tup
 
 
 def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
-    """At 400 km, from 2025 to 2029.9, the models agree within 40 nT and 0.15 deg, and to 10 nT on average."""
+    """At 400 km, 2025 to 2029.9, both models agree within 40 nT and 0.15 deg, and to 10 nT on average."""
     rng = np.random.default_rng(5)
     away = rng.standard_normal((60, 3))
     positions = 6.778e6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
@@ -80,7 +83,10 @@ def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
 
 
 def test_the_true_field_has_no_sources_and_no_currents() -> None:
-    """Divergence and curl, by central differences over 20 km, are below 1e-6 of the field's gradient."""
+    """The true field has no divergence and no curl: both are below 1e-4 of the gradient of the field.
+
+    The derivatives are central differences over 20 km.
+    """
     place, step = np.array([3.1e6, -4.2e6, 4.3e6]), 2e4
     slope = np.empty((3, 3))
     for axis in range(3):
@@ -104,8 +110,8 @@ def test_the_ring_current_weakens_the_field_at_the_magnetic_equator() -> None:
     quiet = true.ring_current(DATE, 20e-9)
     assert np.linalg.norm(quiet) == pytest.approx(20e-9)
     north = celestial_to_terrestrial(DATE) @ quiet
-    # The dipole's pole of 2025 is at 80.8 N, 72.8 W (IGRF-14); the field of the ring current points away from
-    # it.
+    # The dipole's pole of 2025 is at 80.8 N, 72.8 W (IGRF-14). The field of the ring current points away from
+    # this pole.
     _, latitude, _ = geodetic(-7e6 * north / np.linalg.norm(north))
     assert np.degrees(float(latitude)) == pytest.approx(80.8, abs=0.4)
 
@@ -151,7 +157,7 @@ def test_the_builder_refuses_a_text_that_is_not_a_table_of_the_field() -> None:
 
 
 def test_the_stored_table_is_the_builder_s() -> None:
-    """The columns have the builder's order, so the published dipole of 2025 is in the expected columns."""
+    """The stored table has the builder's columns, so the published dipole of 2025 is in the right columns."""
     with np.load(true.TABLE) as stored:
         epochs, table = stored["epoch"], stored["coefficient"]
     assert epochs.tolist() == [2000, 2005, 2010, 2015, 2020, 2025, 2030]
@@ -161,9 +167,10 @@ def test_the_stored_table_is_the_builder_s() -> None:
 
 
 def test_many_positions_give_exactly_the_fields_of_each() -> None:
-    """Positions range from below the ground to the geostationary orbit.
+    """An array of positions gives exactly the fields of the single positions.
 
-    Dates include years after the model's.
+    Positions range from below the ground to the geostationary orbit. Some dates are after the model's last
+    year.
     """
     generator = np.random.default_rng(3)
     directions = generator.normal(size=(100, 3))

@@ -1,4 +1,4 @@
-"""Tests of elements that are fitted to positions of SGP4 and of another orbit model."""
+"""Tests of elements that are fitted to positions by SGP4 and by another orbit model."""
 
 from __future__ import annotations
 
@@ -51,15 +51,15 @@ def test_an_orbit_with_oblateness_is_fitted_to_a_kilometre_over_a_day(orbit: Orb
 
 
 def test_a_short_arc_of_fixes_with_velocities_tells_how_far_it_can_be_trusted() -> None:
-    """With ten minutes of fixes, the error after a day is at most a few stated standard deviations."""
+    """A day later, elements from ten minutes of fixes have errors of at most a few stated deviations."""
     known, rng = TwoLineElements(*LINES), np.random.default_rng(4)
     dates = DATE + np.arange(0.0, 600.0, 10.0) / 86_400.0
     states = [known.at(float(date)) for date in dates]
     positions = np.array([state.position for state in states]) + rng.normal(0.0, 5.0, (60, 3))
     velocities = np.array([state.velocity for state in states]) + rng.normal(0.0, 0.05, (60, 3))
     made, without = fit_elements(dates, positions, velocities), fit_elements(dates, positions)
-    # The residual consists of noise of 8.7 m and of 12 m due to the rounding of angles to 1e-4 deg in the
-    # columns.
+    # The residual consists of 8.7 m of noise, and of 12 m that are due to angles with a resolution of 1e-4
+    # deg in the columns.
     assert 7.0 < made.rms < 14.0
     for fitted in (made, without):
         later = TwoLineElements(*fitted.lines).at(DATE + 1.0).position

@@ -1,4 +1,4 @@
-"""Tests of mean elements as CelesTrak and Space-Track publish them, and of refused element sets."""
+"""Tests of mean elements in the formats of CelesTrak and Space-Track, and of refused element sets."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ METADATA = {
 
 
 def with_columns(line: str, first: int, text: str) -> str:
-    """Return a line with `text` from column `first` on, and its checksum."""
+    """Return a line of elements with `text` from the column `first` on, and with the right checksum."""
     return summed(line[: first - 1] + text + line[first - 1 + len(text) :])
 
 
@@ -102,7 +102,7 @@ FORMS = {"json": as_json, "strings": as_strings, "csv": as_csv, "kvn": as_kvn, "
 
 
 def far(one: tuple[str, str], other: tuple[str, str], days: float = 1.0) -> float:
-    """Return the distance (m) between two element sets' positions, some days after the first one's epoch."""
+    """Return the distance (m) of two element sets' positions, some days after the epoch of the first set."""
     first, second = TwoLineElements(*one), TwoLineElements(*other)
     date = first.epoch + days
     return float(np.linalg.norm(first.at(date).position - second.at(date).position))
@@ -293,7 +293,10 @@ def test_any_damaged_text_of_elements_is_refused_in_one_line_or_read(
 
 
 def test_the_uncertainty_covers_an_error_of_the_drag_term() -> None:
-    """Elements with B* 0 for an orbit with B* 5e-4 have errors of 226 km after 6 days, 5514 km after 30."""
+    """The uncertainty covers the error of elements with B* 0 for an orbit with B* 5e-4.
+
+    The error is 226 km after 6 days and 5514 km after 30 days.
+    """
     lines = (
         "1 99001U 26001A   26320.50000000  .00000000  00000-0  00000+0 0  9995",
         "2 99001  97.4640 337.4170 0011973 295.7805  64.3547 15.30000000000102",

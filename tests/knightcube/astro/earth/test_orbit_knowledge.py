@@ -20,13 +20,13 @@ from sim_hal.worlds.orbit import KeplerianElements, propagate
 from tests.support.orbit_elements import summed
 
 DATE = 2_461_365.8
-# Vallado et al., AIAA 2006-6753, the verification set: satellite 00005.
+# Satellite 00005 of the verification set of Vallado et al., AIAA 2006-6753.
 FIRST = "1 00005U 58002B   00179.78495062  .00000023  00000-0  28098-4 0  4753"
 SECOND = "2 00005  34.2682 348.7242 1859667 331.7664  19.3264 10.82419157413667"
 
 
 def test_two_line_elements_give_the_published_state() -> None:
-    """The expected TEME state (km, km/s) at the epoch is SGP4-VER's first line of satellite 00005."""
+    """At the epoch, the elements of satellite 00005 give the TEME state of SGP4-VER's first line."""
     epoch = 2_451_722.5 + 0.78495062
     state = TwoLineElements(FIRST, SECOND).at(epoch)
     to_teme = mean_equator_to_celestial(epoch).T
@@ -39,9 +39,10 @@ def test_two_line_elements_give_the_published_state() -> None:
 
 
 def test_the_frame_of_sgp4_is_turned_into_the_frame_of_the_stars_as_published() -> None:
-    """Vallado, Fundamentals of Astrodynamics, Example 3-15: 2004 April 6, 07:51:28.386009 UTC, to 40 m.
+    """The conversion from TEME to ICRS agrees with Vallado, Fundamentals of Astrodynamics, Ex. 3-15, to 40 m.
 
-    UT1 - UTC is -0.4399619 s; the neglected polar motion is 10 m.
+    The date is 2004 April 6, 07:51:28.386009 UTC. UT1 - UTC is -0.4399619 s. The neglected polar motion is 10
+    m.
     """
     date = 2_453_101.5 + (7.0 * 3600.0 + 51.0 * 60.0 + 28.386009) / 86_400.0
     teme = 1e3 * np.array([5094.18016210, 6127.64465950, 6380.34453270])
@@ -49,8 +50,8 @@ def test_the_frame_of_sgp4_is_turned_into_the_frame_of_the_stars_as_published() 
     np.testing.assert_allclose(mean_equator_to_celestial(date, -0.4399619) @ teme, celestial, atol=40.0)
     terrestrial = 1e3 * np.array([-1033.4793830, 7901.2952754, 6380.3565958])
     found = celestial_to_terrestrial(date, -0.4399619) @ celestial
-    # In 2004 TT was 64.184 s ahead of UTC, not 69.184 s; the difference hardly affects precession and
-    # nutation.
+    # In 2004, TT was 64.184 s ahead of UTC, and not 69.184 s as assumed. The difference hardly changes
+    # precession and nutation.
     np.testing.assert_allclose(found, terrestrial, atol=40.0)
 
 
@@ -85,13 +86,16 @@ def fix_of(state: FloatArray, date: float, **spread: float) -> GpsFix:
 
 
 def test_a_fix_carried_on_is_where_another_integrator_has_the_satellite() -> None:
-    """The Dormand-Prince integrator of sim_hal agrees to 20 m and 0.02 m/s after 20 minutes."""
+    """A fix that is propagated for 20 minutes agrees with another integrator to 20 m and 0.02 m/s.
+
+    The other integrator is the Dormand-Prince integrator of sim_hal.
+    """
     elements = KeplerianElements(
         semi_major_axis=EARTH_RADIUS + 380e3, eccentricity=0.002, inclination=0.9, ascending_node=1.0
     )
     begin, end = propagate(elements, 1300.0).states_at(np.array([0.0, 1200.0]))
     found = fix_of(begin, DATE).at(DATE + 1200.0 / 86_400.0)
-    # The resolution of a Julian date is 40 us, or 0.3 m along the orbit.
+    # A Julian date is resolved to 40 us, which is 0.3 m along the orbit.
     np.testing.assert_allclose(found.position, end[:3], atol=20.0)
     np.testing.assert_allclose(found.velocity, end[3:], atol=0.02)
     assert found.sigma > 100.0
@@ -119,7 +123,7 @@ def test_lines_that_are_not_elements_are_refused() -> None:
 
 @pytest.mark.parametrize("day", ["000.50000000", "367.00000000", "999999999999"])
 def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
-    """A position 1e12 days from the epoch must be refused, because stepping there would never end."""
+    """An epoch with an impossible day of the year is refused. Steps over 1e12 days would never end."""
     first = FIRST[:20] + day + FIRST[32:]
     high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
     with pytest.raises(UsageError, match="day of the year of the epoch"):
@@ -127,7 +131,10 @@ def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
 
 
 def test_a_decayed_orbit_is_reported() -> None:
-    """Satellite 28872 of the verification set decays within 50 minutes of its epoch according to SGP4."""
+    """The decay of satellite 28872 of the verification set is reported.
+
+    By SGP4, it decays within 50 minutes.
+    """
     first = "1 28872U 05037B   05333.02012661  .25992681  00000-0  24476-3 0  1534"
     second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"
     with pytest.raises(OrbitError, match="SGP4"):

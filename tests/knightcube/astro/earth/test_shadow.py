@@ -1,4 +1,4 @@
-"""Tests of the Earth's shadow against tangents of two spheres and against rays to the Sun's disc."""
+"""Tests of the Earth's shadow against tangents of two spheres, and against rays from the Sun's disc."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ def _behind(depth: float, aside: float) -> FloatArray:
 
 @pytest.mark.parametrize("depth", [3000e3, 6500e3, 42_164e3, 384_400e3])
 def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
-    """The expected widths follow from the radii by similar triangles, to first order in the cone angle."""
+    """Umbra and penumbra have the widths that follow from the radii by similar triangles.
+
+    The widths are computed to first order in the cone angle.
+    """
     inner = np.arcsin((SUN_RADIUS - EARTH_RADIUS) / ASTRONOMICAL_UNIT)
     outer = np.arcsin((SUN_RADIUS + EARTH_RADIUS) / ASTRONOMICAL_UNIT)
     umbra = EARTH_RADIUS / np.cos(inner) - depth * np.tan(inner)
@@ -34,7 +37,10 @@ def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
 
 
 def test_the_umbra_ends_where_hipparchus_had_it() -> None:
-    """Beyond 1.38 million km the Sun is a ring, whose area is the difference of both discs."""
+    """The umbra ends 1.38 million km behind the Earth.
+
+    Farther away, the visible part of the Sun is a ring, whose area is the difference of both discs.
+    """
     tip = EARTH_RADIUS * ASTRONOMICAL_UNIT / (SUN_RADIUS - EARTH_RADIUS)
     assert tip == pytest.approx(1.384e9, rel=2e-3)
     assert sunlit_share(_behind(0.999 * tip, 0.0), SUN) == 0.0
@@ -46,7 +52,7 @@ def test_the_umbra_ends_where_hipparchus_had_it() -> None:
 @pytest.mark.parametrize("share_of_way", [0.1, 0.3, 0.5, 0.8])
 @pytest.mark.parametrize("depth", [2500e3, 42_164e3])
 def test_in_penumbra_the_share_is_that_of_rays_that_pass_the_earth(depth: float, share_of_way: float) -> None:
-    """The expected share is the share of 200,000 rays from the Sun's disc that the Earth does not block."""
+    """In penumbra, the sunlit fraction is that of 200,000 rays from the Sun's disc that pass the Earth."""
     width = depth * 2.0 * SUN_RADIUS / ASTRONOMICAL_UNIT
     middle = EARTH_RADIUS + depth * EARTH_RADIUS / ASTRONOMICAL_UNIT
     position = _behind(depth, middle + (share_of_way - 0.5) * width)
@@ -71,9 +77,9 @@ def test_between_earth_and_sun_it_is_day_everywhere() -> None:
 
 
 def test_the_cylinder_is_as_wide_as_the_earth() -> None:
-    """By the errata to 2.15, the position is the object's.
+    """The edge of the cylindrical shadow is one Earth radius from its axis, at any distance behind the Earth.
 
-    At any distance behind the Earth, the edge of the shadow is one Earth radius from its axis.
+    By the errata to equation 2.15, the position is that of the object.
     """
     for depth in (1000e3, 42_164e3):
         assert sunlit_share(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical") == 0.0
@@ -81,7 +87,10 @@ def test_the_cylinder_is_as_wide_as_the_earth() -> None:
 
 
 def test_cone_and_cylinder_agree_outside_the_penumbra() -> None:
-    """The penumbra covers 0.42 % of a sphere of 7078 km: a ring 28.5 km wide, 6378 km from the axis."""
+    """Cone and cylinder agree outside the penumbra, which covers 0.42 % of a sphere of 7078 km.
+
+    The penumbra is a ring with a width of 28.5 km, at 6378 km from the axis.
+    """
     rng = np.random.default_rng(4)
     positions = rng.normal(size=(20_000, 3))
     positions *= 7078e3 / np.linalg.norm(positions, axis=1, keepdims=True)
