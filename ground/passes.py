@@ -25,7 +25,7 @@ from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_from_sun, julian_date, sunlit_share
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 _SEARCH_S = 3600.0
 """Time (s) by which the search extends beyond the span, so that passes at its ends are found completely."""

@@ -21,7 +21,7 @@ from knightcube.vision.camera.images import EXTRA
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.horizon.illumination import limb_rays
 from knightcube.vision.horizon.nadir import HorizonSolution
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solve import FrameSolution
 

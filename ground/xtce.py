@@ -28,7 +28,7 @@ from flight.link.process.directives import NEW_KEY, PORTION
 from flight.link.telemetry.definitions import STAGES
 from flight.link.telemetry.fields import NO_YES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
-from knightcube.gnc.guidance.three_axes.pointing_target import (
+from knightcube.gnc.guidance.pointing_target import (
     ARGUMENTS,
     NUMBERS,
     ROLLS,

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from knightcube.errors import InputError as InputError
     from knightcube.errors import PlanningError as PlanningError
     from knightcube.errors import UsageError as UsageError
-    from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant as SingleAxisPlant
-    from knightcube.gnc.guidance.one_axis.vmc import plan_step as plan_step
-    from knightcube.gnc.guidance.three_axes.pointing_target import Goal as Goal
-    from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget as PointingTarget
-    from knightcube.gnc.guidance.three_axes.slew_plan import plan_slew as plan_slew
+    from knightcube.gnc.guidance.plant import SingleAxisPlant as SingleAxisPlant
+    from knightcube.gnc.guidance.pointing_target import Goal as Goal
+    from knightcube.gnc.guidance.pointing_target import PointingTarget as PointingTarget
+    from knightcube.gnc.guidance.slew_plan import plan_slew as plan_slew
+    from knightcube.gnc.guidance.vmc import plan_step as plan_step
     from knightcube.vision.camera.images import read_image as read_image
     from knightcube.vision.camera.lens import Lens as Lens
     from knightcube.vision.camera.lens import Pinhole as Pinhole
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from knightcube.vision.sun import find_sun as find_sun
 
 _MODULE_OF = {
-    "Goal": "knightcube.gnc.guidance.three_axes.pointing_target",
+    "Goal": "knightcube.gnc.guidance.pointing_target",
     "HorizonKnowledge": "knightcube.vision.horizon.settings",
     "InputError": "knightcube.errors",
     "Lens": "knightcube.vision.camera.lens",
@@ -57,8 +57,8 @@ _MODULE_OF = {
     "MatchedStars": "knightcube.vision.star_tracker",
     "Pinhole": "knightcube.vision.camera.lens",
     "PlanningError": "knightcube.errors",
-    "PointingTarget": "knightcube.gnc.guidance.three_axes.pointing_target",
-    "SingleAxisPlant": "knightcube.gnc.guidance.one_axis.plant",
+    "PointingTarget": "knightcube.gnc.guidance.pointing_target",
+    "SingleAxisPlant": "knightcube.gnc.guidance.plant",
     "StarSolution": "knightcube.vision.star_tracker",
     "StarTracker": "knightcube.vision.star_tracker",
     "UsageError": "knightcube.errors",
@@ -70,8 +70,8 @@ _MODULE_OF = {
     "magnetic_field": "knightcube.astro.almanac",
     "magnetic_field_on_ground": "knightcube.astro.almanac",
     "orbit_state": "knightcube.astro.almanac",
-    "plan_slew": "knightcube.gnc.guidance.three_axes.slew_plan",
-    "plan_step": "knightcube.gnc.guidance.one_axis.vmc",
+    "plan_slew": "knightcube.gnc.guidance.slew_plan",
+    "plan_step": "knightcube.gnc.guidance.vmc",
     "propagate_elements": "knightcube.astro.almanac",
     "propagate_orbit": "knightcube.astro.almanac",
     "read_image": "knightcube.vision.camera.images",

@@ -49,9 +49,8 @@ from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
-from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.estimation.measurements import MeanRateMeasurement
-from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.estimation.estimate import Estimate, MeanRateMeasurement
+from knightcube.gnc.guidance.pointing_target import PointingTarget
 
 DUE_NS = 60_000_000_000
 """Time (ns) after which a target should have been reached."""

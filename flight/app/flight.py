@@ -90,10 +90,10 @@ from knightcube.vision.camera.lens import CameraKnowledge, Exposures
 from knightcube.vision.frame_job import StreakEstimator, TrackerSettings
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
-from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.index.build import ensure_default_index
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
 if TYPE_CHECKING:

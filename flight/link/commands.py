@@ -42,8 +42,8 @@ from flight.link.telemetry.packets import (
     to_text,
 )
 from knightcube.errors import FlightError, UsageError, shown
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
+from knightcube.gnc.guidance.plant import Q2_LIMIT
+from knightcube.gnc.guidance.pointing_target import NUMBERS, Goal, PointingTarget
 
 _MODES = tuple((int(mode), mode.label) for mode in COMMANDABLE if mode is not Mode.SLEW)
 _NUMBERS = (

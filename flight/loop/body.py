@@ -23,9 +23,14 @@ from flight.schema.sections import Config
 from hal.interfaces.devices import CoilState, Frame, GpsReading, ImuReading, StringReading
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState
-from knightcube.gnc.estimation.estimate import Estimate, Knowledge
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
-from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.estimation.estimate import (
+    AttitudeMeasurement,
+    Estimate,
+    Knowledge,
+    MeanRateMeasurement,
+    Measurement,
+)
+from knightcube.gnc.guidance.pointing_target import PointingTarget
 from knightcube.gnc.tracker import Track
 from knightcube.vision.frame_job import StreakEstimator
 from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult

@@ -456,7 +456,7 @@ class CoilMonitor:
 
     @property
     def available(self) -> BoolArray:
-        """Flags (n,) of the axes with a coil that is not broken, for `knightcube.gnc.control.allocation`."""
+        """Flags (n,) of the axes with a coil that is not broken, for `knightcube.gnc.control.coil_map`."""
         broken = self._verdicts.keys() | self._settings.absent
         return np.array([axis not in broken for axis in range(len(self._trials))])
 

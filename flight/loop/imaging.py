@@ -36,8 +36,14 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Knowledge
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    RATE,
+    AttitudeMeasurement,
+    Estimate,
+    Knowledge,
+    MeanRateMeasurement,
+)
 from knightcube.gnc.tracker import (
     FrameSightings,
     ObjectTracker,
@@ -54,7 +60,6 @@ from knightcube.vision.objects.settings import (
     MeasuredObjects,
     ObjectMeasurementSettings,
 )
-from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import (
     NODES,
     AttitudePrior,
@@ -64,6 +69,7 @@ from knightcube.vision.startracker.solve import (
     middle_covariance,
     weighting_of,
 )
+from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.geometry import Course
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus

@@ -29,7 +29,7 @@ from flight.schema.document import ConfigError
 from flight.schema.sections import Modes
 from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarget
+from knightcube.gnc.guidance.pointing_target import SUN, PointingTarget
 
 
 class Trigger(Enum):

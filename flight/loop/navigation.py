@@ -35,8 +35,7 @@ from hal.interfaces.devices import (
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
+from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Estimate, Measurement
 
 _AT_A_TIME = 16
 """Number of filter updates that one control cycle repeats after a late measurement, which takes a few ms.

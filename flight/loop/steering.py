@@ -27,7 +27,7 @@ from flight.loop.facts import Services
 from flight.schema.sections import Modes
 from hal.interfaces.devices import NO_AXES, Axes, CoilState, ImuReading, PowerMonitor, TorqueCoils
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.allocation import allocate
+from knightcube.gnc.control.coil_map import allocate
 from knightcube.gnc.estimation.estimate import Estimate
 
 

@@ -23,7 +23,7 @@ from flight.schema.values import (
     inertia_matrix,
 )
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.guidance.pointing_target import PointingTarget
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """Range of valid magnetometer readings, T.

@@ -11,8 +11,8 @@ import numpy as np
 from msgspec import Meta
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from knightcube.gnc.guidance.three_axes.pointing_target import ROLLS, Goal, PointingTarget
+from knightcube.gnc.guidance.plant import Q2_LIMIT
+from knightcube.gnc.guidance.pointing_target import ROLLS, Goal, PointingTarget
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]

@@ -14,7 +14,7 @@ from ground.bringup.diagnosis import UNRECOGNISED, Finding
 from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.vision.lens_calibration import MIN_STARS, calibrate_lens
-from knightcube.vision.startracker.detection.detect import detect
+from knightcube.vision.startracker.detect import detect
 
 _FRAMES = 3
 _LENS_FRAMES = 6

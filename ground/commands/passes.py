@@ -17,7 +17,7 @@ from ground.commands.elements import read_file
 from ground.commands.options import finite, positive, utc
 from ground.report.text import number, table
 from knightcube.errors import FlightError, UsageError
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal
+from knightcube.gnc.guidance.pointing_target import Goal
 
 if TYPE_CHECKING:
     from ground.passes import OrbitPrediction, Pass, Station

@@ -22,13 +22,13 @@ from knightcube import plan_slew, plan_step
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, PathCost, SingleAxisPlant, angle_of
-from knightcube.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, StepPlan
-from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import HORIZON_RANGE as SLEW_HORIZON_RANGE
-from knightcube.gnc.guidance.three_axes.slew_model import MINIMUM_TIME, BoresightEnd
-from knightcube.gnc.guidance.three_axes.slew_model import NODES as SLEW_NODES
-from knightcube.gnc.guidance.three_axes.slew_plan import STRETCH, OrderedSlew, SlewStatus
+from knightcube.gnc.guidance.plant import Q2_LIMIT, PathCost, SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.pointing_target import NUMBERS, Goal, PointingTarget
+from knightcube.gnc.guidance.slew_model import HORIZON_RANGE as SLEW_HORIZON_RANGE
+from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, BoresightEnd
+from knightcube.gnc.guidance.slew_model import NODES as SLEW_NODES
+from knightcube.gnc.guidance.slew_plan import STRETCH, OrderedSlew, SlewStatus
+from knightcube.gnc.guidance.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, StepPlan
 
 BODIES: tuple[Literal["sun", "earth", "moon"], ...] = ("sun", "earth", "moon")
 _OFF_UNIT = 0.1

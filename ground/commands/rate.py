@@ -17,8 +17,8 @@ from ground.commands.options import add_field, add_output, add_picture, finite, 
 from ground.pictures import draw_marks
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
-from knightcube.reference.corner_streaks.rate import estimate_rate
-from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.reference.corner_streak_rate import estimate_rate
+from knightcube.reference.corner_streaks import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import SpaceObject, detect_objects

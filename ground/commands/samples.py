@@ -17,8 +17,8 @@ from flight.schema.devices import camera_model
 from ground.commands.options import add_field
 from knightcube.errors import UsageError
 from knightcube.vision.star_tracker import field_of_view
+from knightcube.vision.startracker.index import save
 from knightcube.vision.startracker.index.build import DEFAULT, IndexSettings, build
-from knightcube.vision.startracker.index.sky_index import save
 
 
 def configure_samples(parser: argparse.ArgumentParser) -> None:

@@ -90,7 +90,7 @@ from ground.link.commanding import command as send
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, text_of
 from knightcube.errors import FlightError, UsageError, shown
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 Object = dict[str, Any]
 _Words: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"

@@ -41,9 +41,8 @@ from knightcube.vision.star_tracker import (
     StarTracker,
     field_of_view,
 )
-from knightcube.vision.startracker.detection import DetectionSettings
-from knightcube.vision.startracker.detection.survey import CENTROIDS
 from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
 IMAGE = "image"

@@ -15,7 +15,7 @@ from flight.link.telemetry.packets import LAYOUTS, Layout
 from flight.loop.facts import FACTS
 from ground.documentation import command_table
 from hal.interfaces.devices import COIL_NAMES
-from knightcube.gnc.guidance.three_axes.pointing_target import ARGUMENTS, NUMBERS, ROLLS, Goal
+from knightcube.gnc.guidance.pointing_target import ARGUMENTS, NUMBERS, ROLLS, Goal
 
 Object = dict[str, Any]
 Body = Literal["testbed", "orbit"]

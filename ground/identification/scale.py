@@ -76,7 +76,7 @@ class ScaledValue:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsolutePlant:
-    """Absolute constants of the plant in `knightcube.gnc.guidance.one_axis.plant`, with uncertainties.
+    """Absolute constants of the plant in `knightcube.gnc.guidance.plant`, with uncertainties.
 
     Attributes:
         inertia: kg m^2.

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from ground.identification.fit import PlantFit
     from ground.identification.record import Record
     from ground.passes import OrbitPrediction, Station
-    from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-    from knightcube.gnc.guidance.one_axis.vmc import StepPlan
-    from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder
+    from knightcube.gnc.guidance.plant import SingleAxisPlant
+    from knightcube.gnc.guidance.slew_plan import OrderedSlew, SlewOrder
+    from knightcube.gnc.guidance.vmc import StepPlan
 
 __all__ = [
     "draw",

@@ -21,8 +21,8 @@ from ground.telemetry import Run, text_of
 if TYPE_CHECKING:  # imported only for types, because these modules import the optimiser
     from ground.identification.fit import PlantFit
     from ground.identification.record import Record
-    from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-    from knightcube.gnc.guidance.one_axis.vmc import StepPlan
+    from knightcube.gnc.guidance.plant import SingleAxisPlant
+    from knightcube.gnc.guidance.vmc import StepPlan
 
 DPI = 110
 WIDE = (11.0, 5.2)

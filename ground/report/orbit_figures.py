@@ -34,8 +34,8 @@ from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.guidance.three_axes.slew_model import Cone, heat_matrix, shown
-from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
+from knightcube.gnc.guidance.slew_model import Cone, heat_matrix, shown
+from knightcube.gnc.guidance.slew_plan import OrderedSlew, SlewOrder, SlewStatus
 
 SPIN_MARGIN = 0.2
 """Time shown before and after detumbling, as a fraction of the duration of detumbling."""

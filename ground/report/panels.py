@@ -31,7 +31,7 @@ from ground.report.signals import (
 )
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.one_axis.plant import lgl_rule
+from knightcube.gnc.guidance.plant import lgl_rule
 
 BLACK, GREY = "#222222", "#8a8a8a"
 BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"

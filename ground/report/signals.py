@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from knightcube.gnc.guidance.one_axis.plant import steady_heat, supply_power
+from knightcube.gnc.guidance.plant import steady_heat, supply_power
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 Object = dict[str, Any]

@@ -33,7 +33,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis import CurrentCommand, attitude_error
-from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant
+from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant
 
 
 @dataclass(frozen=True, slots=True)

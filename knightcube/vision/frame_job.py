@@ -32,16 +32,9 @@ from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import FieldPoints, MeasuredObjects, ObjectMeasurementSettings
-from knightcube.vision.startracker.detection import (
-    DetectionSettings,
-    FrameKind,
-    Survey,
-    measure_areas,
-    survey,
-)
-from knightcube.vision.startracker.index import sky_index
+from knightcube.vision.startracker.detect import measure_areas
+from knightcube.vision.startracker.index import SkyIndex, load_once
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.sky_map import ShortTrails
 from knightcube.vision.startracker.solve import (
     MOVED,
@@ -54,6 +47,7 @@ from knightcube.vision.startracker.solve import (
     solve_near,
     solve_points,
 )
+from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Survey, survey
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS
 from knightcube.vision.streaks.distorted_pinhole import streak_pinhole
 from knightcube.vision.streaks.settings import LikelihoodSettings
@@ -286,7 +280,7 @@ def _sky(tracker: TrackerSettings | None) -> tuple[SkyIndex | None, str]:
     if tracker is None:
         return None, ""
     try:
-        return (default_index() if tracker.index is None else sky_index.load_once(tracker.index)), ""
+        return (default_index() if tracker.index is None else load_once(tracker.index)), ""
     except (FlightError, OSError) as error:
         return None, f"stars are not identified: {error}"
 

@@ -33,7 +33,7 @@ from knightcube.vision.camera.lens import (
     Lens,
     LensError,
 )
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.sky_map import apparent
 from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.streak_result import StreakStatus

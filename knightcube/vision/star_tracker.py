@@ -22,9 +22,8 @@ from knightcube.vision.camera.images import grey_image
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.frame_job import found_in_image
 from knightcube.vision.lens_knowledge import LensKnowledge
-from knightcube.vision.startracker.detection import FrameKind
+from knightcube.vision.startracker.index import SkyIndex, load_once
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
 from knightcube.vision.startracker.sky_map import ASPECT, Pointing, SkyMap
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -33,6 +32,7 @@ from knightcube.vision.startracker.solve import (
     SolveSettings,
     SolveStatus,
 )
+from knightcube.vision.startracker.survey import FrameKind
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0

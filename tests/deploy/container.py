@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from knightcube.vision.startracker.index.sky_index import PATH
+from knightcube.vision.startracker.index import PATH
 from tests.hal.guardian.live_flight import ROOT, write_config
 
 LIMIT_S = 1500.0

@@ -24,7 +24,7 @@ from flight.loop.body import SteeringState
 from flight.loop.facts import FACTS, StreamState
 from ground import documentation
 from ground.xtce import document, main, spread
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal
+from knightcube.gnc.guidance.pointing_target import Goal
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.support.xtce_fields import compare, definition_of, shifted
 

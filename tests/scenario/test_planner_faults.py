@@ -17,10 +17,10 @@ from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis import vmc as plan_job
-from knightcube.gnc.guidance.one_axis.plant import PolynomialPath
-from knightcube.gnc.guidance.one_axis.vmc import PlanJob, StepPlan
-from knightcube.gnc.guidance.one_axis.vmc import plan as make_plan
+from knightcube.gnc.guidance import vmc as plan_job
+from knightcube.gnc.guidance.plant import PolynomialPath
+from knightcube.gnc.guidance.vmc import PlanJob, StepPlan
+from knightcube.gnc.guidance.vmc import plan as make_plan
 from tests.scenario.mode_flights import released
 from tests.support.flights import demo_config, event_names, fly, thesis_config
 

@@ -12,7 +12,7 @@ from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.one_axis.plant import angle_of
+from knightcube.gnc.guidance.plant import angle_of
 from tests.scenario.mode_flights import released
 from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_config
 

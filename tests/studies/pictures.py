@@ -24,7 +24,7 @@ from ground.report import draw, draw_path
 from ground.telemetry import read_run
 from knightcube.astro import catalogue
 from knightcube.astro.quaternion import about_axis_y, from_rotation_vector, multiply
-from knightcube.gnc.guidance.one_axis.vmc import plan
+from knightcube.gnc.guidance.vmc import plan
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir

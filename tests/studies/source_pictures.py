@@ -41,10 +41,9 @@ from ground.report.figures import path_figure
 from ground.telemetry import Run
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.gnc.guidance.one_axis.vmc import plan
-from knightcube.reference.corner_streaks.detectors import cornerness
-from knightcube.reference.corner_streaks.rate import estimate_rate
-from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.gnc.guidance.vmc import plan
+from knightcube.reference.corner_streak_rate import cornerness, estimate_rate
+from knightcube.reference.corner_streaks import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import lengths, olae_residuals, slopes, star_ends
 from knightcube.vision.objects.streak_ends import centre_of_rotation, measure_streaks, segment_frame

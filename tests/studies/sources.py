@@ -25,11 +25,11 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.reference import image_matching
-from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES
+from knightcube.reference.corner_streaks import DETECTOR_NAMES
 from knightcube.reference.star_identification import (
     DEFAULT,
     Propose,
+    match_images,
     propose_angles,
     propose_families,
     propose_pyramids,
@@ -147,10 +147,8 @@ def image_matching_errors(runs: int, seed: int) -> Rows:
                 field, prior = drawn.field(), multiply(from_rotation_vector(turn), drawn.attitude)
                 matched = field.direction, stars.direction[drawn.star], field.sigma
                 for number, turns in off.items():
-                    if number:
-                        fix = image_matching.solve(*matched, prior, number)
-                    else:
-                        fix = SOLVERS["davenport"](*matched)
+                    optimal = SOLVERS["davenport"](*matched)
+                    fix = match_images(*matched, prior, number) if number else optimal
                     turns.append(to_rotation_vector(multiply(fix.quaternion, conjugate(drawn.attitude))))
             rms = [_ARCSECONDS * float(np.sqrt(np.mean(np.square(each)))) for each in off.values()]
             rows.append([f"{field_deg:g}", f"{prior_deg:g}", *(_number(each) for each in rms)])

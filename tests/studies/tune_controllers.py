@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from knightcube.gnc.control.one_axis import AngleController
-from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant, angle_of
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.support.thread_loop import BELIEVED, PERIOD
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray, Image, IntArray
-from knightcube.vision.startracker.detection import Detections, DetectionSettings, detect
-from knightcube.vision.startracker.detection.survey import Method
+from knightcube.vision.startracker.detect import Detections, detect
+from knightcube.vision.startracker.survey import DetectionSettings, Method
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 

@@ -7,7 +7,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.pointing_path import CostToGo, SweepCost, linearised, sweep
 from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights, step_costs
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
+from knightcube.gnc.guidance.attitude_law import AttitudeReferences
 
 
 def table_along(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flight.schema.testbed import TestbedConfig
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.plant import SingleAxisPlant, angle_of
 from sim_hal.settings import Simulation
 from tests.support.collocation_oracle import Slew, solve
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.gnc.control.pointing_table import PointingWeights
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
+from knightcube.gnc.guidance.attitude_law import BodyAxes
 
 AXES = BodyAxes(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
 

@@ -13,7 +13,7 @@ from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import from_rotation_vector, multiply, normalise
-from knightcube.gnc.guidance.three_axes.slew_model import (
+from knightcube.gnc.guidance.slew_model import (
     AttitudeEnd,
     EndLaw,
     SlewCraft,
@@ -21,7 +21,7 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
     along,
     cones,
 )
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan
+from knightcube.gnc.guidance.slew_plan import SlewPlan
 from tests.support.recorded_slews import matrix
 
 CRAFT = {

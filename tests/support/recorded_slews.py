@@ -16,14 +16,14 @@ import pytest
 from numpy.polynomial import chebyshev
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.three_axes.slew_model import (
+from knightcube.gnc.guidance.slew_model import (
     AttitudeEnd,
     EnvironmentAt,
     SlewCraft,
     SlewEnvironment,
     SlewTask,
 )
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan
+from knightcube.gnc.guidance.slew_plan import SlewPlan
 
 FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum_orbit.json"
 STEPS = 20

@@ -16,7 +16,7 @@ from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.attitude_fit import StarField
-from knightcube.vision.startracker.index.sky_index import GuideStars
+from knightcube.vision.startracker.index import GuideStars
 
 PIXELS = 1024
 

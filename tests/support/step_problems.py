@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, angle_of
-from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
+from knightcube.gnc.guidance.plant import Q2_LIMIT, SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.vmc import StepPlan, plan
 from tests.support.collocation_oracle import Slew
 from tests.support.shortest_step import shortest_time
 

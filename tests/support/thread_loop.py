@@ -9,7 +9,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.one_axis import AngleController
-from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant
+from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant
 from tests.knightcube.gnc.estimation.single_axis import (
     ANGLE,
     RATE,

@@ -66,12 +66,17 @@ from knightcube.gnc.control.pointing_job import SlewRequest
 from knightcube.gnc.control.pointing_table import PointingWeights
 from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.error_state import Role
-from knightcube.gnc.estimation.estimate import RATE, Estimate, Knowledge
+from knightcube.gnc.estimation.estimate import (
+    RATE,
+    AttitudeMeasurement,
+    Estimate,
+    Knowledge,
+    MeanRateMeasurement,
+)
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.estimation.rigid_body import BodyErrors
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
+from knightcube.gnc.guidance.attitude_law import BodyAxes
 from knightcube.gnc.tracker import Track
 from knightcube.vision.solar_cells import SolarStringModel
 

@@ -28,9 +28,8 @@ from knightcube.astro.attitude.solvers import VectorObservation, field_observati
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.errors import UsageError
-from knightcube.gnc.estimation.estimate import ATTITUDE, Knowledge
+from knightcube.gnc.estimation.estimate import ATTITUDE, AttitudeMeasurement, DirectionMeasurement, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
 from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.settings import (
     HorizonKnowledge,
@@ -38,8 +37,7 @@ from knightcube.vision.horizon.settings import (
     RoughAttitude,
     SensedDirection,
 )
-from knightcube.vision.horizon.structure import StructureMap
-from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
+from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult, StructureMap
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS

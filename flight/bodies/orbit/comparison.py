@@ -11,8 +11,7 @@ from flight.loop.facts import Services
 from flight.schema.orbit import OrbitConfig
 from hal.interfaces.devices import ImuReading
 from knightcube.astro.attitude.solvers import VectorObservation
-from knightcube.gnc.estimation.estimate import ATTITUDE
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement
+from knightcube.gnc.estimation.estimate import ATTITUDE, AttitudeMeasurement
 from knightcube.reference.sensor_fusion import GyroBiasFilter, KnownAttitude, SeparateDetermination
 
 

@@ -28,7 +28,15 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotatio
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation import free_filter as states
 from knightcube.gnc.estimation.error_state import PriorCheck
-from knightcube.gnc.estimation.estimate import Estimate, Knowledge
+from knightcube.gnc.estimation.estimate import (
+    AttitudeMeasurement,
+    DirectionMeasurement,
+    Estimate,
+    FieldMeasurement,
+    Knowledge,
+    MeanRateMeasurement,
+    Measurement,
+)
 from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 from knightcube.gnc.estimation.free_filter import (
     FilterEnvironment,
@@ -36,13 +44,6 @@ from knightcube.gnc.estimation.free_filter import (
     FreeFilterSettings,
     FreeMemory,
     SlowStates,
-)
-from knightcube.gnc.estimation.measurements import (
-    AttitudeMeasurement,
-    DirectionMeasurement,
-    FieldMeasurement,
-    MeanRateMeasurement,
-    Measurement,
 )
 
 FORGOTTEN_NS = 10_000_000_000

@@ -46,9 +46,9 @@ from knightcube.gnc.control.pointing_job import (
 from knightcube.gnc.control.pointing_law import PathRecovery, PointingLaw
 from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference, BodyAxes
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
+from knightcube.gnc.guidance.attitude_law import AttitudeReference, BodyAxes
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.slew_model import SlewPath
 from knightcube.gnc.tracker import Track
 
 

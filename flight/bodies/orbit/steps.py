@@ -12,8 +12,8 @@ import numpy as np
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import Measurement
 from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeMemory
-from knightcube.gnc.estimation.measurements import Measurement
 
 Floats = tuple[float, float, float]
 _NOTHING: Floats = (0.0, 0.0, 0.0)

@@ -59,13 +59,20 @@ from knightcube.gnc.control.detumble import (
     share_in_rotating_field,
 )
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
-from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Parameters
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    RATE,
+    AttitudeMeasurement,
+    Estimate,
+    MeanRateMeasurement,
+    Parameters,
+    RateMeasurement,
+)
 from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.guidance.one_axis import vmc as plan_job
-from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, PathGuidance
-from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
-from knightcube.gnc.guidance.one_axis.vmc import NODES
+from knightcube.gnc.guidance import vmc as plan_job
+from knightcube.gnc.guidance.path_guidance import AcceptanceRules, PathGuidance
+from knightcube.gnc.guidance.plant import PathCost, SingleAxisPlant
+from knightcube.gnc.guidance.vmc import NODES
 
 _UNKNOWN_RATE = 1.0
 """Standard deviation (rad/s) of the body rate if the filter starts without a gyro."""

@@ -57,8 +57,8 @@ from knightcube.gnc.control.one_axis import (
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
 from knightcube.gnc.estimation.estimate import NOMINAL, PARAMETERS, Estimate, Parameters, SlowPrior
 from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.guidance.one_axis.guidance import PathGuidance
-from knightcube.gnc.guidance.one_axis.plant import (
+from knightcube.gnc.guidance.path_guidance import PathGuidance
+from knightcube.gnc.guidance.plant import (
     FARTHEST,
     Q2_LIMIT,
     PathCost,
@@ -67,8 +67,8 @@ from knightcube.gnc.guidance.one_axis.plant import (
     angle_of,
     q2_of,
 )
-from knightcube.gnc.guidance.one_axis.vmc import PlanJob, PlanStatus, StepPlan
-from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.guidance.pointing_target import PointingTarget
+from knightcube.gnc.guidance.vmc import PlanJob, PlanStatus, StepPlan
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 
 

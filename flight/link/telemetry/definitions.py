@@ -16,7 +16,7 @@ from flight.link.events import Severity
 from flight.link.modes import Mode
 from flight.link.telemetry.fields import Alarms, Field, Level, Limits, Packet, States, counter, flag
 from hal.interfaces.devices import COIL_NAMES, MOST_COILS
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
+from knightcube.gnc.guidance.plant import Q2_LIMIT
 
 
 def _parameter(key: str, unit: str, low: float, high: float, meaning: str) -> Field:

@@ -42,7 +42,7 @@ from enum import Enum
 from typing import Protocol
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant, angle_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ from knightcube.gnc.control.pointing_table import (
     pointing_table,
     step_costs,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import (
+from knightcube.gnc.guidance.attitude_law import (
     AttitudeReferences,
     BodyAxes,
     approach,
@@ -56,8 +56,8 @@ from knightcube.gnc.guidance.three_axes.attitude_law import (
     law_of,
     references,
 )
-from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import (
+from knightcube.gnc.guidance.pointing_target import PointingTarget
+from knightcube.gnc.guidance.slew_model import (
     NODES,
     Cone,
     EnvironmentAt,
@@ -67,7 +67,7 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
     along,
     cones,
 )
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, end_law, plan_near, plan_task
+from knightcube.gnc.guidance.slew_plan import SlewPlan, end_law, plan_near, plan_task
 
 PlanTask = Callable[[SlewTask, SlewPath | None], SlewPlan]
 """Function that plans a task, starting from the path of a similar task if given (`slew_plan.plan_task`)."""
@@ -126,7 +126,7 @@ class SlewRequest:
     def planners(self) -> tuple[PlanTask, PlanNear]:
         """Return the functions `plan_task` and `plan_near` of the planner."""
         if self.planner == "vmc":
-            from knightcube.gnc.guidance.three_axes import slew_vmc  # noqa: PLC0415 - loads NLopt
+            from knightcube.gnc.guidance import slew_vmc  # noqa: PLC0415 - loads NLopt
 
             return slew_vmc.plan_task, slew_vmc.plan_near
         return plan_task, plan_near

@@ -24,7 +24,7 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
+from knightcube.gnc.guidance.attitude_law import AttitudeReference
 
 LARGEST_ROTATION = math.radians(20.0)
 """Largest rotation error (rad) that the pointing law uses. Larger errors are scaled down to this value,

@@ -43,7 +43,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
+from knightcube.gnc.guidance.attitude_law import AttitudeReferences
 
 _EYE3: FloatArray = np.eye(3)
 _EYE6: FloatArray = np.eye(6)

@@ -49,8 +49,8 @@ from knightcube.gnc.control.pointing_path import (
     linearised,
     sweep,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
-from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
+from knightcube.gnc.guidance.attitude_law import AttitudeReferences
+from knightcube.gnc.guidance.slew_model import SlewPath
 
 _TURN, _RATE, _DIPOLE, _TORQUE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _EYE: FloatArray = np.eye(3)

@@ -43,15 +43,13 @@ from knightcube.gnc.estimation.estimate import (
     LATENCY,
     RATE,
     SIZE,
+    AttitudeMeasurement,
     Estimate,
     FilterState,
-    SlowPrior,
-)
-from knightcube.gnc.estimation.measurements import (
-    AttitudeMeasurement,
     MeanRateMeasurement,
     Measurement,
     RateMeasurement,
+    SlowPrior,
 )
 from knightcube.gnc.estimation.mekf import LONGEST_LATENCY
 from knightcube.gnc.estimation.replay import (

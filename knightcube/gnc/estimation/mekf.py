@@ -47,15 +47,13 @@ from knightcube.gnc.estimation.estimate import (
     LATENCY,
     PARAMETERS,
     SIZE,
-    FilterState,
-    Parameters,
-)
-from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     DirectionMeasurement,
     FieldMeasurement,
+    FilterState,
     MeanRateMeasurement,
     Measurement,
+    Parameters,
     RateMeasurement,
 )
 from knightcube.gnc.estimation.rigid_body import Accelerated

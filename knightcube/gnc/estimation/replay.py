@@ -19,8 +19,16 @@ import numpy as np
 
 from knightcube.astro import chi_square
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.gnc.estimation.estimate import LATENCY, RATE, SIZE, Estimate, FilterState
-from knightcube.gnc.estimation.measurements import MeanRateMeasurement, Measurement, RateMeasurement
+from knightcube.gnc.estimation.estimate import (
+    LATENCY,
+    RATE,
+    SIZE,
+    Estimate,
+    FilterState,
+    MeanRateMeasurement,
+    Measurement,
+    RateMeasurement,
+)
 from knightcube.gnc.estimation.mekf import (
     RateChange,
     correct,

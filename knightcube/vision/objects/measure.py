@@ -31,10 +31,9 @@ from knightcube.vision.objects.settings import (
     ObjectMeasurementSettings,
 )
 from knightcube.vision.objects.streak_images import spread_over, spread_with_slopes
-from knightcube.vision.startracker.detection import DetectionSettings, FrameKind, survey
-from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.solve import FrameSolution
+from knightcube.vision.startracker.survey import Areas, DetectionSettings, FrameKind, Survey, survey
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _REACH = 5.0

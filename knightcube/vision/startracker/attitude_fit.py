@@ -29,7 +29,7 @@ from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import from_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 
 
 @dataclass(frozen=True, slots=True, eq=False)

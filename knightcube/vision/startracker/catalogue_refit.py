@@ -18,7 +18,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.sky_map import SkyMap, apparent
 from knightcube.vision.startracker.solve import (
     AttitudePrior,

@@ -32,7 +32,7 @@ from knightcube.vision.startracker.attitude_fit import (
     StarMatch,
     stretched,
 )
-from knightcube.vision.startracker.index.sky_index import (
+from knightcube.vision.startracker.index import (
     CELL,
     CELLS,
     FINE,

@@ -26,16 +26,12 @@ from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, LensError, Pinhole
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
-from knightcube.vision.startracker.detection import (
-    Detections,
-    DetectionSettings,
-    FrameKind,
-    measure_near,
-)
+from knightcube.vision.startracker.detect import Detections, measure_near
 from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, attitude_by, fit_in_image
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
+from knightcube.vision.startracker.survey import DetectionSettings, FrameKind
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS, expected_stars, track
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
 from knightcube.vision.streaks.settings import LikelihoodSettings

@@ -39,7 +39,7 @@ from knightcube.vision.startracker.attitude_fit import (
     refine,
     stretched,
 )
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 
 _MOST_ORDERED = 12
 

@@ -15,7 +15,7 @@ from flight.schema.document import ConfigError
 from flight.schema.testbed import as_testbed
 from ground.telemetry import Run
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
+from knightcube.gnc.guidance.plant import Q2_LIMIT
 from tests.support.flights import CONFIG, demo_config, fly
 
 DIPOLE_PER_AMPERE = 80 * 0.0081

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from flight.bodies.streak_methods import corner_estimator
+from flight.bodies.streak_methods import CornerEstimator, corner_estimator
 from flight.schema.devices import Camera
-from knightcube.reference.corner_streaks.estimator import CornerEstimator
-from knightcube.reference.corner_streaks.settings import StreakSettings
+from knightcube.reference.corner_streaks import StreakSettings
 
 
 def estimator(**values: object) -> CornerEstimator:

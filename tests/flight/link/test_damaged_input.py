@@ -17,8 +17,8 @@ from flight.link.files.transfer import CRC32, GROUND, MOST_OPEN, SATELLITE, Enti
 from flight.link.files.units import PduError
 from flight.link.process.commanding import Timetable
 from flight.link.security import COPIES, Association, Vault, encode
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.plant import Q2_LIMIT
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.support.damaged import Files, assert_one_line, chances, damage, fill, line_and_crc, offer
 from tests.support.link_attacker import LinkAttacker
 

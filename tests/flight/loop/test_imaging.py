@@ -14,8 +14,8 @@ from flight.loop.imaging import FrameReport, RepeatedRows, is_strange, middle_ns
 from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import Image
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.startracker.detection.survey import FrameKind
 from knightcube.vision.startracker.solve import FrameSolution, SolveStatus
+from knightcube.vision.startracker.survey import FrameKind
 
 RNG = np.random.default_rng(8)
 

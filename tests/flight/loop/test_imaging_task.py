@@ -20,16 +20,15 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
-from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Knowledge, MeanRateMeasurement
 from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraKnowledge, Exposures, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
-from knightcube.vision.startracker.detection.survey import FrameKind
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, SolveStatus
+from knightcube.vision.startracker.survey import FrameKind
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 

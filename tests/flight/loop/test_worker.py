@@ -24,7 +24,7 @@ from flight.loop.worker import (
 )
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Lens
-from knightcube.vision.startracker.detection.detect import Quality
+from knightcube.vision.startracker.detect import Quality
 from knightcube.vision.streaks.streak_result import StreakStatus
 from tests.flight.loop.passing import passed, slab
 
@@ -96,7 +96,7 @@ HARMFUL: tuple[Any, ...] = (
     ["fields", "no.such.module:Thing", []],
     ["enum", "knightcube.vision.camera.lens:Lens", "x"],
     ["enum", "knightcube.vision.streaks.streak_result:StreakStatus", "NONE_OF_THEM"],
-    ["enum", "knightcube.vision.startracker.detection.detect:Quality", 1],
+    ["enum", "knightcube.vision.startracker.detect:Quality", 1],
     ["flag", "knightcube.vision.streaks.streak_result:StreakStatus", 1],
     ["array", "|O", [1]], ["array", "<f8", [1 << 62, 1 << 62]], ["array", "<f8", [-1]], ["array", "<f8", [2]],
     ["array", "<f8", [1] * 33], ["array", "<f8", [1.0]], ["array", "|b1", [8]], ["scalar", "<f8", [1]],

@@ -20,7 +20,7 @@ from flight.schema.devices import camera_knowledge
 from flight.schema.document import ConfigError, read_document, to_yaml
 from flight.schema.orbit import as_orbit
 from flight.schema.testbed import as_testbed
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.vision.camera.lens import EXACT
 from sim_hal.assembly import camera_model
 from sim_hal.settings import Simulation

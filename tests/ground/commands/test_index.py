@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from knightcube.vision.startracker.attitude_fit import MatchStatus
-from knightcube.vision.startracker.index.sky_index import load
+from knightcube.vision.startracker.index import load
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.ground.commands.in_process import command
 from tests.support.star_lists import ListKind, draw

@@ -13,7 +13,7 @@ from ground.commands import satellite
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of
+from knightcube.gnc.guidance.attitude_law import BodyAxes, law_of
 from tests.support.circular_orbits import JULIAN_DATE, circular
 
 ORBIT = circular(700.0)

@@ -44,7 +44,7 @@ from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import satellite
 from knightcube.errors import FlightError, UsageError
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal
+from knightcube.gnc.guidance.pointing_target import Goal
 from tests.ground.commands.in_process import command
 
 DEFAULTS = {

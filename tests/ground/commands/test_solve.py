@@ -18,8 +18,8 @@ from knightcube.astro.quaternion import (  # noqa: E402
     multiply,
     to_rotation_vector,
 )
-from knightcube.vision.startracker.detection.survey import CENTROIDS  # noqa: E402
 from knightcube.vision.startracker.sky_map import Pointing  # noqa: E402
+from knightcube.vision.startracker.survey import CENTROIDS  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame  # noqa: E402
 

@@ -27,7 +27,7 @@ from ground.console.server import Access, Console
 from ground.console.surroundings import UNKNOWN, FlightSurroundings
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal
+from knightcube.gnc.guidance.pointing_target import NUMBERS, Goal
 from tests.ground.console.served import asked
 from tests.ground.report.synthetic import Recipe, make_run
 

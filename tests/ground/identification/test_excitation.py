@@ -11,7 +11,7 @@ import pytest
 from flight.bodies.testbed.control import plant_of
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis import ExcitationController, manoeuvres
-from knightcube.gnc.guidance.one_axis.plant import PathSample
+from knightcube.gnc.guidance.plant import PathSample
 from tests.ground.identification.conftest import Identified
 from tests.ground.identification.excitations import USUAL
 from tests.ground.identification.worlds import PERIOD, believed, drawn, fly_bare, usual_excitation

@@ -23,7 +23,7 @@ from ground.identification.scale import (
 )
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.one_axis import ExcitationController, ExcitationSettings
-from knightcube.gnc.guidance.one_axis.plant import PathSample
+from knightcube.gnc.guidance.plant import PathSample
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 from tests.support import flights

@@ -23,10 +23,10 @@ from ground.report import figures, orbit_figures, panels
 from ground.report.panels import RunSignals
 from ground.telemetry import Run
 from knightcube.astro.quaternion import from_rotation_vector
-from knightcube.gnc.guidance.one_axis.plant import lgl_rule
-from knightcube.gnc.guidance.one_axis.vmc import plan
-from knightcube.gnc.guidance.three_axes.slew_model import Cone, SlewCraft, SlewEnvironment, SlewPath
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus
+from knightcube.gnc.guidance.plant import lgl_rule
+from knightcube.gnc.guidance.slew_model import Cone, SlewCraft, SlewEnvironment, SlewPath
+from knightcube.gnc.guidance.slew_plan import SlewStatus
+from knightcube.gnc.guidance.vmc import plan
 from tests.ground.report.drawn_figure import described
 from tests.support.flights import demo_config
 from tests.support.packed_run import Rows, packed_run

@@ -16,7 +16,7 @@ from flight.link.telemetry import definitions as table
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.one_axis.plant import lgl_rule
+from knightcube.gnc.guidance.plant import lgl_rule
 from tests.manual_clock import ManualClock
 
 RESISTANCE, VOLTAGE, CURRENT, PULSE_S = 23.0, 3.4, 0.1, 10.0

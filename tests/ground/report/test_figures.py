@@ -15,7 +15,7 @@ from flight.schema.testbed import as_testbed
 from ground.report import draw, draw_path
 from ground.telemetry import read_run
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.vmc import plan
+from knightcube.gnc.guidance.vmc import plan
 from tests.ground.report.synthetic import CURRENT, Recipe, make_run
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")

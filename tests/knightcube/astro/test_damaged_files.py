@@ -16,7 +16,7 @@ from hypothesis import given
 from knightcube.astro import catalogue
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.errors import InputError, UsageError
-from knightcube.vision.startracker.index.sky_index import Columns, TableKind, load_table, save_table
+from knightcube.vision.startracker.index import Columns, TableKind, load_table, save_table
 from tests.support.damaged import Files, chances, fill, offer
 
 DAY = 2_461_000.5

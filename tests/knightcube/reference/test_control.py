@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.plant import PathSample
+from knightcube.gnc.guidance.plant import PathSample
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.support.thread_loop import BELIEVED, PERIOD, fly, held, largest_error
 

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from knightcube.astro.quaternion import from_rotation_vector, multiply
-from knightcube.gnc.guidance.one_axis.plant import PathSample
+from knightcube.gnc.guidance.plant import PathSample
 from knightcube.reference import star_tables
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
+from knightcube.reference.corner_streak_rate import estimate_rate
+from knightcube.reference.corner_streaks import DETECTOR_NAMES, DetectorName, StreakSettings
 from knightcube.reference.horizon import (
     circle_nadir,
     fit_circle,
@@ -31,14 +33,15 @@ from knightcube.reference.star_identification import (
     shared_rate,
 )
 from knightcube.reference.star_tables import KnownSky
+from knightcube.vision.startracker.index import SkyIndex, TriangleIndex, choose_guide_stars
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex, TriangleIndex, choose_guide_stars
 from sim_hal.earth_camera import render
 from tests.sim_hal.earth_camera.scenes import limb_scene
 from tests.support.flights import demo_config
 from tests.support.limb_frames import camera_model
 from tests.support.recorded_results import check
 from tests.support.star_lists import ListKind, StarList, draw, draw_random
+from tests.support.streak_frames import rate_at, star_camera, star_frame
 
 CLASSICAL = sorted(set(METHODS) - {DEFAULT_METHOD})
 FIELD_DEG = 30.0
@@ -188,3 +191,30 @@ def test_the_default_method_identifies_by_the_index_of_the_sky() -> None:
     claimed = found.star >= 0
     assert np.count_nonzero(claimed) > 5
     np.testing.assert_array_equal(found.star[claimed], one.star[claimed])
+
+
+CAMERA = star_camera(400)
+RATE = rate_at(1.2, 0.04, 0.7)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> Image:
+    return star_frame(CAMERA, RATE, 1.0, 4, faintest=6.0)
+
+
+@pytest.mark.parametrize("name", DETECTOR_NAMES)
+def test_the_rate_by_a_detector_is_as_recorded(pixels: Image, name: DetectorName) -> None:
+    settings = StreakSettings.of(name)
+    check(__file__, f"rate {name}", estimate_rate(pixels, CAMERA.pinhole, 1.0, settings, RATE, 1e-3))
+
+
+def test_the_rate_without_a_prior_is_as_recorded(
+    pixels: Image,
+) -> None:
+    check(__file__, "no prior", estimate_rate(pixels, CAMERA.pinhole, 1.0, StreakSettings()))
+
+
+def test_the_rate_about_the_boresight_is_as_recorded() -> None:
+    rate = rate_at(0.1, 0.25, 1.0)
+    frame = star_frame(CAMERA, rate, 1.0, 6, faintest=6.0)
+    check(__file__, "boresight", estimate_rate(frame, CAMERA.pinhole, 1.0, StreakSettings(), rate, 1e-3))

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from knightcube.astro.arrays import FloatArray
 from knightcube.reference import star_tables
 from knightcube.reference.star_tables import PairTable, cosine_sigma
-from knightcube.vision.startracker.index.sky_index import GuideStars
+from knightcube.vision.startracker.index import GuideStars
 
 _KEYS = arrays(
     np.float64,

@@ -11,8 +11,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
-from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.support.scenes import catalogue

@@ -29,7 +29,7 @@ from knightcube.vision.frame import (
     saturation_level,
     saturation_of_bright,
 )
-from knightcube.vision.startracker.detection.survey import _bright_indices, hot_pixels_above
+from knightcube.vision.startracker.survey import _bright_indices, hot_pixels_above
 from knightcube.vision.streaks.faint_stars import less_boxes
 from tests.support.compiled_forms import assert_forms_agree
 from tests.support.streak_frames import rate_at, star_camera, star_frame

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.bodies.streak_methods import CornerEstimator
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
-from knightcube.reference.corner_streaks.estimator import CornerEstimator
-from knightcube.reference.corner_streaks.settings import StreakResult, StreakSettings
+from knightcube.reference.corner_streaks import StreakResult, StreakSettings
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.solve import (

@@ -18,8 +18,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.vision.camera.lens import CameraKnowledge, Lens, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings
 from knightcube.vision.lens_knowledge import LensKnowledge, axes_turn
-from knightcube.vision.startracker.detection import FrameKind
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
     FrameSolution,
@@ -27,6 +26,7 @@ from knightcube.vision.startracker.solve import (
     SolveSettings,
     SolveStatus,
 )
+from knightcube.vision.startracker.survey import FrameKind
 from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
 from knightcube.vision.streaks.geometry import CameraMotion, positions
 from knightcube.vision.streaks.settings import LikelihoodSettings

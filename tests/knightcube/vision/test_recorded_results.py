@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.bodies.streak_methods import CornerEstimator
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.reference.corner_streaks.estimator import CornerEstimator
-from knightcube.reference.corner_streaks.settings import StreakSettings
+from knightcube.reference.corner_streaks import StreakSettings
 from knightcube.vision.camera.lens import Lens, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
 from knightcube.vision.lens_calibration import calibrate, calibrate_determined, lens_accuracy

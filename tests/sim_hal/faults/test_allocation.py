@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
-from knightcube.gnc.control.allocation import allocate
+from knightcube.gnc.control.coil_map import allocate
 
 DIPOLE = 0.648
 COILS = DIPOLE * np.eye(3)

@@ -69,7 +69,7 @@ _again = Again()
 
 def plan_testbed(job: Any) -> Any:
     """Plan for the testbed."""
-    return _again("knightcube.gnc.guidance.one_axis.vmc", job)
+    return _again("knightcube.gnc.guidance.vmc", job)
 
 
 def plan_orbit(job: Any) -> Any:
@@ -88,7 +88,7 @@ def see_wide(job: Any) -> Any:
 
 
 BUSY: dict[str, Callable[[Any], Any]] = {
-    "knightcube.gnc.guidance.one_axis.vmc": plan_testbed,
+    "knightcube.gnc.guidance.vmc": plan_testbed,
     "knightcube.gnc.control.pointing_job": plan_orbit,
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,

@@ -78,7 +78,7 @@ _IMPORTED = (
     "sim_hal.rig",
 )
 _ROLES = {
-    "knightcube.gnc.guidance.one_axis.vmc": "planner",
+    "knightcube.gnc.guidance.vmc": "planner",
     "knightcube.gnc.control.pointing_job": "planner",
     "knightcube.vision.frame_job": "vision",
     "knightcube.vision.horizon_camera_job": "wide",

@@ -32,10 +32,10 @@ from knightcube.gnc.control.pointing_job import (
     SlewRequest,
     slew,
 )
-from knightcube.gnc.guidance.three_axes import slew_vmc
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath, SlewTask
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_task
+from knightcube.gnc.guidance import slew_vmc
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath, SlewTask
+from knightcube.gnc.guidance.slew_plan import SlewPlan, SlewStatus, plan_task
 from tests.studies.campaigns.orbit_pointing_flight import TORQUE
 from tests.support.pointing_settings import AXES, WEIGHTS
 from tests.support.random_slews import _DATE, STAR_CAMERA, clearance, slews

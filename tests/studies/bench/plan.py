@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.vmc import PlanStatus
+from knightcube.gnc.guidance.vmc import PlanStatus
 from tests.support.collocation_oracle import solve
 from tests.support.step_problems import STEPS, THESIS, Problem, feasible_problems, largest_ratio
 

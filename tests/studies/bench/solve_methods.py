@@ -22,11 +22,11 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.attitude.wahba import Solver
 from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
-from knightcube.reference import image_matching
-from knightcube.vision.startracker.detection import DetectionSettings, detect
-from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
+from knightcube.reference.star_identification import match_images
+from knightcube.vision.startracker.detect import detect
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
+from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings, Method
 from sim_hal.star_camera import StarCameraModel
 from tests.support.scenes import YEAR, exposed
 
@@ -34,7 +34,7 @@ _SEED = 41_207
 _FIELD = np.radians(12.0)
 _EXPOSURE = 0.2
 _IMAGE = "image"
-_SOLVERS: dict[str, Solver] = {**SOLVERS, "aim": image_matching.solve}
+_SOLVERS: dict[str, Solver] = {**SOLVERS, "aim": match_images}
 _ARCSECONDS = float(np.degrees(3600.0))
 
 

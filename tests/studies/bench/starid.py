@@ -31,8 +31,8 @@ from ground.campaigns.runner import show
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.startracker.attitude_fit import MatchStatus, refine
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.support.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
 

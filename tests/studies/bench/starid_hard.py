@@ -22,8 +22,8 @@ import numpy as np
 from ground.campaigns.runner import show
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.startracker.attitude_fit import StarMatch
+from knightcube.vision.startracker.index import GuideStars, SkyIndex
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import GuideStars, SkyIndex
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error

@@ -9,7 +9,7 @@ gains by one criterion: minimum power with every step settled in 9 s and oversho
 adaptive controller that is tuned by its bandwidth alone and a PID with three equal poles are added for
 comparison.
 
-Two definitions of power are used (`knightcube.gnc.guidance.one_axis.plant`). V |I| is the power that the
+Two definitions of power are used (`knightcube.gnc.guidance.plant`). V |I| is the power that the
 chopped coils draw from their supply of 3.4 V; it is comparable to the powers of the thesis. R I^2 of the mean
 current is the cost that the paths minimise.
 

@@ -22,10 +22,12 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import VectorObservation, field_observation, weighted_fit
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
-from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, Estimate
-from knightcube.gnc.estimation.measurements import (
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    FIELD_BIAS,
     AttitudeMeasurement,
     DirectionMeasurement,
+    Estimate,
     FieldMeasurement,
     RateMeasurement,
 )

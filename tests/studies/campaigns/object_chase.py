@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotat
 from knightcube.gnc.control import pointing_job
 from knightcube.gnc.control.pointing_job import PointingJob
 from knightcube.gnc.control.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from sim_hal.settings import TipOff
 from tests.studies.campaigns.free_flight import FreeFlight

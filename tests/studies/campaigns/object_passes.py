@@ -35,8 +35,8 @@ from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
-from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render

@@ -39,8 +39,8 @@ from knightcube.gnc.estimation.free_filter import (
     FreeFilter,
     FreeFilterSettings,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import law_of, references
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.attitude_law import law_of, references
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from sim_hal.description_errors import NO_ERRORS
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import log_density

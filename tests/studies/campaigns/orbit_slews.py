@@ -41,9 +41,9 @@ from knightcube.gnc.control import pointing_job
 from knightcube.gnc.control.pointing_job import LEAD, PointingJob, RunningSlew
 from knightcube.gnc.control.pointing_law import PointingLaw
 from knightcube.gnc.control.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath, SlewTask, along
-from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.slew_model import SlewCraft, SlewPath, SlewTask, along
+from knightcube.gnc.guidance.slew_plan import end_law, plan_task
 from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
 from sim_hal.worlds.free_body import CRAFTS
 from tests.studies.campaigns.free_flight import WATTS

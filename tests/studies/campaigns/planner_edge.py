@@ -19,7 +19,7 @@ import numpy as np
 
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
+from knightcube.gnc.guidance.plant import Q2_LIMIT
 from tests.support.collocation_oracle import solve
 from tests.support.step_problems import KNIGHTCUBE, Problem
 

@@ -30,8 +30,8 @@ from knightcube.astro.quaternion import (
 from knightcube.vision.camera.lens import EXACT, CameraKnowledge
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
-from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection

@@ -11,7 +11,7 @@ import numpy as np
 from ground.campaigns.runner import Result
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.reference.corner_streaks.settings import StreakSettings
+from knightcube.reference.corner_streaks import StreakSettings
 from knightcube.vision.objects.detect import ObjectReport, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion

@@ -23,8 +23,8 @@ import numpy as np
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
-from knightcube.reference.corner_streaks.rate import estimate_rate
-from knightcube.reference.corner_streaks.settings import StreakSettings
+from knightcube.reference.corner_streak_rate import estimate_rate
+from knightcube.reference.corner_streaks import StreakSettings
 from knightcube.vision.objects.detect import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.objects import source_tracks

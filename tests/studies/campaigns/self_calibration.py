@@ -25,10 +25,10 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import CameraKnowledge, Pinhole
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run_with_lens
 from knightcube.vision.lens_knowledge import LensKnowledge
-from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import RatePrior, SolveSettings
+from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel

@@ -24,10 +24,8 @@ import numpy as np
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.errors import FlightError
-from knightcube.reference.corner_streaks.detectors import cornerness
-from knightcube.reference.corner_streaks.rate import estimate_rate
-from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from knightcube.reference.corner_streaks.two_ends import attitudes_of_ends
+from knightcube.reference.corner_streak_rate import attitudes_of_ends, cornerness, estimate_rate
+from knightcube.reference.corner_streaks import DETECTOR_NAMES, DetectorName, StreakSettings
 from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from knightcube.vision.streaks.estimate import estimate_motion

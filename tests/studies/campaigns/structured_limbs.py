@@ -25,7 +25,7 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.horizon.nadir import HorizonSolution, find_nadir, nadir_of_uncertain_field
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
-from knightcube.vision.horizon.structure import StructureMap, polygon_mask
+from knightcube.vision.horizon_camera_job import StructureMap, polygon_mask
 from sim_hal.earth_camera import EarthScene, nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns.limbless import spectral_noise

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from knightcube.gnc.guidance.one_axis.vmc import PlanStatus
+from knightcube.gnc.guidance.vmc import PlanStatus
 from tests.studies.campaigns.planner_edge import PLANT, cases, run, verdict
 from tests.support.step_problems import Problem
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from knightcube.astro.attitude.solvers import OPTIMAL, SOLVERS
-from knightcube.vision.startracker.detection.survey import CENTROIDS
+from knightcube.vision.startracker.survey import CENTROIDS
 from tests.studies.bench.solve_methods import compare
 
 

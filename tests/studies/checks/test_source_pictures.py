@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.reference.corner_streaks import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from sim_hal.star_camera import StarCameraModel
 from tests.studies import source_pictures

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from knightcube.astro import catalogue
 from knightcube.errors import InputError, UsageError
-from knightcube.vision.startracker.index.sky_index import (
+from knightcube.vision.startracker.index import (
     PATH,
     GuideStars,
     SkyIndex,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.gnc.control.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import references
+from knightcube.gnc.guidance.attitude_law import references
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
     LAW,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.gnc.control.pointing_law import FAR, SLOW
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 NADIR = PointingTarget(Goal.NADIR, roll=0.0)
 

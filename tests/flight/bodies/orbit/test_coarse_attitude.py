@@ -24,9 +24,8 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation.estimate import ATTITUDE, Knowledge
+from knightcube.gnc.estimation.estimate import ATTITUDE, AttitudeMeasurement, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.solar_cells import SolarStringModel
 from sim_hal.emulators.solar_cells import SolarCellsModel
 

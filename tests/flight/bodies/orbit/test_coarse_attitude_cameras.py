@@ -22,12 +22,10 @@ from knightcube.astro.quaternion import (
     normalise,
 )
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
-from knightcube.vision.horizon.structure import StructureMap
-from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection, run
+from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection, StructureMap, run
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])

@@ -26,7 +26,15 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control.coil_map import CoilMap
-from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, RATE, Estimate, Knowledge
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    FIELD_BIAS,
+    RATE,
+    AttitudeMeasurement,
+    Estimate,
+    Knowledge,
+    MeanRateMeasurement,
+)
 from knightcube.gnc.estimation.free_filter import (
     COILS,
     GYRO,
@@ -36,7 +44,6 @@ from knightcube.gnc.estimation.free_filter import (
     SlowStates,
 )
 from knightcube.gnc.estimation.free_filter import INERTIA as INERTIA_ERROR
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 
 PERIOD_NS = SECOND_NS // 40

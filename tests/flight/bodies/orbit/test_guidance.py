@@ -23,8 +23,8 @@ from knightcube.astro.arrays import BoolArray
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.pointing_job import PointingJob, SlewRequest
 from knightcube.gnc.control.pointing_law import LEAVING
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, BodyAxes
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.attitude_law import AttitudeReferences, BodyAxes
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, STILL
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,

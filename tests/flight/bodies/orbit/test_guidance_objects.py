@@ -17,8 +17,8 @@ from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotat
 from knightcube.gnc.control.pointing_job import LEAD, PointingJob, new_table
 from knightcube.gnc.control.pointing_law import PointingLaw
 from knightcube.gnc.control.pointing_table import PointingWeights
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, following, references
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.attitude_law import BodyAxes, following, references
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.gnc.tracker import ObjectTracker, TrackSettings
 from tests.support.object_passes import PIXEL, sightings
 

@@ -26,8 +26,8 @@ from knightcube.astro.earth.disturbance import box_areas
 from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.control.pointing_job import PointingJob
 from knightcube.gnc.control.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.attitude_law import BodyAxes
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, STILL
 from tests.knightcube.gnc.control.pointing_cases import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
 from tests.knightcube.gnc.control.pointing_requests import WISH, planned

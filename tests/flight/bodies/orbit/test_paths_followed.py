@@ -10,7 +10,7 @@ import pytest
 
 from flight.bodies.orbit import guidance
 from flight.bodies.orbit.guidance import PointingPaths
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 S = 1_000_000_000
 NADIR, SUN = PointingTarget(Goal.NADIR), PointingTarget(Goal.SUN)

@@ -11,7 +11,7 @@ import pytest
 from flight.bodies.orbit.guidance import PointingPaths, PointingTargetLaw, PointingTargets, target_of
 from flight.loop.body import COMMANDED, KEPT, Target, TargetLaw
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 SUN, NADIR, OBJECT = (PointingTarget(goal) for goal in (Goal.SUN, Goal.NADIR, Goal.OBJECT))
 

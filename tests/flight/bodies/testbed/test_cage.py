@@ -15,7 +15,7 @@ from flight.schema.testbed import Cage, TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
-from knightcube.gnc.guidance.one_axis.plant import PathSample
+from knightcube.gnc.guidance.plant import PathSample
 from sim_hal.clock import SimClock
 from sim_hal.rig import utc_ns
 from sim_hal.settings import Simulation

@@ -38,7 +38,7 @@ from flight.link.process.commanding import (
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
 from flight.link.regular_files import overwrite
 from flight.link.telemetry.definitions import RUN
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
 
 

@@ -8,7 +8,7 @@ import pytest
 from knightcube.astro.earth.disturbance import AIR, Pressures, box_areas, pressures, shapes
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.gnc.control.pointing_job import slew
-from knightcube.gnc.guidance.three_axes.slew_model import along
+from knightcube.gnc.guidance.slew_model import along
 from sim_hal.worlds.free_body import CRAFTS, air_torque, box
 from tests.knightcube.gnc.control.pointing_cases import ORBIT
 from tests.knightcube.gnc.control.pointing_requests import (

@@ -9,7 +9,7 @@ from knightcube.astro.earth.disturbance import pressures, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.gnc.control.pointing_table import PointingWeights
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, velocity
+from knightcube.gnc.guidance.attitude_law import AttitudeLaw, nadir, velocity
 from tests.support.circular_orbits import circular
 
 ORBIT = circular(11_500.0)

@@ -11,8 +11,8 @@ from knightcube.astro.earth.disturbance import box_areas, pressures
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.gnc.control.pointing_job import SlewRequest, SlewStart, slew, slew_table
 from knightcube.gnc.control.pointing_table import PointingPreview, PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, references
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.attitude_law import BodyAxes, references
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
     LAW,

@@ -12,7 +12,7 @@ from flight.bodies.testbed.control import controller_of
 from flight.schema.testbed import Control, Identification
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis import AngleController, LqTracker
-from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant
+from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.support.thread_loop import BELIEVED, PERIOD, fly, held, largest_error
 

@@ -13,8 +13,8 @@ from scipy.linalg import solve_continuous_are
 
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis import LqTracker, lq_gains
-from knightcube.gnc.guidance.one_axis.plant import PathSample, PolynomialPath, SingleAxisPlant
-from knightcube.gnc.guidance.one_axis.vmc import plan
+from knightcube.gnc.guidance.plant import PathSample, PolynomialPath, SingleAxisPlant
+from knightcube.gnc.guidance.vmc import plan
 
 PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148)
 THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)

@@ -16,7 +16,7 @@ from knightcube.gnc.control.one_axis import (
     lq_gains,
     manoeuvres,
 )
-from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant, angle_of
 
 PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148)
 STRENGTH = 2.916e-4 * 0.148 / 1.05e-3

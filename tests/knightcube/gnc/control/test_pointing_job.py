@@ -13,8 +13,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control import pointing_job
-from knightcube.gnc.control.allocation import allocate
-from knightcube.gnc.control.coil_map import CoilMap
+from knightcube.gnc.control.coil_map import CoilMap, allocate
 from knightcube.gnc.control.pointing_job import (
     FINE,
     LEAD,
@@ -25,8 +24,8 @@ from knightcube.gnc.control.pointing_job import (
 )
 from knightcube.gnc.control.pointing_law import PointingLaw
 from knightcube.gnc.control.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import references
-from knightcube.gnc.guidance.three_axes.slew_model import cones
+from knightcube.gnc.guidance.attitude_law import references
+from knightcube.gnc.guidance.slew_model import cones
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
     LAW,

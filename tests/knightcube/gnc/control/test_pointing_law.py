@@ -25,7 +25,7 @@ from knightcube.gnc.control.pointing_table import (
     PointingTable,
     pointing_table,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import approach, references
+from knightcube.gnc.guidance.attitude_law import approach, references
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
     LAW,

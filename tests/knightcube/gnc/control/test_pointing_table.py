@@ -33,7 +33,7 @@ from knightcube.gnc.control.pointing_table import (
     midpoint_step,
     step_costs,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, references, velocity
+from knightcube.gnc.guidance.attitude_law import AttitudeLaw, nadir, references, velocity
 from tests.support.circular_orbits import circular
 
 ORBIT = circular(7_500.0)

@@ -17,7 +17,7 @@ from knightcube.gnc.control.pointing_table import (
     PointingWeights,
     pointing_table,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import approach, references
+from knightcube.gnc.guidance.attitude_law import approach, references
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
     LAW,

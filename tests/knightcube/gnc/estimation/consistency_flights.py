@@ -35,9 +35,9 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.estimation.measurements import (
+from knightcube.gnc.estimation.estimate import (
     AttitudeMeasurement,
+    Estimate,
     MeanRateMeasurement,
     Measurement,
     RateMeasurement,

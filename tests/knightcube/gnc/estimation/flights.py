@@ -11,8 +11,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
-from knightcube.gnc.estimation.estimate import Parameters
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, RateMeasurement
+from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Parameters, RateMeasurement
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from tests.support.consistency_worlds import (
     CYCLE_NS,

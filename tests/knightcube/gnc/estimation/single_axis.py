@@ -19,7 +19,7 @@ import numpy as np
 
 from flight.bodies.testbed.control import ThreadEstimate as Estimate
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.plant import SingleAxisPlant
 
 ANGLE, RATE = 0, 1
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.single_axis import ANGLE, RATE, FilterSettings, Measurement
 
 PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.916e-4, resistance=23.0, current_limit=0.148)

@@ -13,8 +13,17 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_between, conjugate, from_rotation_vector, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, slow_prior
-from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, PARAMETERS, RATE, Estimate, Parameters
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    BIAS,
+    PARAMETERS,
+    RATE,
+    AttitudeMeasurement,
+    Estimate,
+    MeanRateMeasurement,
+    Parameters,
+    RateMeasurement,
+)
 from tests.knightcube.gnc.estimation.flights import (
     FREE,
     RATE_COVARIANCE,

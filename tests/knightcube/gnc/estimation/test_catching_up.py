@@ -9,7 +9,7 @@ import pytest
 
 from knightcube.astro.quaternion import about_axis_y
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.measurements import (
+from knightcube.gnc.estimation.estimate import (
     AttitudeMeasurement,
     MeanRateMeasurement,
     Measurement,

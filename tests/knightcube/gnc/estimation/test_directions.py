@@ -12,8 +12,15 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import VectorObservation, weighted_fit
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, SIZE, FilterState
-from knightcube.gnc.estimation.measurements import DirectionMeasurement, FieldMeasurement, Measurement
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    FIELD_BIAS,
+    SIZE,
+    DirectionMeasurement,
+    FieldMeasurement,
+    FilterState,
+    Measurement,
+)
 from knightcube.gnc.estimation.mekf import correct, innovation, weigh_innovation
 from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow

@@ -9,8 +9,7 @@ import pytest
 
 from knightcube.astro.quaternion import angle_about_axis_y
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
-from knightcube.gnc.estimation.estimate import LATENCY, Estimate
-from knightcube.gnc.estimation.measurements import RateMeasurement
+from knightcube.gnc.estimation.estimate import LATENCY, Estimate, RateMeasurement
 from knightcube.gnc.estimation.mekf import LONGEST_LATENCY, rate_change
 from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, SUSPENDED, Flight, fly
 from tests.support.consistency_worlds import CYCLE_NS

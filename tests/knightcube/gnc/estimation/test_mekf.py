@@ -16,8 +16,14 @@ from knightcube.astro.quaternion import (
     logarithm,
     skew,
 )
-from knightcube.gnc.estimation.estimate import SIZE, FilterState, Parameters
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
+from knightcube.gnc.estimation.estimate import (
+    SIZE,
+    AttitudeMeasurement,
+    FilterState,
+    MeanRateMeasurement,
+    Parameters,
+    RateMeasurement,
+)
 from knightcube.gnc.estimation.mekf import (
     RateChange,
     correct,

@@ -8,9 +8,9 @@ import numpy as np
 
 from knightcube.astro.earth.disturbance import Pressures
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.gnc.estimation.estimate import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.estimation.field_rate import FieldRate, FieldRateSettings
 from knightcube.gnc.estimation.free_filter import MAGNET, FilterEnvironment, FreeFilter, FreeFilterSettings
-from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from tests.knightcube.gnc.estimation.flights import begin, fly, follow
 from tests.support.consistency_worlds import CYCLE_NS
 from tests.support.recorded_results import check

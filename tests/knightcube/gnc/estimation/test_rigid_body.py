@@ -20,7 +20,7 @@ from knightcube.astro.quaternion import (
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import Parameters
 from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.flights import FREE
 from tests.support.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
 

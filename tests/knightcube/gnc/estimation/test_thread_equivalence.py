@@ -12,7 +12,7 @@ from flight.bodies.testbed.control import about_thread
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.measurements import (
+from knightcube.gnc.estimation.estimate import (
     AttitudeMeasurement,
     MeanRateMeasurement,
     Measurement,

@@ -10,7 +10,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_about_axis_y
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.measurements import RateMeasurement
+from knightcube.gnc.estimation.estimate import RateMeasurement
 from knightcube.gnc.estimation.replay import CommandHistory
 from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, begin, fly, follow
 from tests.support.consistency_worlds import CYCLE_NS

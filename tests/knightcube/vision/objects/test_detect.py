@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.attitude.olae import rotation_between
+from knightcube.astro.attitude.solvers import rotation_between
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
 from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run

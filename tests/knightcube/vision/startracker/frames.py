@@ -10,8 +10,8 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.streaks.geometry import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.support.streak_bound import rate_bound, star_information

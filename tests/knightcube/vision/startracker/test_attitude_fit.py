@@ -30,7 +30,7 @@ from knightcube.vision.startracker.attitude_fit import (
     stretched,
     turned,
 )
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index import SkyIndex
 from tests.support.compiled_forms import assert_forms_agree
 
 SIGMA = 1e-4

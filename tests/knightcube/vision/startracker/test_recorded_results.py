@@ -12,7 +12,7 @@ from knightcube.reference.star_identification import DEFAULT_METHOD, method_of
 from knightcube.vision.camera.lens import CameraKnowledge, Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
-from knightcube.vision.startracker.detection import DetectionSettings, detect, measure_near, survey
+from knightcube.vision.startracker.detect import detect, measure_near
 from knightcube.vision.startracker.image_fit import Unknowns, fit_in_image
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -21,6 +21,7 @@ from knightcube.vision.startracker.solve import (
     SolveSettings,
     solve_motion,
 )
+from knightcube.vision.startracker.survey import DetectionSettings, survey
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel

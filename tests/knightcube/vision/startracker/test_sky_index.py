@@ -10,9 +10,7 @@ import pytest
 from knightcube.astro import catalogue
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.errors import InputError
-from knightcube.vision.startracker.index import build as index_build
-from knightcube.vision.startracker.index.build import IndexSettings, default_index
-from knightcube.vision.startracker.index.sky_index import (
+from knightcube.vision.startracker.index import (
     CELLS,
     FINE,
     LEAST_RATIO,
@@ -25,6 +23,8 @@ from knightcube.vision.startracker.index.sky_index import (
     reach,
     save,
 )
+from knightcube.vision.startracker.index import build as index_build
+from knightcube.vision.startracker.index.build import IndexSettings, default_index
 from tests.pace import ordinary_seconds
 
 SMALL = IndexSettings(faintest=5.0, smallest=float(np.deg2rad(8.0)), density=4.0)

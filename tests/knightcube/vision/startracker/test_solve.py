@@ -25,7 +25,7 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.star_tracker import StarTracker
-from knightcube.vision.startracker.detection import Detections, DetectionSettings, FrameKind
+from knightcube.vision.startracker.detect import Detections
 from knightcube.vision.startracker.sky_map import ASPECT
 from knightcube.vision.startracker.solve import (
     ENDS,
@@ -44,6 +44,7 @@ from knightcube.vision.startracker.solve import (
     solve_places,
     weighting_of,
 )
+from knightcube.vision.startracker.survey import DetectionSettings, FrameKind
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.support.attitude_errors import attitude_error

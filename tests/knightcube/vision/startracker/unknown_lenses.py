@@ -10,8 +10,8 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, multiply, normalise
 from knightcube.vision.camera.lens import Lens
-from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, solve_places
+from knightcube.vision.startracker.survey import FrameKind
 from tests.knightcube.vision.startracker.frames import EPOCH, sky
 from tests.support.photographs import FIELD_SHARE, believed
 

@@ -1,0 +1,362 @@
+"""Attitude laws: the commanded attitude as a function of time, from two directions or a pointing target.
+
+An attitude law aligns one body axis exactly with a first direction, and a second body axis with a second
+direction as closely as possible (TRIAD: Black 1964). A direction can be fixed in inertial axes, fixed in the
+orbital axes (nadir, velocity, orbit normal), or point to the Sun or to a point on the ground. If the roll is
+free, the second direction follows from the attitude at which the attitude law begins. The second direction is
+then fixed in the same axes, inertial or orbital, as the first direction, so that the body does not rotate
+about the first direction.
+
+The law of a pointing target aligns the pointing axis with the direction of the target and the body axis
+`across` with a second direction: the velocity for nadir and ground targets, nadir for the velocity target,
+the celestial pole for the Sun. If a roll is given, the body is additionally rotated about the pointing axis.
+If the roll is free, the body keeps the roll that it has when the attitude law begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import erfa
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import Ephemeris
+from knightcube.astro.earth.orientation import celestial_to_terrestrial
+from knightcube.astro.earth.sun import DAY
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_matrix,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
+
+Direction = Callable[[Ephemeris, FloatArray], FloatArray]
+"""Function that returns unit vectors (n, 3), ICRS, for an ephemeris and times (n,), s."""
+DIFFERENCE = 1.0
+"""Time step (s) of the central differences from which rate and acceleration are computed."""
+MINIMUM_SINE = 1e-3
+"""Smallest permitted sine of the angle between the two directions, because nearly parallel directions do not
+determine the roll."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeReference:
+    """The commanded attitude (4,), rate (3,), rad/s, and acceleration (3,), rad/s^2, at one time.
+
+    Rate and acceleration are in the axes of the commanded attitude.
+    """
+
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeReferences:
+    """The commanded motion at equally spaced times.
+
+    Attributes:
+        times: (n,) s.
+        quaternion: commanded attitudes (n, 4), from ICRS into body axes.
+        rate: commanded body rates (n, 3) in the axes of the commanded attitude, rad/s.
+        acceleration: commanded angular accelerations (n, 3) in the axes of the commanded attitude, rad/s^2.
+    """
+
+    times: FloatArray
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+
+    def position(self, time: float) -> tuple[int, float]:
+        """Return the index of the last instant before a time, s, and the elapsed fraction of the step."""
+        begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
+        position = (time - begin) / step
+        k = min(max(math.floor(position), 0), len(self.times) - 2)
+        return k, min(max(position - k, 0.0), 1.0)
+
+    def at(self, time: float) -> AttitudeReference:
+        """Return the commanded motion at a time, s, which is clamped to the range of the given times."""
+        k, share = self.position(time)
+        near = k + round(share)
+        since = (share - round(share)) * float(self.times[1] - self.times[0])
+        rate, acceleration = self.rate[near], self.acceleration[near]
+        turned = from_rotation_vector(since * rate + 0.5 * since * since * acceleration)
+        return AttitudeReference(
+            multiply(turned, self.quaternion[near]),
+            (1.0 - share) * self.rate[k] + share * self.rate[k + 1],
+            (1.0 - share) * self.acceleration[k] + share * self.acceleration[k + 1],
+        )
+
+    def until(self, count: int) -> AttitudeReferences:
+        """Return the commanded motion at the first `count` instants only."""
+        return self._part(slice(count))
+
+    def since(self, position: int) -> AttitudeReferences:
+        """Return the commanded motion without the instants before the index `position`."""
+        return self._part(slice(position, None))
+
+    def _part(self, part: slice) -> AttitudeReferences:
+        return AttitudeReferences(
+            self.times[part], self.quaternion[part], self.rate[part], self.acceleration[part]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeLaw:
+    """A law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
+
+    The alignment with `first` is exact, and the alignment with `second` is as close as possible.
+    """
+
+    axis: FloatArray
+    first: Direction
+    across: FloatArray
+    second: Direction
+
+    def attitudes(self, ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        """Return commanded attitudes (n, 4) at times (n,) s. Raises UsageError for parallel directions."""
+        wanted = _frames(self.first(ephemeris, times), self.second(ephemeris, times))
+        body = _frames(self.axis[None], self.across[None])[0]
+        return np.array([from_matrix(body.T @ frame) for frame in wanted])
+
+
+Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
+"""Function, such as an `AttitudeLaw`, that returns commanded attitudes (n, 4) for an ephemeris and times
+(n,), s."""
+
+
+def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
+    """Return commanded attitudes, and rates and accelerations by central differences, at times (n,), s."""
+    before, now, after = (attitudes(ephemeris, times + shift) for shift in (-DIFFERENCE, 0.0, DIFFERENCE))
+    back = to_rotation_vector(multiply(before, conjugate(now)))
+    ahead = to_rotation_vector(multiply(after, conjugate(now)))
+    return AttitudeReferences(times, now, (ahead - back) / (2.0 * DIFFERENCE), (ahead + back) / DIFFERENCE**2)
+
+
+def nadir(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 3) from the satellite to the Earth's centre."""
+    return _unit(-ephemeris.position_at(times))
+
+
+def velocity(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 3) along the inertial velocity."""
+    return _unit(ephemeris.velocity_at(times))
+
+
+def orbit_normal(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 3) along the angular momentum of the orbit."""
+    return _unit(np.cross(ephemeris.position_at(times), ephemeris.velocity_at(times)))
+
+
+def sun(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 3) to the Sun."""
+    return ephemeris.sun_at(times)
+
+
+def inertial(vector: FloatArray) -> Direction:
+    """Return the function of time that gives a direction (3,) fixed in inertial axes."""
+    fixed = _unit(np.asarray(vector, dtype=float))
+
+    def at(_: Ephemeris, times: FloatArray) -> FloatArray:
+        return np.broadcast_to(fixed, (len(times), 3))
+
+    return at
+
+
+def orbital(vector: FloatArray) -> Direction:
+    """Return the function of time that gives a direction (3,) fixed in orbital axes.
+
+    The orbital axes are the along-track direction, the negative orbit normal and the nadir direction.
+    """
+    fixed = _unit(np.asarray(vector, dtype=float))
+
+    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        return np.asarray(fixed @ _orbital_axes(ephemeris, times))
+
+    return at
+
+
+def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
+    """Return the function of time that gives the direction from the satellite to a point on the ground.
+
+    The geodetic coordinates are `latitude` and `longitude`, rad, and `height`, m above the WGS 84 ellipsoid.
+    Raises UsageError for values out of range.
+    """
+    if not (abs(latitude) <= 0.5 * np.pi and np.isfinite(longitude) and np.isfinite(height)):
+        raise UsageError(
+            f"latitude {latitude}, longitude {longitude} rad, height {height} m is not a point on the Earth"
+        )
+    station = np.asarray(erfa.gd2gc(1, longitude, latitude, height))
+
+    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        to_ground = celestial_to_terrestrial(ephemeris.julian_date + np.asarray(times) / DAY)
+        return _unit(station @ to_ground - ephemeris.position_at(times))
+
+    return at
+
+
+def free_roll(
+    axis: FloatArray, first: Direction, quaternion: FloatArray, ephemeris: Ephemeris, time: float
+) -> AttitudeLaw:
+    """Return a law that aligns `axis` (3,) with `first` and keeps the roll of an attitude (4,) at `time`, s.
+
+    The roll is constant in inertial axes if the direction is inertially fixed, and otherwise constant in the
+    orbital axes.
+    """
+    across = _any_across(axis)
+    shown = attitude_matrix(quaternion).T @ across
+    when = np.array([time])
+    wanted = first(ephemeris, when)[0]
+    # The second direction is rotated by the shortest rotation that aligns the axis with the first direction.
+    shown = _turned(attitude_matrix(quaternion).T @ axis, wanted, shown)
+    moved = float(np.linalg.norm(first(ephemeris, when + 10.0)[0] - wanted))
+    if moved < 1e-4:
+        return AttitudeLaw(axis, first, across, inertial(shown))
+    return AttitudeLaw(axis, first, across, orbital(_orbital_axes(ephemeris, when)[0] @ shown))
+
+
+def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
+    """Return the function for the direction to an object that moves on a straight line relative to the body.
+
+    At the time `since`, s, the object is in `direction` (3,). The relative velocity of the object divided by
+    the distance is `velocity` (3,), 1/s, which is zero for a fixed direction.
+    """
+
+    def at(_: Ephemeris, times: FloatArray) -> FloatArray:
+        return _unit(direction + (np.asarray(times) - since)[:, None] * velocity)
+
+    return at
+
+
+def following(
+    axis: FloatArray, direction: FloatArray, velocity: FloatArray, since: float, quaternion: FloatArray
+) -> AttitudeLaw:
+    """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
+
+    The law starts with the given attitude (4,), changed by the shortest rotation that aligns `axis` with
+    `direction`.
+    """
+    shown = attitude_matrix(quaternion)
+    normal = np.cross(direction, velocity)
+    size = float(np.linalg.norm(normal))
+    now = shown.T @ axis
+    normal = normal / size if size > 1e-9 else _turned(now, direction, shown.T @ _any_across(axis))
+    across = shown @ _turned(direction, now, normal)
+    return AttitudeLaw(axis, passing(direction, velocity, since), across, inertial(normal))
+
+
+def approach(
+    attitudes: Attitudes, quaternion: FloatArray, rate: FloatArray, begin: float, end: float
+) -> Attitudes:
+    """Return the commanded transition from an attitude (4,) and a body rate (3,), rad/s, to an attitude law.
+
+    The transition lasts from `begin` to `end` s. The rotation vector relative to the attitude law is a
+    quintic polynomial of time, which starts with the body's rate relative to the law and ends with zero rate.
+    Raises UsageError unless `end` is after `begin`.
+    """
+    if not end > begin:
+        raise UsageError(f"an approach from {begin} to {end} s: the end must be after the start")
+
+    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        wanted = attitudes(ephemeris, times)
+        start = attitudes(ephemeris, begin + np.array([-DIFFERENCE, 0.0, DIFFERENCE]))
+        left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
+        law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
+        shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
+        # The polynomial is also evaluated just before the start, for the central differences at the start.
+        share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
+        rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
+        # The inverse left Jacobian of the rotation group gives the derivative of the rotation vector `left`.
+        angle, relative = float(np.linalg.norm(left)), rate - shown
+        second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+        crossed = np.cross(left, relative)
+        derivative = np.asarray(relative + 0.5 * crossed + second * np.cross(left, crossed))
+        return multiply(from_rotation_vector(rest * left + drift * derivative), wanted)
+
+    return at
+
+
+def _orbital_axes(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the orbital axes as rows (n, 3, 3): along-track, minus orbit normal, nadir."""
+    down, right = nadir(ephemeris, times), -orbit_normal(ephemeris, times)
+    return np.stack([np.cross(right, down), right, down], axis=1)
+
+
+def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
+    axis = np.cross(start, end)
+    cosine = float(start @ end)
+    if cosine < -1.0 + 1e-9:  # for opposite directions, any axis normal to them is suitable
+        return vector
+    return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
+
+
+def _any_across(axis: FloatArray) -> FloatArray:
+    """Return a unit vector (3,) normal to `axis`, close to the coordinate axis farthest from `axis`."""
+    unit = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    return _unit(unit - axis * float(axis @ unit))
+
+
+def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return right-handed frames (n, 3, 3) whose rows are `first`, the common normal, and their product."""
+    normal = np.cross(first, second)
+    sine = np.linalg.norm(normal, axis=1, keepdims=True)
+    if float(np.min(sine)) < MINIMUM_SINE:
+        raise UsageError(
+            "the two directions of the attitude law are parallel, so that the roll is undetermined"
+        )
+    normal = normal / sine
+    return np.stack([first, normal, np.cross(first, normal)], axis=1)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+
+
+POLE = inertial(np.array([0.0, 0.0, 1.0]))
+"""The Sun is always at least 66 deg from the celestial pole, so the two directions are never parallel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyAxes:
+    """The pointing axis (3,) of a body, and the body axis `across` (3,) from which a roll is measured."""
+
+    pointing: FloatArray
+    across: FloatArray
+
+
+def law_of(
+    target: PointingTarget, axes: BodyAxes, quaternion: FloatArray, ephemeris: Ephemeris, time: float
+) -> Attitudes:
+    """Return the attitude law of a target. A free roll angle is taken from the attitude (4,) at `time`, s."""
+    if target.goal is Goal.INERTIAL:
+        fixed = normalise(np.array(target.numbers))
+        return lambda _, times: np.broadcast_to(fixed, (len(times), 4))
+    first, second = directions_of(target)
+    if target.roll is None:
+        return free_roll(axes.pointing, first, quaternion, ephemeris, time).attitudes
+    turned = attitude_matrix(from_rotation_vector(target.roll * axes.pointing)) @ axes.across
+    return AttitudeLaw(axes.pointing, first, turned, second).attitudes
+
+
+def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
+    """Return the functions for the direction of a goal and for the direction that defines zero roll.
+
+    The goal INERTIAL is not supported, because it is defined by a quaternion and not by two directions.
+    """
+    if target.goal is Goal.GROUND:
+        return ground(*target.numbers), velocity
+    return {
+        Goal.NADIR: (nadir, velocity),
+        Goal.VELOCITY: (velocity, nadir),
+        Goal.SUN: (sun, POLE),
+    }[target.goal]

@@ -1,0 +1,114 @@
+"""Tests of attitude laws: pointing axes, and rates and accelerations against the attitude."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.astro.earth.ephemeris import predict
+from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
+from knightcube.astro.quaternion import (
+    IDENTITY,
+    angle_between,
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+    normalise,
+)
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.attitude_law import (
+    AttitudeLaw,
+    Direction,
+    approach,
+    free_roll,
+    ground,
+    inertial,
+    nadir,
+    orbit_normal,
+    orbital,
+    references,
+    sun,
+    velocity,
+)
+from tests.support.circular_orbits import JULIAN_DATE, RADIUS, RATE, circular
+
+ORBIT = circular(3000.0)
+X, Y, Z = np.eye(3)
+TIMES = np.arange(100.0, 400.0, 20.0)
+NADIR = AttitudeLaw(Z, nadir, X, velocity)
+
+
+def test_nadir_along_the_flight_turns_once_an_orbit_about_the_pitch_axis() -> None:
+    found = references(NADIR.attitudes, ORBIT, TIMES)
+    for time, q in zip(TIMES, found.quaternion, strict=True):
+        turned = attitude_matrix(q)
+        np.testing.assert_allclose(turned @ -ORBIT.position_at(np.array([time]))[0] / RADIUS, Z, atol=1e-9)
+        np.testing.assert_allclose(turned @ orbit_normal(ORBIT, np.array([time]))[0], -Y, atol=1e-9)
+    np.testing.assert_allclose(found.rate, np.tile([0.0, -RATE, 0.0], (len(TIMES), 1)), atol=1e-9)
+    np.testing.assert_allclose(found.acceleration, 0.0, atol=1e-9)
+
+
+def test_rate_and_acceleration_carry_the_attitude_on() -> None:
+    """The ground target passes at 3 km/s or more, so rate and acceleration change continuously."""
+    beneath = celestial_to_terrestrial(JULIAN_DATE) @ ORBIT.position_at(np.array([300.0]))[0]
+    longitude, latitude, _ = (float(part) for part in geodetic(beneath))
+    law = AttitudeLaw(Z, ground(latitude, longitude), X, velocity)
+    found = references(law.attitudes, ORBIT, TIMES)
+    step = 2.0
+    later = law.attitudes(ORBIT, TIMES + step)
+    for k in range(len(TIMES)):
+        turn = step * found.rate[k] + 0.5 * step**2 * found.acceleration[k]
+        carried = multiply(from_rotation_vector(turn), found.quaternion[k])
+        assert angle_between(carried, later[k]) < 3e-5
+    assert np.linalg.norm(found.rate, axis=1).max() > 5.0 * RATE
+    overhead = law.attitudes(ORBIT, np.array([300.0]))[0]
+    down = nadir(ORBIT, np.array([300.0]))[0]
+    # In 300 s the Earth's rotation moves the target by 1.3 deg as seen from 500 km.
+    assert np.degrees(np.arccos(attitude_matrix(overhead)[2] @ down)) < 20.0
+
+
+@pytest.mark.parametrize(
+    "first", [sun, inertial(np.array([0.2, -0.5, 1.0])), orbital(np.array([1.0, 1.0, 0.0]))]
+)
+def test_a_free_roll_keeps_the_roll_that_there_is_and_turns_the_shortest_way(first: Direction) -> None:
+    start = normalise(np.array([0.3, -0.2, 0.5, 0.7]))
+    law = free_roll(Y, first, start, ORBIT, 100.0)
+    wanted = law.attitudes(ORBIT, np.array([100.0]))[0]
+    direction = first(ORBIT, np.array([100.0]))[0]
+    np.testing.assert_allclose(attitude_matrix(wanted) @ direction, Y, atol=1e-9)
+    away = np.arccos(np.clip(float(attitude_matrix(start)[1] @ direction), -1.0, 1.0))
+    assert angle_between(start, wanted) == pytest.approx(away, abs=1e-6)
+
+
+def test_an_approach_starts_with_the_body_s_attitude_and_rate_and_ends_in_the_law() -> None:
+    start, rate = normalise(np.array([0.6, 0.1, -0.3, 0.5])), np.array([0.002, -0.003, 0.001])
+    way = approach(NADIR.attitudes, start, rate, 100.0, 700.0)
+    begin = references(way, ORBIT, np.array([101.0, 700.0, 800.0]))
+    carried = multiply(from_rotation_vector(rate), start)
+    assert angle_between(begin.quaternion[0], carried) < 1e-4
+    np.testing.assert_allclose(begin.rate[0], rate, atol=2e-5)
+    np.testing.assert_allclose(references(way, ORBIT, np.array([100.0])).rate[0], rate, atol=2e-5)
+    np.testing.assert_allclose(begin.rate[1], [0.0, -RATE, 0.0], atol=1e-6)
+    np.testing.assert_allclose(begin.quaternion[2], NADIR.attitudes(ORBIT, np.array([800.0]))[0], atol=1e-12)
+
+
+def test_parallel_directions_bad_places_and_times_outside_are_refused() -> None:
+    with pytest.raises(UsageError, match="parallel"):
+        AttitudeLaw(Z, nadir, X, nadir).attitudes(ORBIT, TIMES)
+    with pytest.raises(UsageError, match="latitude"):
+        ground(2.0, 0.0)
+    with pytest.raises(UsageError, match="must be after the start"):
+        approach(NADIR.attitudes, IDENTITY, np.zeros(3), 10.0, 10.0)
+    with pytest.raises(OrbitError, match="predicted for"):
+        NADIR.attitudes(ORBIT, np.array([4000.0]))
+
+
+def test_a_prediction_follows_its_orbit_between_the_instants() -> None:
+    state = OrbitState(JULIAN_DATE, np.array([RADIUS, 0.0, 0.0]), np.array([0.0, 1000.0, 7500.0]), 10.0)
+    coarse, fine = predict(state, 100.0), predict(state, 100.0, step=2.5)
+    times = np.array([3.0, 47.5, 99.0])
+    np.testing.assert_allclose(coarse.position_at(times), fine.position_at(times), atol=0.05)
+    np.testing.assert_allclose(coarse.velocity_at(times), fine.velocity_at(times), atol=0.01)
+    np.testing.assert_allclose(coarse.field_at(times), fine.field_at(times), atol=1e-8)
+    np.testing.assert_allclose(np.linalg.norm(coarse.sun_at(times), axis=1), 1.0)

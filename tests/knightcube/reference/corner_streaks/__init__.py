@@ -1,1 +1,0 @@
-"""Tests of `knightcube.reference.corner_streaks`."""
