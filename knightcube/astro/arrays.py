@@ -22,10 +22,8 @@ Record = TypeVar("Record")
 def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record:
     """Return a copy of a dataclass of arrays (`record`) that contains only the selected rows.
 
-    Args:
-        record: dataclass whose fields are arrays with n rows each.
-        chosen: (n,) Boolean mask, or indices of the selected rows.
-        common: names of fields that do not have n rows and remain unchanged.
+    The selection `chosen` is a Boolean mask (n,) or indices. The fields named in `common` do not have n rows
+    and remain unchanged.
     """
     picked: dict[str, Any] = {
         field.name: getattr(record, field.name)[chosen]

@@ -13,12 +13,7 @@ _BISECTIONS = 200
 
 
 def chance_beyond(x: float, degrees: int) -> float:
-    """Return the probability that a chi-square variable exceeds x.
-
-    Args:
-        x: threshold, at least 0.
-        degrees: number of degrees of freedom, at least 1.
-    """
+    """Return the probability that a chi-square variable of 1 or more `degrees` of freedom exceeds x."""
     half = 0.5 * x
     chance = math.erfc(math.sqrt(half)) if degrees % 2 else math.exp(-half)
     for below in range(2 - degrees % 2, degrees, 2):
@@ -27,12 +22,7 @@ def chance_beyond(x: float, degrees: int) -> float:
 
 
 def bound(chance: float, degrees: int) -> float:
-    """Return the value that a chi-square variable exceeds with a given probability.
-
-    Args:
-        chance: probability, above 0 and at most 1.
-        degrees: number of degrees of freedom, at least 1.
-    """
+    """Return the value that a chi-square variable exceeds with a probability `chance` above 0 and up to 1."""
     low, high = 0.0, 1.0
     while chance_beyond(high, degrees) > chance:
         low, high = high, 2.0 * high

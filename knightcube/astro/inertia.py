@@ -18,9 +18,6 @@ def principal_axes(inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     The principal axes are numbered and directed so that the rotation angle is as small as possible. For a
     diagonal tensor, the rotation is the identity.
-
-    Args:
-        inertia: (3, 3) symmetric inertia tensor in body axes, kg m^2.
     """
     if not np.any(inertia - np.diag(np.diag(inertia))):
         return np.diag(inertia).copy(), np.eye(3)

@@ -69,15 +69,10 @@ class PidController:
     def __init__(
         self, plant: SingleAxisPlant, period: float, gains: PidSettings, target_weight: float
     ) -> None:
-        """Prepare the controller.
+        """Prepare the controller for a command every `period` s.
 
-        Args:
-            plant: testbed parameters, of which inertia, torque constant and current limit are used.
-            period: time between commands, s.
-            gains: PID gains.
-            target_weight: weight b of the reference angle in the proportional part, 0 to 1.
-
-        Raises UsageError if a value is outside its range.
+        The weight b of the reference angle in the proportional part, `target_weight`, is 0 to 1. Raises
+        UsageError if a value is outside its range.
         """
         if not (math.isfinite(period) and period > 0.0):
             raise UsageError(f"PID period is {period}: it must be finite and positive")
@@ -93,13 +88,7 @@ class PidController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the current command for the given state. The estimated disturbance is not used.
-
-        Args:
-            wanted: reference angle, rate and acceleration.
-            angle: measured angle, rad.
-            rate: measured rate, rad/s.
-            disturbance: estimated disturbance, which is checked to be finite but not used.
+        """Return the current command for the given state. The estimated disturbance is checked but not used.
 
         Raises UsageError if an input is not finite.
         """
@@ -164,12 +153,7 @@ class AdaptiveController:
     def __init__(self, plant: SingleAxisPlant, period: float, settings: AdaptiveSettings) -> None:
         """Start with the inertia, stiffness and damping of the plant model as initial parameters.
 
-        Args:
-            plant: testbed parameters.
-            period: time between commands, s.
-            settings: settings of the controller.
-
-        Raises UsageError if the period is not positive.
+        Raises UsageError if the time `period` between commands, s, is not positive.
         """
         if not (math.isfinite(period) and period > 0.0):
             raise UsageError(f"adaptive period is {period}: it must be finite and positive")
@@ -190,13 +174,7 @@ class AdaptiveController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the current command for the given state. The estimated disturbance is not used.
-
-        Args:
-            wanted: reference angle, rate and acceleration.
-            angle: measured angle, rad.
-            rate: measured rate, rad/s.
-            disturbance: estimated disturbance, which is checked to be finite but not used.
+        """Return the current command for the given state. The estimated disturbance is checked but not used.
 
         Raises UsageError if an input is not finite.
         """

@@ -174,16 +174,11 @@ def rotation_axis(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the rotation axis (3,) with which most streaks agree, and flags (n,) of the agreeing streaks.
 
-    The sign of the rotation axis is arbitrary. Each pair of streaks defines a rotation axis. The axis with
-    which most streaks agree is refined by least squares over the streaks that agree. Up to about half of the
-    streaks may be outliers. No random numbers are used.
-
-    Args:
-        first: (n, 3) unit vectors to one end of each streak, strongest streak first.
-        second: (n, 3) unit vectors to the other end of each streak.
-        tolerance: (n,) tolerated error of the direction of each chord, rad.
-
-    Raises ValueError for fewer than two streaks.
+    The unit vectors `first` and `second` (n, 3) point to the ends of each streak, the strongest streak first,
+    and `tolerance` (n,) is the tolerated error of each chord's direction, rad. The sign of the rotation axis
+    is arbitrary. Each pair of streaks defines a rotation axis. The axis with which most streaks agree is
+    refined by least squares over the streaks that agree. Up to about half of the streaks may be outliers. No
+    random numbers are used. Raises ValueError for fewer than two streaks.
     """
     if len(first) < 2:
         raise ValueError(f"a rotation axis needs at least two streaks, not {len(first)}")
@@ -206,14 +201,9 @@ def rotation_axis(
 
 
 def rotation_angles(first: FloatArray, second: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the rotation angles (n,), rad, about an axis between the two ends of each streak.
+    """Return the rotation angles (n,), rad, about an axis (3,) between the two ends (n, 3) of each streak.
 
     Streaks with the same sign of the angle have the same order of ends (Sease, eq. 3.19, corrected).
-
-    Args:
-        first: (n, 3) unit vectors to the first ends.
-        second: (n, 3) unit vectors to the second ends.
-        axis: (3,) unit vector along the rotation axis.
     """
     sine = np.cross(first, second) @ axis
     cosine = np.sum(first * second, axis=-1) - (first @ axis) * (second @ axis)
@@ -246,13 +236,9 @@ def fit_rotation(
 ) -> RotationFit | None:
     """Return the rotation with which most streaks agree.
 
-    Returns None if fewer than half of the streaks, or fewer than `least_streaks`, agree.
-
-    Args:
-        raw: (n, 2, 2) endpoints without bias correction, strongest streak first, px.
-        sigma: (n,) expected errors of the endpoints, px.
-        pinhole: model of the camera.
-        settings: settings of the estimation.
+    The endpoints `raw` (n, 2, 2), px, are without bias correction and have the expected errors `sigma` (n,),
+    px, the strongest streak first. Returns None if fewer than half of the streaks, or fewer than
+    `least_streaks`, agree.
     """
     needed = max(settings.least_streaks, _LEAST_AGREEMENT * len(raw))
     outward = chord_outward(raw)
@@ -415,14 +401,8 @@ def trajkovic_response(
 ) -> FloatArray:
     """Return the interpixel cornerness of pixels above the thresholds T1 and T2, and zero for other pixels.
 
-    The thresholds T1 and T2 are relative to the largest simple cornerness in the image (Sease, text at eq.
-    3.10).
-
-    Args:
-        image: (rows, columns) image intensities.
-        neighbours: number of neighbour pixels used, 4 or 8.
-        coarse_relative: threshold T1 of the simple cornerness in the image at half scale.
-        fine_relative: threshold T2 of the simple cornerness in the image at full scale.
+    The thresholds T1 (`coarse_relative`, in the image at half scale) and T2 (`fine_relative`) are relative to
+    the largest simple cornerness with 4 or 8 `neighbours` (Sease, text at eq. 3.10).
     """
     simple = simple_response(image, neighbours)
     likely = _coarse_corners(image, neighbours, coarse_relative)
@@ -510,14 +490,9 @@ def attitudes_of_ends(
 ) -> TwoAttitudes:
     """Return the attitudes at the start and end of an exposure, and the mean rate, from identified streaks.
 
-    Args:
-        endpoints: (n, 2, 2) positions (x, y) of the start and end of each streak, corrected for bias, px.
-        reference: (n, 3) unit vectors to the stars of the streaks, in the reference frame of the attitudes.
-        sigma: (n,) standard deviations of the endpoints, px.
-        pinhole: model of the camera.
-        exposure: exposure time, s.
-
-    Raises AttitudeError if the stars do not determine an attitude, FlightError for an invalid exposure.
+    The `endpoints` (n, 2, 2), px, are corrected for bias and have the standard deviations `sigma` (n,), px.
+    The unit vectors `reference` (n, 3) point to the stars. Raises AttitudeError if the stars do not determine
+    an attitude, FlightError for an invalid exposure.
     """
     if not (np.isfinite(exposure) and exposure > 0.0):
         raise FlightError(f"exposure of {exposure} s: must be finite and positive")
@@ -546,14 +521,6 @@ def solve_ends(
 
     If the streaks cannot be identified, the streak result is returned unchanged. The covariance of the rate
     is not changed, because it already describes the errors of the streak ends along and across the streaks.
-
-    Args:
-        found: streak result of the frame.
-        camera: model of the camera.
-        scale: range of the relative image scale.
-        sky: search index of the guide stars.
-        settings: settings of the star identification.
-        prior: prior attitude, None if unknown.
     """
     ends, sigma = _brightest_first(found, camera)
     covariance = 0.5 * sigma[:, None, None] ** 2 * np.eye(2)
@@ -602,15 +569,11 @@ def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArr
 
 
 def _scatter(both: TwoAttitudes, count: int) -> float:
-    """Return the ratio of the observed variance of the residuals to the assumed variance.
+    """Return the ratio of the observed variance of the residuals of `count` stars to the assumed variance.
 
     The fit of each attitude has two residual components per star and three parameters. The variance ratio is
     multiplied by nu/(nu - 2), where nu is the number of degrees of freedom, to allow for the uncertainty of
     the ratio (Student's t distribution).
-
-    Args:
-        both: attitudes at the start and end of the exposure.
-        count: number of stars.
     """
     freedom = 4 * count - 6
     squares = 2.0 * (both.start.loss + both.end.loss)

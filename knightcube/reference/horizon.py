@@ -153,13 +153,7 @@ def scan_horizon(frame: Image, camera: CameraModel, lines: int = LINES) -> Scann
 
 
 def circle_nadir(circle: HorizonCircle, camera: CameraModel, altitude: float) -> FloatArray:
-    """Return the nadir direction (3,) in camera axes.
-
-    Args:
-        circle: horizon circle in the image of the ideal pinhole camera, px.
-        camera: model of the camera.
-        altitude: altitude of the satellite, m.
-    """
+    """Return the nadir (3,) in camera axes for a circle in the ideal pinhole's image and an altitude, m."""
     off = circle.centre - np.array(camera.ideal.centre)
     distance = float(np.linalg.norm(off))
     towards = off / distance if distance > _ON_AXIS else np.array([1.0, 0.0])
@@ -213,12 +207,7 @@ def horizon_plane_depth(altitude: float) -> float:
 def graphic_nadir(
     cameras: tuple[LevelCamera, LevelCamera], horizons: tuple[HorizonCircle, HorizonCircle], altitude: float
 ) -> FloatArray:
-    """Return the nadir direction (3,) in body axes by the Graphic Method.
-
-    Args:
-        cameras: the two cameras.
-        horizons: horizon circle in the image of each camera, px.
-        altitude: altitude of the satellite, m.
+    """Return the nadir direction (3,) in body axes by the Graphic Method, for an altitude in m.
 
     Raises GraphicMethodError if the boresights of the cameras are nearly parallel.
     """

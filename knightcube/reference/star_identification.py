@@ -172,12 +172,8 @@ class ScaledField:
         """Return the angles (k,) between observed stars, with lower and upper limits (k,) of the true angles.
 
         The limits allow for the error of the scale, and for `tolerance` standard deviations of the angle, or
-        of its cosine (Michalski, eq. 31) if `cosine_limits` is set.
-
-        Args:
-            one: (k,) indices of the first observed stars.
-            other: (k,) indices of the second observed stars.
-            tolerance: tolerance of the angles in standard deviations.
+        of its cosine (Michalski, eq. 31) if `cosine_limits` is set. The observed stars have the indices `one`
+        and `other` (k,).
         """
         angle = angles(self.direction[one], self.direction[other])
         if self.cosine_limits:
@@ -245,13 +241,7 @@ def search(
 ) -> StarMatch:
     """Return the first candidate of a method that passes the verification with all observed stars.
 
-    Raises FieldUnknown if the image scale is too uncertain.
-
-    Args:
-        field: observed stars.
-        sky: guide stars and tables of their patterns.
-        propose: function of the method that yields candidates.
-        settings: settings of the method.
+    The function `propose` yields the candidates. Raises FieldUnknown if the image scale is too uncertain.
     """
     if len(field) < settings.verification.least_matches:
         return nothing(field, MatchStatus.TOO_FEW_STARS)
@@ -645,16 +635,9 @@ def identify_by_rate(
 ) -> StarMatch:
     """Return the identification of a star field by rate matching.
 
+    Without the `motion` of the observed points, all points are treated as stars and the attitude as constant.
     Raises FieldUnknown if the image scale is too uncertain, and ValueError if `motion` and `field` differ in
     length.
-
-    Args:
-        field: observed stars.
-        sky: guide stars and tables of their patterns.
-        settings: settings of the method.
-        motion: motion of the observed points; if None, all points are treated as stars and the attitude as
-            constant.
-        previous: previous attitude, None if unknown.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)
@@ -680,12 +663,8 @@ def identify_by_rate(
 def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
     """Return the body rate with which most observed points agree, by least squares over these points.
 
-    A rate is computed from each pair of the first ten points, and the rate with which most points agree is
-    the initial guess. Raises ValueError if the numbers of directions and velocities differ.
-
-    Args:
-        direction: (n, 3) unit vectors to the points in the camera frame.
-        motion: motion of the points.
+    A rate is computed from each pair of the first ten points `direction` (n, 3), and the rate with which most
+    points agree is the initial guess. Raises ValueError if the numbers of directions and velocities differ.
     """
     if len(motion.velocity) != len(direction):
         raise ValueError(f"{len(direction)} directions and {len(motion.velocity)} velocities: give one each")
@@ -825,10 +804,7 @@ def match_images(
 def _image_motion(observed: FloatArray, predicted: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the rotation (4,) of the camera that moves the predicted image onto the observed image.
 
-    Args:
-        observed: (n, 3) observed unit vectors in camera axes.
-        predicted: (n, 3) unit vectors of the same stars for the prior attitude, in camera axes.
-        weight: (n,) weights of the stars with a sum of one.
+    The unit vectors (n, 3) are in camera axes, and the weights (n,) have a sum of one.
     """
     if min(observed[:, 2].min(), predicted[:, 2].min()) <= 0.0:
         raise AttitudeError("image matching needs all observed and predicted stars in front of the camera")

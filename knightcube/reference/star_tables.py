@@ -191,10 +191,7 @@ def build_pairs(stars: GuideStars, widest: float) -> PairTable:
 def faintest_for(stars: GuideStars, solid_angle: float, wanted: float) -> float:
     """Return the limiting magnitude at which a field of view contains `wanted` guide stars on average.
 
-    Args:
-        stars: guide stars in order of brightness.
-        solid_angle: solid angle of the field of view, sr.
-        wanted: mean number of guide stars in the field of view.
+    The stars are in order of brightness, and `solid_angle` is the size of the field of view, sr.
     """
     number = int(np.ceil(wanted * 4.0 * np.pi / solid_angle))
     return (
@@ -217,12 +214,8 @@ def cosine_sigma(cosine: FloatArray, one: FloatArray, other: FloatArray) -> Floa
 
     With the covariance R = sigma^2 (I - b b^T) of a direction b (eq. 25b), the variance of eq. 31 becomes
     (sigma_1^2 + sigma_2^2) sin^2 + sigma_1^2 sigma_2^2 (1 + cos^2). The second term is the trace of R1 R2,
-    which matters only if the angle between two stars is of the order of the direction errors.
-
-    Args:
-        cosine: (k,) cosines of the angles between two stars.
-        one: (k,) standard deviations of the directions of the first stars, rad.
-        other: (k,) standard deviations of the directions of the second stars, rad.
+    which matters only if the angle between two stars is of the order of the direction errors. The standard
+    deviations of the directions are `one` and `other` (k,), rad.
     """
     first, second, square = one**2, other**2, cosine**2
     return np.asarray(np.sqrt((first + second) * (1.0 - square) + first * second * (1.0 + square)))
@@ -256,13 +249,10 @@ def planar_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def measured_planar_shape(corners: FloatArray, sigma: FloatArray) -> TriangleShape:
-    """Return the shapes of planar triangles with standard deviations (Michalski, eq. 38-48).
+    """Return the shapes of t planar triangles with standard deviations (Michalski, eq. 38-48).
 
-    A triangle with zero area has infinite standard deviations, because the area is not differentiable.
-
-    Args:
-        corners: (t, 3, 3) unit vectors to the corners of t triangles.
-        sigma: (t, 3) standard deviations of the corners, rad.
+    The corners (t, 3, 3) are unit vectors with the standard deviations `sigma` (t, 3), rad. A triangle with
+    zero area has infinite standard deviations, because the area is not differentiable.
     """
     a, b, c = _sides(corners)
     area, moment = planar_shape(corners)
@@ -346,9 +336,7 @@ def spherical_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 def measured_spherical_shape(corners: FloatArray, sigma: FloatArray) -> TriangleShape:
     """Return the shapes of spherical triangles with standard deviations from numerical derivatives.
 
-    Args:
-        corners: (t, 3, 3) unit vectors to the corners of t triangles.
-        sigma: (t, 3) standard deviations of the corners, rad.
+    The arguments are those of `measured_planar_shape`.
     """
     area, moment = spherical_shape(corners)
     variance_area, variance_moment = np.zeros_like(area), np.zeros_like(moment)
@@ -405,14 +393,9 @@ class TriangleTable:
 def build_triangles(
     direction: FloatArray, pairs: PairTable, chosen: BoolArray, widest: float, shape: Shape
 ) -> TriangleTable:
-    """Return the table of all triangles of selected guide stars whose sides are at most `widest`.
+    """Return the table of all triangles of the `chosen` (n,) guide stars with sides of at most `widest` rad.
 
-    Args:
-        direction: (n, 3) unit vectors to the guide stars.
-        pairs: table of pairs of these guide stars.
-        chosen: (n,) whether each guide star is selected.
-        widest: largest side of a triangle, rad.
-        shape: function that returns areas and polar moments of triangles.
+    The function `shape` returns areas and polar moments of triangles.
     """
     corners = ordered(direction, _triangles(pairs, chosen, widest))
     area, moment = shape(direction[corners])
@@ -492,13 +475,7 @@ class GridTable:
 
 
 def build_grid(direction: FloatArray, tree: cKDTree, radius: float) -> GridTable:
-    """Return the table of the grid patterns of all guide stars.
-
-    Args:
-        direction: (n, 3) unit vectors to the guide stars.
-        tree: search tree of the guide star directions.
-        radius: radius of the patterns, rad.
-    """
+    """Return the table of the grid patterns, with a radius in rad, of all guide stars (n, 3)."""
     pairs = tree.query_pairs(2.0 * np.sin(0.5 * radius), output_type="ndarray").astype(np.int64)
     centre = np.concatenate([pairs[:, 0], pairs[:, 1]])
     other = np.concatenate([pairs[:, 1], pairs[:, 0]])
@@ -519,13 +496,7 @@ def build_grid(direction: FloatArray, tree: cKDTree, radius: float) -> GridTable
 
 
 def tangent_positions(direction: FloatArray, centre: IntArray, others: FloatArray) -> FloatArray:
-    """Return the positions (k, 2) of stars on the tangent planes at other stars.
-
-    Args:
-        direction: (n, 3) unit vectors to all stars.
-        centre: (k,) indices of the stars at the origins of the tangent planes.
-        others: (k, 3) unit vectors to the projected stars.
-    """
+    """Return the positions (k, 2) of stars `others` (k, 3) on the tangent planes at stars `centre` (k,)."""
     z = direction[centre]
     helper = np.where(np.abs(z[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     x = np.cross(helper, z)
@@ -536,13 +507,7 @@ def tangent_positions(direction: FloatArray, centre: IntArray, others: FloatArra
 
 
 def cells_of(place: FloatArray, along: FloatArray, radius: float) -> IntArray:
-    """Return the grid cells (k,) of positions in tangent planes.
-
-    Args:
-        place: (k, 2) positions of stars on the tangent planes.
-        along: (k, 2) positions of the stars that define the +x axis of the grid.
-        radius: radius of the patterns, rad.
-    """
+    """Return the grid cells (k,) of positions (k, 2) in tangent planes, with +x towards `along` (k, 2)."""
     unit = along / np.linalg.norm(along, axis=-1, keepdims=True)
     x = np.sum(place * unit, axis=-1)
     y = unit[:, 0] * place[:, 1] - unit[:, 1] * place[:, 0]

@@ -347,18 +347,10 @@ def found_in_image(
 ) -> FrameFound:
     """Return the solution of an image (rows, columns), and the lens parameters estimated up to this image.
 
-    Args:
-        pixels: counts of the image (rows, columns).
-        camera: assumed camera, with the same numbers of rows and columns as the image.
-        scale: lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for a
-            calibrated camera.
-        exposure: exposure time, s.
-        sky: the guide stars.
-        settings: settings of star detection, identification and attitude.
-        attitude_prior: predicted attitude. Stars are first searched near their predicted positions.
-        rate_prior: predicted rate. The predicted rate determines the sense of the rotation, which a single
-            frame does not show.
-        lens: lens parameters estimated from earlier images of the camera, or None if they are not estimated.
+    The scale is the lowest and highest ratio of the true to the assumed tangents of field angles, (1, 1) for
+    a calibrated camera. Stars are first searched near the positions predicted by `attitude_prior`. The
+    predicted rate determines the sense of the rotation, which a single frame does not show. The parameters
+    `lens` are estimated from earlier images of the camera, or None if they are not estimated.
     """
     tracker = TrackerSettings(settings, scale)
     # The attitude depends only on the positions of the stars, so that a rate with a large uncertainty is

@@ -422,17 +422,10 @@ def calibrate_one_lens(
 ) -> tuple[DeterminedLens, dict[int, str]]:
     """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    A frame is excluded if it was taken with another focus or zoom, or if its solution is wrong. A frame is
-    excluded if its focal length differs from the median by more than 5 standard deviations and by more than 1
-    %, or if a fit rejects more than half of its matches.
-
-    Args:
-        frames: the frames.
-        initial: camera from which the fit starts.
-        focal_lengths: focal length (m,) from each frame alone, px.
-        sigmas: standard deviations (m,) of the focal lengths, px.
-
-    Raises CalibrationError for the same reasons as `calibrate`.
+    The focal length (m,) from each frame alone, px, has the standard deviation `sigmas` (m,). A frame is
+    excluded if it was taken with another focus or zoom, or if its solution is wrong: if its focal length
+    differs from the median by more than 5 standard deviations and by more than 1 %, or if a fit rejects more
+    than half of its matches. Raises CalibrationError for the same reasons as `calibrate`.
     """
     usual = float(np.median(focal_lengths))
     different = np.abs(focal_lengths - usual) > np.maximum(5.0 * sigmas, 0.01 * usual)

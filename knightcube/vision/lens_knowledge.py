@@ -292,13 +292,9 @@ def matched_frame(
 ) -> MatchedFrame:
     """Return the identified stars of a solution as a matched frame.
 
-    Args:
-        solution: a solved frame.
-        sky: the guide stars of the solution.
-        velocity: velocity of the camera (3,), m/s, for the correction of aberration, or None.
-        shutter: line time with which the frame was solved, and its standard deviation, s. If `shutter` is
-            given, the matched frame includes the covariances of the positions and the effect of the line
-            time.
+    The velocity (3,) of the camera, m/s, corrects aberration. With `shutter`, which is the line time of the
+    solution and its standard deviation, s, the matched frame includes the covariances of the positions and
+    the effect of the line time.
     """
     matched = solution.matched
     own, points = solution.covariance[matched], solution.points[matched]
@@ -513,16 +509,12 @@ class LensKnowledge:
         velocity: FloatArray | None = None,
         elapsed: float = 0.0,
     ) -> LensKnowledge:
-        """Return the estimate after a frame. A frame with too few stars has no effect.
+        """Return the estimate after a frame, `elapsed` s after the last one. Too few stars have no effect.
 
-        If the frame contradicts the estimated lens, the result is the configured lens, the attribute
-        `contradictions` is increased by one, and the frame should be solved again with the configured lens.
-
-        Args:
-            solution: the frame, solved with `camera` and `shutter` of this object.
-            sky: the guide stars with which the frame was solved.
-            velocity: velocity of the camera (3,), m/s, with which the frame was solved, or None.
-            elapsed: time since the last frame, s.
+        The frame was solved with `camera` and `shutter` of this object and, if given, with the velocity (3,)
+        of the camera, m/s. If the frame contradicts the estimated lens, the result is the configured lens,
+        the attribute `contradictions` is increased by one, and the frame should be solved again with the
+        configured lens.
         """
         motion, line_time_known = solution.motion, self.shutter[1] == 0.0
         if solution.fix is None or solution.mirrored or len(solution.matched) < _LEAST_MATCHED:

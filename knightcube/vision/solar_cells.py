@@ -276,16 +276,11 @@ class FieldAndStrings:
     def accept(
         self, currents: FloatArray, field: FloatArray, sigma: float, sky: KnownDirections, blur: float = 0.0
     ) -> StringFix | None:
-        """Return the attitude from one reading, or None if the possible rotations do not determine it.
+        """Return the attitude from one reading of the currents (n,), A, or None if it is not determined.
 
-        Returns None if no rotation is possible, or if the possible rotations span more than half a circle.
-
-        Args:
-            currents: currents (n,) of the strings, A.
-            field: magnetic field (3,) at the time of the reading, body axes, T.
-            sigma: standard deviation of each component of the magnetic field, T.
-            sky: known directions in inertial axes.
-            blur: rotation angle of the body during the reading, rad.
+        The magnetic field (3,), body axes, T, has the standard deviation `sigma` per component, and the body
+        rotates by `blur` rad during the reading. Returns None if no rotation is possible, or if the possible
+        rotations span more than half a circle.
         """
         strength = float(np.linalg.norm(sky.field))
         axis, across = field / np.linalg.norm(field), sigma / strength

@@ -376,14 +376,9 @@ def camera_of_field(
     """Return a pinhole camera for a field of view, and the lowest and highest possible scale.
 
     The tangents of the observed field angles must be multiplied by the scale for the true field of view.
-
-    Args:
-        fov_deg: field of view across the columns, deg. If `fov_deg` is None, the range `UNKNOWN_FOV_DEG` is
-            used.
-        error_deg: largest error of the field of view, deg; None: 5 % of it.
-        shape: number of rows and columns of the image.
-
-    Raises InputError if the field of view is not between 1 and 120 deg.
+    Without `fov_deg`, deg across the columns, the range `UNKNOWN_FOV_DEG` is used. Without the largest error
+    `error_deg`, deg, it is 5 % of the field. Raises InputError if the field of view is not between 1 and 120
+    deg.
     """
     _check_field_of_view(fov_deg, error_deg)
     lowest, highest = UNKNOWN_FOV_DEG

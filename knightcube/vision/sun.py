@@ -608,17 +608,10 @@ def sun_of_cameras(
 ) -> SunOfCameras:
     """Return the Sun direction in body axes from the first camera that finds it, or from the solar strings.
 
-    A camera is not read if, according to the solar strings, the Sun cannot be in its field of view. A
-    measured Sun that contradicts the solar strings is rejected.
-
-    Args:
-        images: images (rows, columns) taken at one instant, by camera index.
-        cameras: all cameras of the body.
-        strings: coarse Sun direction from the solar strings.
-        settings: settings of the search for the Sun.
-
-    Raises:
-        ValueError: if an image does not have the size of its camera, or has non-finite pixels.
+    The images (rows, columns), by camera index, were taken at one instant. A camera is not read if, according
+    to the solar strings, the Sun cannot be in its field of view. A measured Sun that contradicts the solar
+    strings is rejected. Raises ValueError if an image does not have the size of its camera, or has non-finite
+    pixels.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}

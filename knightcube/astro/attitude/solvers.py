@@ -156,14 +156,11 @@ def _by_eigenvalue(
 ) -> FloatArray:
     """Return the optimal quaternion (4,) by a formula that needs the largest eigenvalue of K.
 
-    The error of the polynomial's root is the rounding error divided by the product of the eigenvalue
-    differences, and is therefore large for two close directions. The eigenvalue is therefore improved by the
-    Rayleigh quotient, whose error is quadratic in the error of the quaternion. Raises AttitudeError if the
-    largest eigenvalue is double, so that the attitude is undefined.
-
-    Args:
-        profile: (3, 3) attitude profile matrix.
-        quaternion_at: function that returns the quaternion (4,) for the profile matrix and the eigenvalue.
+    The function `quaternion_at` returns the quaternion for the profile matrix and the eigenvalue. The error
+    of the polynomial's root is the rounding error divided by the product of the eigenvalue differences, and
+    is therefore large for two close directions. The eigenvalue is therefore improved by the Rayleigh
+    quotient, whose error is quadratic in the error of the quaternion. Raises AttitudeError if the largest
+    eigenvalue is double, so that the attitude is undefined.
     """
 
     def check(root: float) -> None:
@@ -336,15 +333,10 @@ class OlaeSolution:
 
 
 def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) -> OlaeSolution:
-    """Return the least-squares rotation between two sets of directions (Sease, eq. 4.1-4.7).
+    """Return the least-squares rotation from unit vectors `starts` to `ends` (n, 3) (Sease, eq. 4.1-4.7).
 
     Raises numpy.linalg.LinAlgError if the directions do not determine a rotation, for example a single
     direction.
-
-    Args:
-        starts: (n, 3) unit vectors before the rotation.
-        ends: (n, 3) unit vectors after the rotation.
-        weights: (n,) weights of the directions.
     """
     sums, differences = ends + starts, ends - starts
     cross = cross_matrices(sums)

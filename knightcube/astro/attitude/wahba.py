@@ -97,12 +97,8 @@ class Sightings:
 def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Sightings:
     """Check directions and return them with the quantities that all solvers need.
 
-    Raises AttitudeError for directions that are invalid or do not determine an attitude.
-
-    Args:
-        observed: (n, 3) observed unit vectors.
-        reference: (n, 3) reference unit vectors.
-        sigma: (n,) standard deviations of the observed directions, rad.
+    Raises AttitudeError for directions that are invalid or do not determine an attitude. The arguments are
+    those of `Solver`.
     """
     n = len(observed)
     if observed.shape != (n, 3) or reference.shape != (n, 3) or sigma.shape != (n,):
@@ -135,12 +131,7 @@ def profile_matrix(observed: FloatArray, reference: FloatArray, weights: FloatAr
 
 
 def fix(seen: Sightings, quaternion: FloatArray) -> AttitudeFix:
-    """Return the refined optimal attitude with covariance and loss (Sease, eq. 3.23).
-
-    Args:
-        seen: checked directions.
-        quaternion: (4,) attitude computed by a solver.
-    """
+    """Return the optimal attitude, refined from a solver's attitude (4,) (Sease, eq. 3.23)."""
     optimum, loss = refine(seen, quaternion)
     return AttitudeFix(upright(optimum), seen.covariance, loss)
 
@@ -201,14 +192,9 @@ def _squared_sines(vectors: FloatArray) -> FloatArray:
 
 
 def attitude_of_pair(seen: Sightings, first: int, second: int) -> FloatArray:
-    """Return the TRIAD attitude quaternion (4,) of two directions.
+    """Return the TRIAD attitude quaternion (4,) of the directions with the indices `first` and `second`.
 
     The attitude rotates the first reference direction exactly into the first observed direction.
-
-    Args:
-        seen: checked directions.
-        first: index of the first direction.
-        second: index of the second direction.
     """
 
     def triad(vectors: FloatArray) -> FloatArray:
@@ -234,10 +220,6 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
     unique.
 
     Raises AttitudeError if the iteration does not converge, or converges to a point that is not a minimum.
-
-    Args:
-        seen: checked directions.
-        quaternion: (4,) initial attitude.
     """
     weight = seen.weight[:, None]
     # The variable `narrowness` is about 1 / (angular extent of the directions, rad)^2.

@@ -52,12 +52,7 @@ class Pressures:
         return Pressures(self.air[:count], self.light[:count])
 
     def facing(self, areas: FloatArray, to_body: FloatArray) -> Pressures:
-        """Return the pressure vectors multiplied by the exposed area of a box.
-
-        Args:
-            areas: (3,) relative areas of the faces of the box.
-            to_body: (n, 3, 3) attitude matrices from ICRS to body axes.
-        """
+        """Return the pressure vectors multiplied by the exposed area of a box with face areas (3,)."""
         found = [
             vector * exposed_area(areas, np.einsum("nij,nj->ni", to_body, vector))
             for vector in (self.air, self.light)
@@ -66,14 +61,10 @@ class Pressures:
 
 
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
-    """Return the pressure vectors of air and sunlight along an orbit.
+    """Return the pressure vectors of air and sunlight along an orbit, at times (n,) of the ephemeris, s.
 
     The relative strength of the air pressure is about one at an altitude of 500 km, and that of the sunlight
     is one in full sunlight.
-
-    Args:
-        ephemeris: predicted orbit.
-        times: (n,) times of the ephemeris, s.
     """
     position, velocity = ephemeris.position_at(times), ephemeris.velocity_at(times)
     sun = ephemeris.sun_at(times)
@@ -97,13 +88,10 @@ def mean_density(distance: float) -> float:
 
 
 def box_areas(inertia: FloatArray) -> FloatArray:
-    """Return the relative areas (3,) of the faces of a homogeneous box with a given inertia.
+    """Return the relative areas (3,) of the faces of a homogeneous box with an inertia tensor (3, 3), kg m^2.
 
-    The areas are scaled to a mean projected area of one. If no homogeneous box has the given moments of
-    inertia, a flat box is used.
-
-    Args:
-        inertia: (3, 3) inertia matrix of the body, whose principal axes are close to the body axes, kg m^2.
+    The principal axes must be close to the body axes. The areas are scaled to a mean projected area of one.
+    If no homogeneous box has the given moments of inertia, a flat box is used.
     """
     moments = np.diag(inertia)
     square = np.maximum(0.5 * moments.sum() - moments, _THINNEST * moments.max())  # side^2 mass / 12
@@ -112,12 +100,7 @@ def box_areas(inertia: FloatArray) -> FloatArray:
 
 
 def exposed_area(areas: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return the projected areas (n, 1) of a box in given directions.
-
-    Args:
-        areas: (3,) relative areas of the faces of the box.
-        direction: (n, 3) directions in body axes, not necessarily unit vectors.
-    """
+    """Return the projected areas (n, 1) of a box with face areas (3,) in directions (n, 3) of any length."""
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     return np.asarray((np.abs(direction) @ areas)[:, None] / np.where(length > 0.0, length, 1.0))
 
@@ -125,9 +108,8 @@ def exposed_area(areas: FloatArray, direction: FloatArray) -> FloatArray:
 def shapes(found: Pressures, to_body: FloatArray) -> FloatArray:
     """Return the derivatives (n, 3, 9) of the torque in body axes with respect to the torque components.
 
-    Args:
-        found: pressure vectors of air and sunlight, each multiplied by the body's exposed area.
-        to_body: (n, 3, 3) attitude matrices from ICRS to body axes.
+    The pressure vectors `found` are multiplied by the body's exposed area. The attitude matrices `to_body`
+    (n, 3, 3) rotate ICRS into body axes.
     """
     torque = np.empty((len(to_body), 3, SIZES))
     torque[:, :, CONSTANT] = np.eye(3)

@@ -106,15 +106,10 @@ class Ephemeris:
 
 
 def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris:
-    """Return the ephemeris for a time interval after an orbit state, including the oblateness term J2.
+    """Return the ephemeris for `duration` s after an orbit state in steps of `step` s, including the term J2.
 
     The neglected drag and higher gravity terms shift a satellite by one kilometre in two revolutions, which
     changes the field by 15 nT. The field is extrapolated outside the years of its model.
-
-    Args:
-        state: orbit state at the start.
-        duration: duration of the prediction, s.
-        step: time step, s.
     """
     times: FloatArray = step * np.arange(np.ceil(duration / step) + 2.0)
     dates = state.julian_date + times / DAY
@@ -154,15 +149,11 @@ LARGEST_JUMP = 50e3
 
 
 def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the field (n, 3) in ICRS axes, T, predicted by a dipole model.
+    """Return the field (n, 3) in ICRS axes, T, predicted by a dipole model for `times` (n,) after now, s.
 
     The satellite is assumed to move along a circle with its current position, direction and angular rate. The
-    dipole field is rotated and scaled to agree with the current field, and this correction decays with time.
-
-    Args:
-        state: current orbit state.
-        field: (3,) current field in ICRS axes, T.
-        times: (n,) times after the current state, s.
+    dipole field is rotated and scaled to agree with the current field (3,), and this correction decays with
+    time.
     """
     all_times = np.concatenate([[0.0], times])
     distance = float(np.linalg.norm(state.position))
@@ -195,12 +186,7 @@ class FieldAhead:
         self._fields: list[FloatArray] = []
 
     def along(self, state: OrbitState, times: FloatArray) -> FloatArray:
-        """Return the geomagnetic field (n, 3) in ICRS axes, T, along the orbit.
-
-        Args:
-            state: current orbit state.
-            times: (n,) increasing times after the current state, s.
-        """
+        """Return the geomagnetic field (n, 3) in ICRS axes, T, at increasing times (n,) after `state`, s."""
         since = self._restart(state)
         last = since + float(times[-1])
         for _ in range(NODES_PER_CALL):

@@ -59,14 +59,8 @@ def extrapolation_sigma(julian_date: float) -> float:
 def field_on_ground_axes(year: float, latitude: float, longitude: float, height: float) -> FloatArray:
     """Return the north, east and down components (3,) of the geomagnetic field, T, at geodetic coordinates.
 
-    The field is extrapolated outside the years 2025.0 to 2030.0. Raises GeomagneticError for an invalid
-    position.
-
-    Args:
-        year: decimal year.
-        latitude: geodetic latitude, rad.
-        longitude: longitude, rad.
-        height: height above the WGS 84 ellipsoid, m.
+    Angles are in rad, and the height above the WGS 84 ellipsoid is in m. The field is extrapolated outside
+    the decimal years 2025.0 to 2030.0. Raises GeomagneticError for an invalid position.
     """
     if not (abs(latitude) <= 0.5 * math.pi and math.isfinite(longitude) and math.isfinite(height)):
         raise GeomagneticError(
@@ -82,13 +76,9 @@ def field_on_ground_axes(year: float, latitude: float, longitude: float, height:
 
 
 def field(julian_date: float, position: FloatArray) -> FloatArray:
-    """Return the geomagnetic field (3,) in ICRS axes, T, at a time and a geocentric position.
+    """Return the geomagnetic field (3,) in ICRS axes, T, at a Julian date UTC and a position (3,), ICRS, m.
 
     A call takes 0.2 ms. The field is extrapolated outside the years of the model.
-
-    Args:
-        julian_date: Julian date UTC.
-        position: (3,) geocentric position in ICRS axes, m.
     """
     to_ground = celestial_to_terrestrial(julian_date)
     longitude, latitude, height = (float(part) for part in geodetic(to_ground @ position))
@@ -99,14 +89,10 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
 
 
 def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return the fields (n, 3) in ICRS axes, T, at n times and positions, equal to the results of `field`.
+    """Return the fields (n, 3) at n Julian dates UTC and positions (n, 3), equal to the results of `field`.
 
     The expansion is evaluated for all positions together. For a hundred positions, the computation takes 0.03
     ms per position.
-
-    Args:
-        julian_dates: (n,) Julian dates UTC.
-        positions: (n, 3) geocentric positions in ICRS axes, m.
     """
     to_ground = celestial_to_terrestrial(julian_dates)
     there = np.array([turn @ position for turn, position in zip(to_ground, positions, strict=True)])

@@ -68,11 +68,7 @@ def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float =
 
 
 def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return longitude (...), rad, geodetic latitude (...), rad, and height (...), m, above WGS 84.
-
-    Args:
-        position: (..., 3) geocentric positions in ITRS axes, m.
-    """
+    """Return longitude and geodetic latitude, rad, and height above WGS 84, m, of ITRS positions (..., 3)."""
     longitude, latitude, height = erfa.gc2gd(1, np.asarray(position, dtype=float))
     return np.asarray(longitude), np.asarray(latitude), np.asarray(height)
 
@@ -80,12 +76,8 @@ def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def north_east_down(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> FloatArray:
     """Return matrices (..., 3, 3) whose rows are the unit vectors north, east and down in ITRS axes.
 
-    For a geodetic latitude, down is perpendicular to the ellipsoid. For a geocentric latitude, down points to
-    the centre of the Earth.
-
-    Args:
-        longitude: (...) longitudes, rad.
-        latitude: (...) latitudes, rad.
+    Longitudes and latitudes (...) are in rad. For a geodetic latitude, down is perpendicular to the
+    ellipsoid. For a geocentric latitude, down points to the centre of the Earth.
     """
     along, up = np.asarray(longitude, dtype=float), np.asarray(latitude, dtype=float)
     ca, sa, cu, su = np.cos(along), np.sin(along), np.cos(up), np.sin(up)

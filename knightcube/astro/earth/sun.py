@@ -42,11 +42,8 @@ def julian_date(utc: datetime) -> float:
 def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
     """Return the Earth's heliocentric position (3,), m, and barycentric velocity (3,), m/s, in ICRS axes.
 
-    From 1900 to 2100 the differences from the JPL ephemeris DE405 are below 12 km and 5 mm/s (documentation
-    of epv00).
-
-    Args:
-        julian_date: Julian date TT.
+    The Julian date is TT. From 1900 to 2100 the differences from the JPL ephemeris DE405 are below 12 km and
+    5 mm/s (documentation of epv00).
     """
     # ERFA is imported here, because most modules use only the constants of this module.
     import erfa  # noqa: PLC0415
@@ -100,16 +97,11 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
 
 
 def _covered_share(disc: FloatArray, cover: FloatArray, apart: FloatArray) -> FloatArray:
-    """Return the fraction (...) of one disc that is covered by another disc.
+    """Return the fraction (...) of a disc of angular radius `disc` that a disc of radius `cover` covers.
 
-    The covered area of two plane discs consists of two circular segments along the common chord. Plane discs
-    are a sufficient approximation, because the Sun's disc is small and the Earth's limb across the disc is
-    nearly straight.
-
-    Args:
-        disc: (...) angular radii of the covered disc, rad.
-        cover: (...) angular radii of the covering disc, rad.
-        apart: (...) angular distances of the centres, rad.
+    The centres are `apart` rad from each other. The covered area of two plane discs consists of two circular
+    segments along the common chord. Plane discs are a sufficient approximation, because the Sun's disc is
+    small and the Earth's limb across the disc is nearly straight.
     """
     crossing = (apart < disc + cover) & (apart > np.abs(disc - cover))
     safe = np.where(crossing, apart, disc + cover)

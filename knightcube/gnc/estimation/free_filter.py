@@ -499,17 +499,12 @@ class FreeFilter:
     ) -> None:
         """Reset the estimated matrix of the coils for one coil.
 
-        The estimate and its copies `memories` are changed. The reset is necessary after the sign or the gain
-        of the coil was corrected, because the estimated matrix refers to the dipole before the correction.
-        The error of the corrected dipole becomes zero, and its correlations with other states are deleted.
-        The settings give the new standard deviation of the corrected dipole, which along the coil is at least
-        `deviation`.
-
-        Args:
-            direction: unit vector (3,) of the coil, body axes.
-            dual: vector (3,) normal to the other coils, whose scalar product with `direction` is 1.
-            deviation: relative standard deviation of the corrected dipole.
-            memories: copies of earlier estimates.
+        The coil has the unit vector `direction` (3,) in body axes; the vector `dual` (3,) is normal to the
+        other coils and has the scalar product 1 with it. The estimate and its copies `memories` are changed.
+        The reset is necessary after the sign or the gain of the coil was corrected, because the estimated
+        matrix refers to the dipole before the correction. The error of the corrected dipole becomes zero, and
+        its correlations with other states are deleted. The settings give the new relative standard deviation
+        of the corrected dipole, which along the coil is at least `deviation`.
         """
         self.changes += 1
         kept = np.eye(STATES)

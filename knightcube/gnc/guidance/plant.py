@@ -50,12 +50,7 @@ def supply_power(current: FloatArray, voltage: float) -> FloatArray:
 
 
 def steady_heat(current: FloatArray, resistance: float | FloatArray) -> FloatArray:
-    """Return the heating power R I^2 of steady currents, W; pulse-width modulated coils consume more.
-
-    Args:
-        current: mean coil currents over a PWM period, A.
-        resistance: coil resistance, as a number or an array that broadcasts with `current`, ohm.
-    """
+    """Return the heating power R I^2 of steady currents, W; pulse-width modulated coils consume more."""
     return np.asarray(resistance * current * current)
 
 

@@ -266,11 +266,8 @@ def _line_edges(
 ) -> ScanEdges:
     """Return those edges on columns and rows whose step height exceeds `contrast`.
 
-    Args:
-        light: brightness of the columns and of the rows, each (n, m).
-        bright: which pixels of the columns and of the rows are bright, each (n, m).
-        places: indices of the columns and of the rows, each (n,).
-        contrast: minimum step height of an edge.
+    The brightness `light`, and the mask of bright pixels, of the columns and of the rows are (n, m) each, and
+    their indices `places` are (n,).
     """
     parts, read = [], 0
     for direction, binary in enumerate(bright):

@@ -168,11 +168,9 @@ def limb_in_view(
 ) -> LimbInView:
     """Return the length of a limb in the image and the number of its crossings with scan lines.
 
-    Args:
-        points: successive points around the closed limb (n, 2), px.
-        inside: mask of the points that are inside the image (n,).
-        due: mask of the points at which the limb should show an edge (n,).
-        space: distances between neighbouring scanned columns and between neighbouring scanned rows, px.
+    The points (n, 2), px, follow the closed limb. The masks (n,) mark the points inside the image, and the
+    points at which the limb is due to show an edge. The distances between scanned columns and between scanned
+    rows are `space`, px.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)

@@ -155,13 +155,8 @@ def why_not_space(view: LimbView, sun: FloatArray | None, samples: Samples, pixe
 
     Space is dark and has no texture beyond the noise of the detector. Stray light is smooth. Clouds have
     texture, and so has ground in front of a bright sky. The test compares medians, so that stars and
-    spacecraft structure have no effect if they cover less than half of the sky.
-
-    Args:
-        view: assumed view of the Earth.
-        sun: unit vector (3,) to the Sun in inertial axes, or None if unknown.
-        samples: sampled pixels of the image.
-        pixel: angular size of a pixel, rad.
+    spacecraft structure have no effect if they cover less than half of the sky. The Sun direction (3,) is in
+    inertial axes, or None, and `pixel` is the angular size of a pixel, rad.
     """
     outside = limb_residuals(view, samples.rays)
     away = np.ones(len(outside), dtype=bool)
@@ -273,10 +268,8 @@ def coarse_nadir(
 ) -> CoarseNadir | None:
     """Return the nadir that explains the brightness of all images, or None if the nadir is too uncertain.
 
-    Args:
-        looks: samples of each image, with their directions and brightness.
-        altitude: height of the cameras above the Earth's mean radius, m.
-        sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees, or None if unknown.
+    The altitude is above the Earth's mean radius, m. The Sun direction (3,) in body axes, accurate to ten
+    degrees, may be unknown.
     """
     rays = np.concatenate([look.rays for look in looks])
     bright = np.concatenate([look.bright for look in looks])
@@ -325,11 +318,8 @@ def _bright_probability(
 def _sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, distance: float) -> FloatArray:
     """Return the sine of the Sun's elevation at the points where rays meet the surface of a sphere.
 
-    Args:
-        cosine: cosine of the angle between each ray from the camera and nadir.
-        ahead: cosine of the angle between each ray from the camera and the Sun.
-        below: cosine of the angle between nadir and the direction of the Sun.
-        distance: distance of the camera from the centre of the sphere, in radii of the sphere.
+    The cosines are those of the angles between each ray and nadir, between each ray and the Sun (`ahead`),
+    and between nadir and the Sun (`below`). The camera's distance from the centre is in radii of the sphere.
     """
     depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
     return np.asarray((distance * cosine - depth) * ahead - distance * below)
@@ -377,11 +367,8 @@ Clouds alone cause a lower fraction of contradicting samples.
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:
     """Return why an image contradicts a known attitude, or an empty string if it agrees.
 
-    Args:
-        look: samples of the image, with their directions and brightness.
-        nadir: unit vector (3,) to nadir in body axes, accurate to a degree.
-        altitude: height of the camera above the Earth's mean radius, m.
-        sun: unit vector (3,) to the Sun in body axes, accurate to a degree.
+    Nadir and Sun are unit vectors (3,) in body axes, accurate to a degree. The altitude is above the Earth's
+    mean radius, m.
     """
 
     def mostly(against: BoolArray) -> bool:

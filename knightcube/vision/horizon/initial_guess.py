@@ -98,14 +98,10 @@ class ConeCandidate:
 def best_cone(
     edges: EdgeRays, free: BoolArray, cosines: tuple[float, float], tolerance: float, tries: int
 ) -> ConeCandidate | None:
-    """Return the cone with which most edges in the mask `free` agree, or None if no cone can be formed.
+    """Return the cone with which most edges in the mask `free` (n,) agree, or None if no cone can be formed.
 
-    Args:
-        edges: directions of the edges that were detected in the image.
-        free: mask of the edges that may be used (n,).
-        cosines: lower and upper limit of the cosine of the cone's half-angle; equal if the angle is known.
-        tolerance: largest distance of an agreeing edge from the cone, px.
-        tries: maximum number of pairs or triples of edges that are tried.
+    The limits `cosines` of the cosine of the cone's half-angle are equal if the angle is known. An edge
+    agrees within `tolerance` px. At most `tries` pairs or triples of edges are tried.
     """
     chosen = np.flatnonzero(free)
     if cosines[0] == cosines[1]:

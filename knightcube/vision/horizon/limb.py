@@ -414,12 +414,9 @@ _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
     """Return the brightness of air and ground at tangent heights, and their derivatives, 1/m, as (4, n, k).
 
-    Brightness is relative to sunlit air of infinite optical depth, and to ground without air. The blur is
+    Brightness is relative to sunlit air of infinite optical depth, and to ground without air. The k heights
+    along each of n scan lines are (n, k), m, and the Gaussian blur of each scan line is (n,), m. The blur is
     rounded to the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
-
-    Args:
-        heights: tangent heights of k samples along n scan lines (n, k), m.
-        blur: standard deviation of the Gaussian blur of each scan line (n,), m.
     """
     table = _limb_table()
     width = np.log(np.clip(blur, _SHARPEST, _BROADEST) / _SHARPEST) / math.log(_BROADEST / _SHARPEST)

@@ -544,15 +544,9 @@ def fit_with_distortion(
 ) -> DistortedFit | None:
     """Return a match extended to the stars that match only if the distortion of the lens is fitted.
 
-    Returns None if the matched stars do not determine the distortion.
-
-    Args:
-        field: observed points of the frame.
-        sky: index of the guide stars.
-        expected: indices of the guide stars in and around the field, the brightest first.
-        observed: indices of the points that match without distortion (k,).
-        star: indices of the guide stars that these points match (k,).
-        start: attitude and scale of the match without distortion.
+    The points `observed` (k,) match the guide stars `star` (k,) without distortion at the attitude `start`.
+    The guide stars `expected` are in and around the field, the brightest first. Returns None if the matched
+    stars do not determine the distortion.
     """
     corner = math.hypot(*field.half_width)
     pose = _DistortedPose(start.matrix, start.scale, 0.0)

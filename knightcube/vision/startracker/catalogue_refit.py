@@ -76,12 +76,8 @@ def refit_with_catalogue(
 ) -> FrameSolution:
     """Return a solution with motion and attitude fitted again, or the same solution if the new fit fails.
 
-    Args:
-        pixels: counts of the solved frame (rows, columns).
-        solution: solution of a frame of streaks; a solution with a fitted focal length is returned unchanged.
-        sky: index of the guide stars.
-        settings: settings with which the frame was solved.
-        likelihood: settings of the fit of the streaks.
+    The arguments are those with which the frame of streaks was solved. A solution with a fitted focal length
+    is returned unchanged.
     """
     motion, fix = solution.motion, solution.fix
     if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:

@@ -164,18 +164,12 @@ def find_peaks(areas: Areas) -> Peaks:
 
 
 def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the indices (k,) of the peaks to measure, the highest first.
+    """Return the indices (k,) of the `peaks` (p,) to measure, the highest first.
 
     Local maxima that may be part of the wings of a brighter star are excluded. At most `most` peaks in the
-    open sky are selected, and at most a quarter of `most` in each sixteenth of the frame's area, so that a
-    bright cloud does not exclude the stars beside it. The same number of peaks outside the open sky is
-    selected as well, so that the widths of foreground sources are measured.
-
-    Args:
-        peaks: local maxima of the frame, the highest first.
-        open_sky: mask of the peaks that are in the open sky (p,).
-        shape: rows and columns of the frame.
-        most: maximum number of peaks in the open sky.
+    mask `open_sky` (p,) are selected, and at most a quarter of `most` in each sixteenth of the frame's area,
+    so that a bright cloud does not exclude the stars beside it. The same number of peaks outside the open sky
+    is selected as well, so that the widths of foreground sources are measured.
     """
     compared = np.sort(
         np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])

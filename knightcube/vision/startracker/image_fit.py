@@ -558,19 +558,10 @@ def attitude_by(
     """Return the attitude from a solver of Wahba's problem for the stars that agree in an image fit.
 
     The image fit excludes outliers and determines the lens errors. The solver uses the directions of the
-    stars that are not outliers, each with one standard deviation for both axes (Michalski, section 3.4).
-
-    Args:
-        solver: solver of Wahba's problem.
-        points: measured positions of the stars (n, 2), px.
-        covariance: covariances of the positions (n, 2, 2), px^2.
-        reference: unit vectors to the stars from the catalogue (n, 3).
-        camera: camera model with which the image fit was started.
-        fit: result of the image fit.
-        late: displacement of each star per standard deviation of the line time (n, 2), px; (0, 2) if the line
-            time is exact.
-
-    Raises AttitudeError if the stars do not determine the attitude.
+    stars that are not outliers, each with one standard deviation for both axes (Michalski, section 3.4). The
+    first arguments are those of `fit_in_image`. The displacement of each star per standard deviation of the
+    line time is `late` (n, 2), px; (0, 2) if the line time is exact. Raises AttitudeError if the stars do not
+    determine the attitude.
     """
     if len(late):
         points = points - fit.delay * late

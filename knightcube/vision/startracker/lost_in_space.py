@@ -225,14 +225,9 @@ def look_up(
 ) -> tuple[TriangleMatches, int]:
     """Return the matches of observed triangles in the index, and the number of index entries read.
 
-    Args:
-        field: observed points of the frame, some of which may not be stars.
-        sky: sky index of guide stars and their triangles.
-        steps: steps into which the range of image scales is divided.
-        triangles: indices of the observed stars at the corners of each triangle (t, 3).
-        tolerance: tolerance of a side ratio, in standard deviations.
-        distortion: additional error of a side ratio due to distortion of the lens.
-        most: maximum number of index entries to read, in the order of the observed triangles.
+    The corners of each triangle are `triangles` (t, 3). The tolerance of a side ratio is in standard
+    deviations, with an additional error due to `distortion` of the lens. At most `most` index entries are
+    read, in the order of the observed triangles.
     """
     observed, star, scale, code, read = _look_up(
         np.ascontiguousarray(field.direction),

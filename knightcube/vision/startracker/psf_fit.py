@@ -65,16 +65,10 @@ def cut(
     ceiling: float,
     trail: FloatArray | None = None,
 ) -> StarWindows:
-    """Return the windows around the pixels `middle` (n, 2), which must be inside the frame.
+    """Return the windows of half-width `half` around the pixels `middle` (n, 2), which are inside the frame.
 
-    Args:
-        pixels: counts of the frame (rows, columns).
-        middle: column and row of the middle pixel of each window (n, 2).
-        half: half-width of the windows around stars, px.
-        level: sky background in each window (n,), counts.
-        noise: standard deviation of a background pixel in each window (n,), counts.
-        ceiling: counts from which a pixel is saturated and not used.
-        trail: displacement of each star during the exposure (n, 2), px, or None for no displacement.
+    The level (n,) and noise (n,) of the sky in each window are in counts. A pixel with counts of `ceiling` or
+    more is saturated and not used. The displacement of each star during the exposure is `trail` (n, 2), px.
     """
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)
@@ -172,11 +166,8 @@ def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
 def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | None = None) -> FloatArray:
     """Return the fraction of each star's flux in each pixel of its window (n, k, k), rows first.
 
-    Args:
-        offset: position of each star relative to the centre of the middle pixel (n, 2), px.
-        sigma: standard deviation of the PSF of each star (n,), px.
-        half: half-width of the windows around stars, px.
-        trail: displacement of each star during the exposure (n, 2), px, or None for no displacement.
+    The offset of each star (n, 2) is relative to the centre of the middle pixel, px, `sigma` is the standard
+    deviation of its PSF (n,), px, and `trail` is its displacement during the exposure (n, 2), px.
     """
     out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))
     for shift, share in path(np.zeros_like(offset) if trail is None else trail):
@@ -745,13 +736,8 @@ def neighbour_light(
 ) -> FloatArray:
     """Return the counts of all neighbours in the window of each star (n, k, k).
 
-    Args:
-        pairs: pairs of a star and a neighbour.
-        windows: windows around the stars.
-        middle: column and row of the middle pixel of each window (n, 2).
-        offset: position of each star relative to the middle pixel (n, 2), px.
-        flux: flux of each star (n,), counts.
-        width: standard deviation of each star's Gaussian (n,), px.
+    Each star has its middle pixel (n, 2), offset from this pixel (n, 2), px, flux (n,), counts, and width
+    (n,), px.
     """
     size = 2 * windows.half + 1
     out = np.zeros((len(middle), size, size))

@@ -30,14 +30,10 @@ from knightcube.vision.startracker.attitude_fit import scale_slope
 
 
 def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return the apparent directions (n, 3) of stars for a moving camera, as unit vectors.
+    """Return the apparent directions (n, 3) of stars for a camera with a velocity (3,), m/s, as unit vectors.
 
-    Args:
-        direction: unit vectors to the stars (n, 3).
-        velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, in the same axes
-            as the directions.
-
-    Raises ValueError unless the velocity is finite and below the speed of light.
+    The velocity is relative to the solar system barycentre. Raises ValueError unless it is finite and below
+    the speed of light.
     """
     beta = np.asarray(velocity, dtype=float) / SPEED_OF_LIGHT
     square = float(beta @ beta)

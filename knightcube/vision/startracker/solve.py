@@ -158,11 +158,8 @@ def middle_covariance(
 ) -> FloatArray:
     """Return the covariance (3, 3), rad^2, of the measured attitude relative to the attitude at mid-exposure.
 
-    Args:
-        weighting: weighting of the attitudes during the exposure.
-        turns: estimated rotation vectors from mid-exposure to the times `NODES` (4, 3), rad.
-        angular_acceleration_psd: density of unmodelled white angular acceleration (3, 3), rad^2/s^3.
-        exposure: exposure time, s.
+    The rotation vectors `turns` (4, 3), rad, lead from mid-exposure to the times `NODES`. The density of the
+    unmodelled white angular acceleration is (3, 3), rad^2/s^3.
     """
     known = np.asarray(weighting.weights) @ turns
     return np.outer(known, known) + angular_acceleration_psd * weighting.noise_share * exposure**3

@@ -69,14 +69,11 @@ class Chance:
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
         """Return log10 of an upper bound on the expected number of chance matches as good as a given match.
 
-        Only expected stars down to a brightness limit are compared, and the limit with the most significant
-        match is selected. Because of this selection, the bound is multiplied by j^2 pi^2/6, where j - 1 is
-        the number of expected stars down to the limit that have no match.
-
-        Args:
-            gate: half-width within which a star matches, in standard deviations.
-            observed: indices of the matched observed stars in order of brightness.
-            ranks: indices of the expected stars that the observed stars match, in order of brightness.
+        The observed stars with the indices `observed` match the expected stars `ranks` within `gate` standard
+        deviations, both in order of brightness. Only expected stars down to a brightness limit are compared,
+        and the limit with the most significant match is selected. Because of this selection, the bound is
+        multiplied by j^2 pi^2/6, where j - 1 is the number of expected stars down to the limit that have no
+        match.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -215,13 +212,7 @@ def verify_first(
 ) -> StarMatch:
     """Return the identification by the first candidate that `verify` accepts, or NO_MATCH.
 
-    Args:
-        field: observed points of the frame.
-        sky: index of the guide stars.
-        matrices: attitude matrices of the candidates (c, 3, 3).
-        scales: image scales of the candidates (c,).
-        searched: fraction of all attitudes that the search for the candidates covered.
-        settings: settings of the verification.
+    The candidates have the attitude matrices (c, 3, 3) and scales (c,).
     """
     deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
     matching = _Matcher(deciding, sky, searched, settings)
