@@ -87,18 +87,9 @@ from knightcube.reference.star_tables import (
     tangent_positions,
 )
 from knightcube.vision.startracker import lost_in_space
-from knightcube.vision.startracker.attitude_fit import (
-    MatchStatus,
-    StarField,
-    StarMatch,
-    stretched,
-)
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch, stretched
 from knightcube.vision.startracker.index import SkyIndex
-from knightcube.vision.startracker.verification import (
-    VerificationSettings,
-    nothing,
-    verify,
-)
+from knightcube.vision.startracker.verification import VerificationSettings, nothing, verify
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,13 +271,7 @@ def _best(
     for number in np.argsort(-support, kind="stable")[: settings.verified]:
         if support[number] < least:
             return None
-        answer = verify(
-            view.field,
-            sky.index,
-            matrices[number],
-            view.scale,
-            settings=settings.verification,
-        )
+        answer = verify(view.field, sky.index, matrices[number], view.scale, settings=settings.verification)
         if answer.status is MatchStatus.IDENTIFIED:
             return answer
     return None

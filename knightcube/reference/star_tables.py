@@ -45,10 +45,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.startracker.index import (
-    GuideStars,
-    SkyIndex,
-)
+from knightcube.vision.startracker.index import GuideStars, SkyIndex
 
 
 @dataclass(frozen=True, slots=True, eq=False)

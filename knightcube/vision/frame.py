@@ -120,14 +120,7 @@ def _subtracted(pixels: Image, level: FloatArray, variance: FloatArray) -> tuple
 
 @loop_helper
 def _fill_row(
-    signal: Image,
-    floor: Image,
-    pixels: Image,
-    of_row: Image,
-    block: int,
-    width: int,
-    first: int,
-    last: int,
+    signal: Image, floor: Image, pixels: Image, of_row: Image, block: int, width: int, first: int, last: int
 ) -> None:
     """Write the columns `first` to `last` of a row of signal and variance from the block values `of_row`."""
     centre, scale = np.float32(block * width + 0.5 * (width - 1)), np.float32(1.0 / width)

@@ -503,11 +503,7 @@ class LensKnowledge:
         return replace(self, values=whole, covariance=spread, frames=1)
 
     def update(
-        self,
-        solution: FrameSolution,
-        sky: SkyIndex,
-        velocity: FloatArray | None = None,
-        elapsed: float = 0.0,
+        self, solution: FrameSolution, sky: SkyIndex, velocity: FloatArray | None = None, elapsed: float = 0.0
     ) -> LensKnowledge:
         """Return the estimate after a frame, `elapsed` s after the last one. Too few stars have no effect.
 

@@ -601,10 +601,7 @@ class SunOfCameras:
 
 
 def sun_of_cameras(
-    images: Mapping[int, Image],
-    cameras: Sequence[MountedCamera],
-    strings: CoarseSun,
-    settings: SunSettings,
+    images: Mapping[int, Image], cameras: Sequence[MountedCamera], strings: CoarseSun, settings: SunSettings
 ) -> SunOfCameras:
     """Return the Sun direction in body axes from the first camera that finds it, or from the solar strings.
 

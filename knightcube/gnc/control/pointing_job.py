@@ -35,12 +35,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import PlanningError
-from knightcube.gnc.control.pointing_path import (
-    CostToGo,
-    SweepCost,
-    linearised,
-    sweep,
-)
+from knightcube.gnc.control.pointing_path import CostToGo, SweepCost, linearised, sweep
 from knightcube.gnc.control.pointing_table import (
     PointingPreview,
     PointingTable,
@@ -287,11 +282,7 @@ def slew_table(
     gain, torque_part = (part[:count] for part in _tracking(tracked, ahead, dipole, begin, weights))
     dipoles, gains, torque_parts = (
         np.concatenate([slewed, np.repeat(kept, FINE, axis=0)])
-        for slewed, kept in (
-            (dipole, held.dipole),
-            (gain, held.gain),
-            (torque_part, held.torque_part),
-        )
+        for slewed, kept in ((dipole, held.dipole), (gain, held.gain), (torque_part, held.torque_part))
     )
     whole = _joined(flown, _finer(held.path, times, count))
     return PointingTable(whole, wanted, dipoles, gains, torque_parts, begin.sizes, path)

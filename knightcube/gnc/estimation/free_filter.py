@@ -491,11 +491,7 @@ class FreeFilter:
         self.field_error = then.field_error
 
     def renew_coil(
-        self,
-        direction: FloatArray,
-        dual: FloatArray,
-        deviation: float,
-        memories: Sequence[FreeMemory] = (),
+        self, direction: FloatArray, dual: FloatArray, deviation: float, memories: Sequence[FreeMemory] = ()
     ) -> None:
         """Reset the estimated matrix of the coils for one coil.
 

@@ -355,8 +355,5 @@ def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
     """
     if target.goal is Goal.GROUND:
         return ground(*target.numbers), velocity
-    return {
-        Goal.NADIR: (nadir, velocity),
-        Goal.VELOCITY: (velocity, nadir),
-        Goal.SUN: (sun, POLE),
-    }[target.goal]
+    along = {Goal.NADIR: (nadir, velocity), Goal.VELOCITY: (velocity, nadir), Goal.SUN: (sun, POLE)}
+    return along[target.goal]

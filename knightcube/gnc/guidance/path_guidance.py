@@ -14,13 +14,7 @@ from enum import StrEnum
 import numpy as np
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.plant import (
-    Q2_LIMIT,
-    PathSample,
-    PolynomialPath,
-    SingleAxisPlant,
-    q2_of,
-)
+from knightcube.gnc.guidance.plant import Q2_LIMIT, PathSample, PolynomialPath, SingleAxisPlant, q2_of
 from knightcube.gnc.guidance.vmc import StepPlan
 
 _CHECKED_POINTS = 600

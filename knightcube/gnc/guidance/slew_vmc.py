@@ -56,14 +56,7 @@ from knightcube.gnc.guidance.slew_model import (
 )
 from knightcube.gnc.guidance.slew_plan import SlewPlan, integrated, is_within_limits, refusal
 from knightcube.gnc.guidance.slew_program import SlewLimits, SlewProgram, Trajectory
-from knightcube.gnc.guidance.slew_search import (
-    GRIDS,
-    LAST_BARRIER,
-    LONGER,
-    SlewSearch,
-    SolvedPath,
-    guesses,
-)
+from knightcube.gnc.guidance.slew_search import GRIDS, LAST_BARRIER, LONGER, SlewSearch, SolvedPath, guesses
 from knightcube.gnc.guidance.vmc_program import CONVERGED, SOLVER_STOPS, SamplePoints, discretisation
 
 Numbers = NDArray[Any]

@@ -263,12 +263,7 @@ class PathProgram:
     """
 
     def __init__(
-        self,
-        plant: SingleAxisPlant,
-        family: PathFamily,
-        q2_limit: float,
-        horizon: float,
-        cost: PathCost,
+        self, plant: SingleAxisPlant, family: PathFamily, q2_limit: float, horizon: float, cost: PathCost
     ) -> None:
         self._plant = plant
         self._cost = cost

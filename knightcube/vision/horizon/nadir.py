@@ -421,11 +421,7 @@ def _search(
 
 
 def _closer_search(
-    search: _Search,
-    image: Image,
-    camera: CameraModel,
-    knowledge: HorizonKnowledge,
-    settings: HorizonSettings,
+    search: _Search, image: Image, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
 ) -> _Search:
     """Search an image again near the best horizon of a first search, on more scan lines."""
     best, before = search.hypotheses[0], search.observation

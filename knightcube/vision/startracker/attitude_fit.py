@@ -394,11 +394,7 @@ def _fill_rows(
                 + matrix[i, 1] * reference[k, 1]
                 + matrix[i, 2] * reference[k, 2]
             )
-        rows[k, 3], rows[k, 4], rows[k, 5] = (
-            w * bx - rows[k, 0],
-            w * by - rows[k, 1],
-            w * bz - rows[k, 2],
-        )
+        rows[k, 3], rows[k, 4], rows[k, 5] = (w * bx - rows[k, 0], w * by - rows[k, 1], w * bz - rows[k, 2])
         rows[k, 6], rows[k, 7], rows[k, 8] = w * bx * bz * bz, w * by * bz * bz, w * (bz * bz * bz - bz)
 
 
@@ -473,11 +469,7 @@ def _turn(matrix: FloatArray, turn: FloatArray) -> None:
 
 def _summed_cross(gram: list[list[float]], at: int) -> list[float]:
     """Return the sum of p x q over the stars; p begins at column 0 of the Gram matrix, q at column `at`."""
-    return [
-        gram[1][at + 2] - gram[2][at + 1],
-        gram[2][at] - gram[0][at + 2],
-        gram[0][at + 1] - gram[1][at],
-    ]
+    return [gram[1][at + 2] - gram[2][at + 1], gram[2][at] - gram[0][at + 2], gram[0][at + 1] - gram[1][at]]
 
 
 def _cross_matrix(vector: FloatArray) -> FloatArray:

@@ -85,16 +85,7 @@ class Detections:
         """Return detections without any source."""
         empty, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
         return cls(
-            np.zeros((0, 2)),
-            empty,
-            np.zeros((0, 2, 2)),
-            empty,
-            empty,
-            empty,
-            empty,
-            whole,
-            whole,
-            psf_sigma,
+            np.zeros((0, 2)), empty, np.zeros((0, 2, 2)), empty, empty, empty, empty, whole, whole, psf_sigma
         )
 
     @property

@@ -31,12 +31,7 @@ from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.startracker.attitude_fit import (
-    inflation,
-    scale_slope,
-    stretched,
-    turned,
-)
+from knightcube.vision.startracker.attitude_fit import inflation, scale_slope, stretched, turned
 from knightcube.vision.startracker.sky_map import ASPECT, BENDS, bend_slope, bent
 
 _MOST_STEPS = 8

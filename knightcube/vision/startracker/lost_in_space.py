@@ -42,11 +42,7 @@ from knightcube.vision.startracker.index import (
     SIZE_UNIT,
     SkyIndex,
 )
-from knightcube.vision.startracker.verification import (
-    VerificationSettings,
-    nothing,
-    verify_first,
-)
+from knightcube.vision.startracker.verification import VerificationSettings, nothing, verify_first
 
 _BRIGHTEST = 12
 _NEIGHBOURS = 5

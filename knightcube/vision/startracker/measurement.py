@@ -266,10 +266,7 @@ def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float)
     slopes = by_log.reshape(len(clean), 2, *clean.shape[1:]) / light[:, None]
     sound = (np.count_nonzero(used, axis=(1, 2)) >= _LEAST) & np.isfinite(bend)
     sound &= np.all(np.abs(place - start[0]) < _INSIDE, axis=1)
-    return (
-        np.where(sound[:, None], place, start[0]),
-        np.where(sound[:, None, None, None], slopes, start[1]),
-    )
+    return np.where(sound[:, None], place, start[0]), np.where(sound[:, None, None, None], slopes, start[1])
 
 
 METHODS: dict[str, Callable[[FloatArray, FloatArray, Centroid, float], Centroid]] = {
