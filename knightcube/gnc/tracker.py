@@ -167,7 +167,13 @@ def predict(
     if tide is not None:
         transition[:3, :3] += 0.5 * step**2 * tide
         transition[3:, :3] = step * tide
-    spread = transition @ state.covariance @ transition.T + _noise(state, step, motion, tide is not None)
+    along = np.outer(state.direction, state.direction)
+    rate = float(np.linalg.norm(state.rate))
+    wander = motion.residual_wander if tide is not None else motion.wander
+    density = wander * np.eye(3) + motion.bend**2 * rate**3 * along
+    spread = transition @ state.covariance @ transition.T + np.block(
+        [[density * step**3 / 3.0, density * step**2 / 2.0], [density * step**2 / 2.0, density * step]]
+    )
     moved = transition @ np.concatenate([state.direction, state.velocity])
     return _at_unit_range(time_ns, moved[:3], moved[3:], spread)
 
@@ -206,20 +212,6 @@ def _at_unit_range(
     jacobian[3:, 3:] = np.eye(3) / size
     spread = jacobian @ covariance @ jacobian.T
     return LineOfSightState(time_ns, direction, scaled, 0.5 * (spread + spread.T))
-
-
-def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: bool) -> FloatArray:
-    """Return the covariance (6, 6) that white acceleration noise adds to the state in `step` seconds.
-
-    The flag `known` states whether the gravity gradient is known.
-    """
-    along = np.outer(state.direction, state.direction)
-    rate = float(np.linalg.norm(state.rate))
-    wander = motion.residual_wander if known else motion.wander
-    density = wander * np.eye(3) + motion.bend**2 * rate**3 * along
-    return np.block(
-        [[density * step**3 / 3.0, density * step**2 / 2.0], [density * step**2 / 2.0, density * step]]
-    )
 
 
 _UNSEEN = np.full(3, np.nan)

@@ -256,7 +256,11 @@ def fit_rotation(
             solution, used = _reject_and_solve(vectors, errors, used, settings)
         except np.linalg.LinAlgError:
             return None
-        outward = _arc_outward(raw, solution.rotation_vector, pinhole)
+        # Outward image directions (n, 2, 2) along the star's arc at both ends of each streak.
+        v = pinhole.unit_vectors(raw)
+        velocity = -np.cross(solution.rotation_vector, v)
+        image = velocity[..., :2] * v[..., 2:] - v[..., :2] * velocity[..., 2:]
+        outward = image * np.array([-1.0, 1.0])[:, None]
     if np.count_nonzero(used) < needed:
         return None
     covariance = _covariance(solution, vectors[used], errors[used], pinhole, settings)
@@ -316,14 +320,6 @@ def _motion_axes(sums: FloatArray, rodrigues: FloatArray) -> tuple[FloatArray, F
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     across = np.cross(sums, along)
     return along, across / np.linalg.norm(across, axis=-1, keepdims=True)
-
-
-def _arc_outward(endpoints: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return the outward image directions (n, 2, 2) along the star's arc at both ends of each streak."""
-    v = pinhole.unit_vectors(endpoints)
-    velocity = -np.cross(rotation, v)
-    image = velocity[..., :2] * v[..., 2:] - v[..., :2] * velocity[..., 2:]
-    return np.asarray(image * np.array([-1.0, 1.0])[:, None])
 
 
 def _covariance(
@@ -504,7 +500,11 @@ def attitudes_of_ends(
     rotation = to_rotation_vector(turn)
     # The error of the start attitude is rotated into the end axes, to which the rotation vector refers.
     propagated = attitude_matrix(turn)
-    jacobian = _turn_to_vector(rotation)
+    angle = float(np.linalg.norm(rotation))
+    cross = cross_matrices(rotation[None])[0]
+    # For an angle of zero both terms of the coefficient diverge, but their difference has the limit 1/12.
+    second = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - 1.0 / (2.0 * angle * np.tan(0.5 * angle))
+    jacobian = np.eye(3) + 0.5 * cross + second * cross @ cross
     covariance = jacobian @ (end.covariance + propagated @ start.covariance @ propagated.T) @ jacobian.T
     return TwoAttitudes(start, end, rotation, rotation / exposure, covariance / exposure**2)
 
@@ -522,7 +522,14 @@ def solve_ends(
     If the streaks cannot be identified, the streak result is returned unchanged. The covariance of the rate
     is not changed, because it already describes the errors of the streak ends along and across the streaks.
     """
-    ends, sigma = _brightest_first(found, camera)
+    # The streaks are put in order of increasing error.
+    used = np.flatnonzero(found.used)
+    used = used[np.argsort(found.sigma[used], kind="stable")]
+    sigma = found.sigma[used]
+    if len(used):
+        typical = np.sqrt(np.mean(sigma**2))
+        sigma = sigma * max(found.residual * camera.focal_length, _LEAST_SIGMA_PX) / typical
+    ends = found.endpoints[used]
     covariance = 0.5 * sigma[:, None, None] ** 2 * np.eye(2)
     solution = solve_places(
         ends.mean(axis=1), covariance, FrameKind.STREAKS, camera, scale, sky, settings, prior
@@ -546,26 +553,6 @@ def solve_ends(
         loss=(both.start.loss + both.end.loss) / scatter,
     )
     return replace(solution, fix=fix), replace(found, rate=both.rate)
-
-
-def _turn_to_vector(rotation: FloatArray) -> FloatArray:
-    """Return the derivatives (3, 3) of the rotation vector with respect to an additional small rotation."""
-    angle = float(np.linalg.norm(rotation))
-    cross = cross_matrices(rotation[None])[0]
-    # For an angle of zero both terms of the coefficient diverge, but their difference has the limit 1/12.
-    second = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - 1.0 / (2.0 * angle * np.tan(0.5 * angle))
-    return np.asarray(np.eye(3) + 0.5 * cross + second * cross @ cross)
-
-
-def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return the ends (n, 2, 2) and errors (n,), px, of the used streaks, in order of increasing error."""
-    used = np.flatnonzero(found.used)
-    used = used[np.argsort(found.sigma[used], kind="stable")]
-    sigma = found.sigma[used]
-    if len(used):
-        typical = np.sqrt(np.mean(sigma**2))
-        sigma = sigma * max(found.residual * camera.focal_length, _LEAST_SIGMA_PX) / typical
-    return found.endpoints[used], sigma
 
 
 def _scatter(both: TwoAttitudes, count: int) -> float:

@@ -545,16 +545,12 @@ def propose_grids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings)
             others = near[near != neighbour]
             along = np.broadcast_to(place[neighbour], (len(others), 2))
             cells = np.unique(cells_of(place[others], along, sky.grid.radius))
-            yield _grid_matches(sky, cells, int(centre), int(neighbour))
-
-
-def _grid_matches(sky: KnownSky, cells: IntArray, centre: int, neighbour: int) -> Candidates:
-    votes = sky.grid.votes(cells)
-    best = np.argpartition(-votes, _BEST)[:_BEST]
-    best = best[votes[best] >= _LEAST_CELLS]
-    best = best[np.argsort(-votes[best], kind="stable")]
-    star = np.stack([best, sky.grid.aligning[best].astype(np.int64)], axis=-1)
-    return Candidates(np.tile([centre, neighbour], (len(best), 1)), star)
+            votes = sky.grid.votes(cells)
+            best = np.argpartition(-votes, _BEST)[:_BEST]
+            best = best[votes[best] >= _LEAST_CELLS]
+            best = best[np.argsort(-votes[best], kind="stable")]
+            star = np.stack([best, sky.grid.aligning[best].astype(np.int64)], axis=-1)
+            yield Candidates(np.tile([int(centre), int(neighbour)], (len(best), 1)), star)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

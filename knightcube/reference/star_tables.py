@@ -258,7 +258,13 @@ def measured_planar_shape(corners: FloatArray, sigma: FloatArray) -> TriangleSha
     u3, u4 = s * (s - a) * (s - c), s * (s - a) * (s - b)
     with np.errstate(divide="ignore", invalid="ignore"):
         by_side = np.stack([u1 - u2 + u3 + u4, u1 + u2 - u3 + u4, u1 + u2 + u3 - u4]) / (4.0 * area)
-        side_by_corner = _side_gradients(corners, a, b, c)
+        # Derivatives of the side lengths with respect to the corners (Michalski, eq. 42), (3, t, 3, 3).
+        p, q, r = np.moveaxis(corners, -2, 0)
+        ab, bc, ac = (p - q) / a[:, None], (q - r) / b[:, None], (p - r) / c[:, None]
+        none = np.zeros_like(ab)
+        side_by_corner = np.stack(
+            [np.stack(row, axis=1) for row in ((ab, -ab, none), (none, bc, -bc), (ac, none, -ac))]
+        )
         h = np.einsum("st,stcx->tcx", by_side, side_by_corner)
         moment_by_side = area * np.stack([a, b, c]) / 18.0
         squares = (a**2 + b**2 + c**2) / 36.0
@@ -274,17 +280,6 @@ def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     p, q, r = np.moveaxis(corners, -2, 0)
     a, b, c = (np.linalg.norm(one - other, axis=-1) for one, other in ((p, q), (q, r), (p, r)))
     return a, b, c
-
-
-def _side_gradients(corners: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return the derivatives of the side lengths with respect to the corners (Michalski, eq. 42).
-
-    The result has the shape (3 sides, t triangles, 3 corners, 3 components).
-    """
-    p, q, r = np.moveaxis(corners, -2, 0)
-    ab, bc, ac = (p - q) / a[:, None], (q - r) / b[:, None], (p - r) / c[:, None]
-    none = np.zeros_like(ab)
-    return np.stack([np.stack(row, axis=1) for row in ((ab, -ab, none), (none, bc, -bc), (ac, none, -ac))])
 
 
 def _variance(gradient: FloatArray, corners: FloatArray, sigma: FloatArray) -> FloatArray:

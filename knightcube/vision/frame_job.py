@@ -225,7 +225,12 @@ def run(job: FrameJob) -> FrameFound:
     tracker = job.tracker
     sky, problem = _sky(tracker)
     if tracker is None or sky is None:
-        found = _without_catalogue(job, problem)
+        motion, lens, points = _motion(job), None if job.lens is None else job.lens[0], None
+        if job.objects is not None:
+            from knightcube.vision.objects.measure import measure_points  # noqa: PLC0415 - needs scipy
+
+            points = measure_points(job.pixels, job.camera, job.exposure, motion, job.objects, job.detection)
+        found = FrameFound(motion, None, lens=lens, field=points, problem=problem)
     else:
         found = run_with_lens(job, tracker, sky)
         if job.objects is not None and found.solution is not None:
@@ -263,16 +268,6 @@ def run_with_lens(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> Fra
         if found.solution is not None:
             lens = lens.update(found.solution, sky, tracker.solve.velocity)
     return replace(found, lens=lens)
-
-
-def _without_catalogue(job: FrameJob, problem: str) -> FrameFound:
-    """Return the motion from a frame, and the points of light if objects are searched for."""
-    motion, lens, points = _motion(job), None if job.lens is None else job.lens[0], None
-    if job.objects is not None:
-        from knightcube.vision.objects.measure import measure_points  # noqa: PLC0415 - needs scipy
-
-        points = measure_points(job.pixels, job.camera, job.exposure, motion, job.objects, job.detection)
-    return FrameFound(motion, None, lens=lens, field=points, problem=problem)
 
 
 def _sky(tracker: TrackerSettings | None) -> tuple[SkyIndex | None, str]:

@@ -520,8 +520,13 @@ class LensKnowledge:
         frame, attitude = matched_frame(solution, sky, velocity, self.shutter), solution.fix.quaternion
         focal = solution.camera.focal_length
         if motion is not None and motion.length > 0.0:
-            bent = self._path_error(motion.length) ** 2 * np.eye(2)
-            frame = replace(frame, covariance=np.asarray(frame.covariance) + bent)
+            # A distortion error changes the curvature of a star's path and thus displaces the middle of the
+            # fitted path.
+            corner = math.hypot(*self.configured.ideal.centre)
+            square = (corner / float(self.values[0])) ** 2
+            distortion = (self.sigma if self.usable else self.spread)[3] * square
+            off = 0.5 * float(distortion) * corner * (motion.length / corner) ** 2
+            frame = replace(frame, covariance=np.asarray(frame.covariance) + off**2 * np.eye(2))
         grown = self.covariance + np.diag((_DRIFT * self.spread) ** 2 * (elapsed / 3600.0))
         begun = replace(self, values=self.prior, covariance=np.diag(self.spread**2))
         try:
@@ -543,17 +548,6 @@ class LensKnowledge:
         except LensError:
             return self
         return known._with_psf(solution.psf_sigma)
-
-    def _path_error(self, length: float) -> float:
-        """Return the position error (px) of streaks of `length` px due to an error of the distortion.
-
-        A distortion error changes the curvature of a star's path and thus displaces the middle of the fitted
-        path.
-        """
-        corner = math.hypot(*self.configured.ideal.centre)
-        square = (corner / float(self.values[0])) ** 2
-        distortion = (self.sigma if self.usable else self.spread)[3] * square
-        return 0.5 * float(distortion) * corner * (length / corner) ** 2
 
     def _with_psf(self, measured: float) -> LensKnowledge:
         """Return the estimate updated with a measured point-spread width, px, which is NaN if unknown.

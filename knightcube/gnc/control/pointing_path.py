@@ -120,8 +120,12 @@ def linearised(
     flow = np.zeros((len(rate), 6, 6))
     flow[:, :3, :3], flow[:, :3, 3:], flow[:, 3:] = -cross_matrices(rate), _EYE3, slopes
     dt = float(references.times[1] - references.times[0])
-    transition, pushed = _discrete(flow, dt)
-    by_torque = pushed @ inverse
+    # Transition matrices exp(F dt) and their integrals are computed to third order in dt.
+    first = flow * dt
+    second = first @ first
+    transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
+    integral = dt * (_EYE6 + 0.5 * first + second / 6.0)
+    by_torque = integral[:, :, 3:] @ inverse
     momentum = rate @ inertia.T
     missing = references.acceleration @ inertia.T + np.cross(rate, momentum) - _gradient(inertia, up)[0]
     return LinearErrorModel(transition, -by_torque @ cross_matrices(shown), by_torque, missing, shown)
@@ -200,18 +204,6 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
     crossed = cross_matrices(down)
     stiffness = strength[:, None, None] * ((crossed @ inertia - cross_matrices(stiff)) @ crossed)
     return strength[:, None] * np.cross(down, stiff), stiffness
-
-
-def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return transition matrices exp(F dt) (n, 6, 6), and the rate columns (n, 6, 3) of their integrals.
-
-    Transition matrices and integrals are computed to third order in dt.
-    """
-    first = flow * dt
-    second = first @ first
-    transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
-    integral = dt * (_EYE6 + 0.5 * first + second / 6.0)
-    return transition, integral[:, :, 3:]
 
 
 RISES = (4.0, 2.0, 10.0)

@@ -262,22 +262,18 @@ def _better(
         moved = _moved(motion, share * step.change, share * step.control)
         if sum(criterion.merit(moved)) < before:
             return moved
-        closed = _closed(criterion.expected, moved, step)
+        # A second-order correction after the step makes the defects smaller.
+        defect, gain = defects(criterion.expected, moved), step.gains.gain
+        change, control = np.zeros((len(gain) + 1, 6)), np.empty((len(gain), 3))
+        transition, push = step.linear.transition, step.linear.by_control
+        for k in range(len(gain)):
+            control[k] = -gain[k] @ change[k]
+            change[k + 1] = transition[k] @ change[k] + push[k] @ control[k] + defect[k]
+        closed = _moved(moved, change, control)
         if sum(criterion.merit(closed)) < before:
             return closed
         share *= 0.5
     return None
-
-
-def _closed(expected: PathConditions, moved: PlannedMotion, step: _ShootingStep) -> PlannedMotion:
-    """Return a motion with smaller defects, by a second-order correction after a step."""
-    defect, gain = defects(expected, moved), step.gains.gain
-    change, control = np.zeros((len(gain) + 1, 6)), np.empty((len(gain), 3))
-    transition, push = step.linear.transition, step.linear.by_control
-    for k in range(len(gain)):
-        control[k] = -gain[k] @ change[k]
-        change[k + 1] = transition[k] @ change[k] + push[k] @ control[k] + defect[k]
-    return _moved(moved, change, control)
 
 
 def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> PlannedMotion:

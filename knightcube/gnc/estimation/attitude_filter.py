@@ -155,7 +155,13 @@ class CommandCheck:
     def _test_recovery(self, state: FilterState, rate: RateMeasurement) -> None:
         """Record a gyro sample, and trust the commands again if the rate follows the commands."""
         before_ns = self._samples[-1][0] if self._samples else rate.time_ns
-        commanded, natural = self._changes(state, before_ns, rate.time_ns)
+        commanded, natural = np.zeros(3), np.zeros(3)
+        for torquing, span_ns in self._model.commands.spans(before_ns, rate.time_ns):
+            found = self._model.body.accelerate(state.quaternion, state.rate, state.parameters, torquing)
+            by_coils = state.parameters.gain * np.array(found.by_parameters)[:, 2]
+            commanded += span_ns * 1e-9 * by_coils
+            natural += span_ns * 1e-9 * (np.array(found.acceleration) + state.disturbance - by_coils)
+        commanded, natural = commanded[self._axes], natural[self._axes]
         self._natural = self._natural + natural
         self._commanded = self._commanded + commanded
         self._samples.append((rate.time_ns, rate.rate[self._axes] - self._natural, self._commanded))
@@ -190,16 +196,6 @@ class CommandCheck:
         self._departures.clear()
         self._samples.clear()
         self._natural = self._commanded = np.zeros(1)
-
-    def _changes(self, state: FilterState, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Return the modelled changes of the rate (rad/s) due to coil commands, and due to other causes."""
-        commanded, natural = np.zeros(3), np.zeros(3)
-        for torquing, span_ns in self._model.commands.spans(from_ns, to_ns):
-            found = self._model.body.accelerate(state.quaternion, state.rate, state.parameters, torquing)
-            by_coils = state.parameters.gain * np.array(found.by_parameters)[:, 2]
-            commanded += span_ns * 1e-9 * by_coils
-            natural += span_ns * 1e-9 * (np.array(found.acceleration) + state.disturbance - by_coils)
-        return commanded[self._axes], natural[self._axes]
 
     def _variance(self, state: FilterState, rate: RateMeasurement) -> FloatArray:
         """Return the variance of a gyro sample plus the variance of the rate due to coil noise."""

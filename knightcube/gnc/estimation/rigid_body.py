@@ -254,26 +254,18 @@ def propagate(
         model = body.linearise(middle, state.rate, state.parameters, torquing, half)
         ax, ay, az = (a + d for a, d in zip(model.acceleration, state.disturbance, strict=True))
         moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
-        flow, density = _flow(state.rate, model), _density(noise, model, torquing)
+        # For the attitude error e, the dynamics are e' = -w x e + rate error.
+        flow = _FLOW.copy()
+        flow[ATTITUDE, ATTITUDE] = ((0.0, wz, -wy), (-wz, 0.0, wx), (wy, -wx, 0.0))
+        flow[RATE, ATTITUDE] = model.by_attitude
+        flow[RATE, RATE] = model.by_rate
+        flow[RATE, PARAMETERS] = model.by_parameters
+        density = _density(noise, model, torquing)
         covariance = propagated(covariance, flow, dt, density, noise.walks)
         state = state._replace(
             quaternion=compose(moved, state.quaternion), rate=(wx + dt * ax, wy + dt * ay, wz + dt * az)
         )
     return state, covariance
-
-
-def _flow(rate: Vector, model: Linearised) -> FloatArray:
-    """Return the rows (6, 19) for attitude and rate of the linearised error dynamics.
-
-    For the attitude error e, the dynamics are e' = -w x e + rate error.
-    """
-    x, y, z = rate
-    flow = _FLOW.copy()
-    flow[ATTITUDE, ATTITUDE] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
-    flow[RATE, ATTITUDE] = model.by_attitude
-    flow[RATE, RATE] = model.by_rate
-    flow[RATE, PARAMETERS] = model.by_parameters
-    return flow
 
 
 def _density(noise: ProcessNoise, model: Linearised, torquing: Torquing) -> FloatArray:

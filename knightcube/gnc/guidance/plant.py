@@ -374,7 +374,11 @@ class PolynomialPath:
         """Return the motion at `now_ns`: the initial motion before the path starts, a coast after it ends."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
-            return self._coast(elapsed - self.horizon)
+            angle = self.end_angle + self.end_rate * (elapsed - self.horizon)
+            farthest = max(FARTHEST, abs(self.end_angle))
+            if abs(angle) > farthest:
+                return PathSample(math.copysign(farthest, angle), 0.0, 0.0)
+            return PathSample(angle, self.end_rate, 0.0)
         s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
         # Clenshaw's recurrence is computed with Python floats, which are faster than numpy arrays of twenty
         # elements.
@@ -404,14 +408,6 @@ class PolynomialPath:
                 moving = motion_of(q2, q2_rate, q2_acceleration)
             angle[under_way], rate[under_way], acceleration[under_way] = moving
         return angle, rate, acceleration
-
-    def _coast(self, since: float) -> PathSample:
-        """Return the commanded motion at `since` s after the end of the path."""
-        angle = self.end_angle + self.end_rate * since
-        farthest = max(FARTHEST, abs(self.end_angle))
-        if abs(angle) > farthest:
-            return PathSample(math.copysign(farthest, angle), 0.0, 0.0)
-        return PathSample(angle, self.end_rate, 0.0)
 
 
 @lru_cache(maxsize=8)

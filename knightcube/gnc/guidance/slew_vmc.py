@@ -324,7 +324,12 @@ class VmcProgram:
         self._unit = float(np.mean(task.craft.limit))
         self._heat = heat_matrix(task.craft.weights) * self._unit**2 * scale
         self._quadrature = 0.5 * grid.cost_weights
-        self._basis = self._basis @ self._whitening()
+        # The parameters are transformed so that the whitened cost has a unit Hessian.
+        _, slopes = self._observed(self._grid.cost).values(np.zeros(self.size))
+        root = np.zeros((4, 4))
+        root[:3, :3], root[3, 3] = np.linalg.cholesky(self._heat), self._along
+        each = np.sqrt(2.0 * self._quadrature)[:, None, None] * (root.T @ slopes[:, :4])
+        self._basis = self._basis @ np.linalg.inv(np.linalg.qr(each.reshape(-1, self.size), mode="r"))
         self._cost = self._observed(grid.cost)
         self._equal = self._observed(SamplePoints.at(grid.rule, grid.rule.nodes))
 
@@ -336,14 +341,6 @@ class VmcProgram:
     def _observed(self, samples: SamplePoints) -> ObservedPaths:
         parts = self._task, self.scale, self._middle, self._margin, samples
         return ObservedPaths(*parts, self._nodes, self._basis)
-
-    def _whitening(self) -> FloatArray:
-        """Return the transformation (k, k) of the parameters that gives the whitened cost a unit Hessian."""
-        _, slopes = self._observed(self._grid.cost).values(np.zeros(self.size))
-        root = np.zeros((4, 4))
-        root[:3, :3], root[3, 3] = np.linalg.cholesky(self._heat), self._along
-        each = np.sqrt(2.0 * self._quadrature)[:, None, None] * (root.T @ slopes[:, :4])
-        return np.asarray(np.linalg.inv(np.linalg.qr(each.reshape(-1, self.size), mode="r")))
 
     @property
     def _along(self) -> float:

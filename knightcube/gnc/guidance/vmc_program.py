@@ -275,7 +275,14 @@ class PathProgram:
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * family.grid.cost_weights
         self._bang = plant.resistance * plant.current_limit**2
-        self.family = self._whitened(family, horizon)
+        # The family is rescaled so that the energy has a unit Gauss-Newton Hessian. SLSQP starts with a unit
+        # matrix as Hessian, so the first step from the initial guess (prey path) is the Gauss-Newton step.
+        observed = family.observed(family.grid.cost)
+        prey = observed.trajectory(np.zeros(family.size), horizon)
+        _, slopes = self._current(prey, horizon)
+        root_weights = np.sqrt(2.0 * self._plant.resistance * horizon * self._weights)
+        jacobian = root_weights[:, None] * _contract(slopes, observed.basis)
+        self.family = family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
         self._cost_points = self.family.observed(family.grid.cost)
         self.evaluations = 0
 
@@ -292,19 +299,6 @@ class PathProgram:
     def prey(self, horizon: float) -> Trial:
         """Return the initial guess of `horizon` s, for which all path control parameters are one."""
         return Trial(np.zeros(self.family.size), horizon)
-
-    def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
-        """Return the path family, rescaled so that the energy has a unit Gauss-Newton Hessian.
-
-        SLSQP starts with a unit matrix as Hessian, so the first step from the initial guess (prey path) is
-        the Gauss-Newton step.
-        """
-        observed = family.observed(family.grid.cost)
-        prey = observed.trajectory(np.zeros(family.size), horizon)
-        _, slopes = self._current(prey, horizon)
-        root_weights = np.sqrt(2.0 * self._plant.resistance * horizon * self._weights)
-        jacobian = root_weights[:, None] * _contract(slopes, observed.basis)
-        return family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
 
     def _current(self, trajectory: FloatArray, horizon: float) -> tuple[FloatArray, FloatArray]:
         """Return currents (m,), and their derivatives (3, m) with respect to q2, dq2/ds and d2q2/ds2."""

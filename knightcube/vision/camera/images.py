@@ -332,7 +332,8 @@ def _through_pillow(path: Path) -> Image:
                 high = _colours(picture)
                 with pillow.open(path, formats=FORMATS) as again:
                     again.tile = [tile._replace(args=_low_bytes(tile.args)) for tile in again.tile]
-                    return _upright(_luminance(256.0 * high + _colours(again)), picture)
+                    luminance = np.rint((256.0 * high + _colours(again)) @ _LUMINANCE)
+                    return _upright(luminance.astype(np.uint16), picture)
             picture.load()
             return _upright(_grey(path, picture), picture)
     except UnidentifiedImageError as error:
@@ -403,11 +404,6 @@ def _low_bytes(args: Any) -> Any:
 
 def _colours(picture: Picture) -> npt.NDArray[np.float64]:
     return np.asarray(picture.convert("RGB"), dtype=np.float64)
-
-
-def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
-    """Return the luminance (rows, columns) of colours (rows, columns, 3) of 16 bits."""
-    return np.asarray(np.rint(colours @ _LUMINANCE), dtype=np.uint16)
 
 
 def _grey(path: Path, picture: Picture) -> Image:

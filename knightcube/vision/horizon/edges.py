@@ -182,19 +182,15 @@ def find_edges(
         return ScanEdges(empty, empty, none, none, none, np.zeros((0, len(_PROFILE)))), read
     edges = _line_edges(light, bright, (columns, rows), settings.contrast * span)
     if hidden is not None:
-        edges = select(edges, ~_touches(hidden, edges))
+        # Hidden pixels that are this close would affect the position of an edge.
+        reach = np.maximum(_WINDOW, (_REACH + _TAIL) * edges.scale)
+        steps = np.linspace(-1.0, 1.0, 2 * _WINDOW + 1)
+        points = edges.points[:, None] + edges.towards[:, None] * (reach[:, None] * steps)[..., None]
+        edges = select(edges, ~_at(hidden, points).any(axis=1))
     most = settings.most * settings.lines
     if len(edges) > most:
         edges = select(edges, np.argsort(edges.background, kind="stable")[:most])
     return edges, read
-
-
-def _touches(hidden: BoolArray, edges: ScanEdges) -> BoolArray:
-    """Return which edges (n,) are so close to hidden pixels that these affect the position of the edge."""
-    reach = np.maximum(_WINDOW, (_REACH + _TAIL) * edges.scale)
-    steps = np.linspace(-1.0, 1.0, 2 * _WINDOW + 1)
-    points = edges.points[:, None] + edges.towards[:, None] * (reach[:, None] * steps)[..., None]
-    return np.asarray(_at(hidden, points).any(axis=1))
 
 
 def _at(mask: BoolArray, points: FloatArray) -> BoolArray:

@@ -647,7 +647,11 @@ def nadir_of_cameras(
 
     def searched(number: int, known: HorizonKnowledge) -> HorizonSolution:
         camera = cameras[number]
-        seen = _in_camera(camera, known)
+        rough = known.attitude
+        if rough is not None:
+            rough = RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma)
+        sensed = tuple(replace(one, camera=camera.in_camera(one.camera)) for one in known.sensed)
+        seen = replace(known, attitude=rough, sensed=sensed)
         return find_nadir(images[number], camera.lens, seen, settings, (hidden or {}).get(number))
 
     each = {number: searched(number, knowledge) for number in images}
@@ -674,15 +678,6 @@ def nadir_of_cameras(
         reason = rival or "the cameras' horizons do not agree"
         return JointNadir(HorizonStatus.AMBIGUOUS, reason, None, (), each)
     return _joint_fit(tuple(vote.camera for vote in group), cameras, each, knowledge, settings)
-
-
-def _in_camera(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKnowledge:
-    """Transform prior knowledge from body axes to the axes of a camera."""
-    rough = knowledge.attitude
-    if rough is not None:
-        rough = RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma)
-    sensed = tuple(replace(one, camera=camera.in_camera(one.camera)) for one in knowledge.sensed)
-    return replace(knowledge, attitude=rough, sensed=sensed)
 
 
 def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> list[_Vote]:

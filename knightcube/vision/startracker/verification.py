@@ -263,7 +263,10 @@ def _verified(field: StarField, matching: _Matcher, first: _Matching, start: Ref
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
     """Return the identification with fitted distortion, or NO_MATCH if bright stars are displaced."""
-    expected = _expected_in(field, sky, refined.matrix, refined.scale)
+    across, down = field.half_width
+    expected = expected_stars(
+        sky, refined.matrix, (across * refined.scale, down * refined.scale), _most_expected(len(field))
+    )
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
     if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
         return nothing(field)
@@ -328,12 +331,6 @@ def _expected_numpy(
     x, y, z = matrix @ guide[near].T
     inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
     return np.asarray(near[inside][:count])
-
-
-def _expected_in(field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float) -> npt.NDArray[np.intp]:
-    """Return the indices of the guide stars that are expected in the field, the brightest first."""
-    across, down = field.half_width
-    return expected_stars(sky, matrix, (across * scale, down * scale), _most_expected(len(field)))
 
 
 def _most_expected(observed: int) -> int:
