@@ -293,8 +293,13 @@ class Transcription:
         with respect to the states, and the terms `dipole_part` (k + 1, 3) to those with respect to the
         dipoles.
         """
-        h = self._step
-        bend = self._bend(linear, multipliers[self.layout.equations])
+        at, h = linear.at, self._step
+        half, whole = np.split(multipliers[self.layout.equations], 2, axis=1)
+        y = np.zeros_like(at.states)
+        y[:-1:2] += -h / 8.0 * half - h / 6.0 * whole
+        y[2::2] += h / 8.0 * half - h / 6.0 * whole
+        y[1::2] = -4.0 * h / 6.0 * whole
+        bend = self.motion.curvature(at.states, at.all_dipoles(), y)
         bend[:, :7, :7] += state_part
         nodes = bend[::2]
         heat = np.full(self.count + 1, 4.0 * h / 3.0)
@@ -316,16 +321,6 @@ class Transcription:
         tail[:4, :4] += self._ending.curvature(multipliers[self.layout.end])
         tail[10:, :7], tail[:7, 10:] = linear.ending, linear.ending.T
         return self.layout.band(block, tail)
-
-    def _bend(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
-        """Return the second derivatives (2 k + 1, 10, 10) of the equations times `multipliers` (k, 14)."""
-        at, h = linear.at, self._step
-        half, whole = multipliers[:, :7], multipliers[:, 7:]
-        y = np.zeros_like(at.states)
-        y[:-1:2] += -h / 8.0 * half - h / 6.0 * whole
-        y[2::2] += h / 8.0 * half - h / 6.0 * whole
-        y[1::2] = -4.0 * h / 6.0 * whole
-        return self.motion.curvature(at.states, at.all_dipoles(), y)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -503,9 +498,8 @@ class SlewProgram:
         is_far = lack > _FAR
         minimum = _DAMPED * min(1.0, lack) if is_far else 0.0
         bent = np.zeros_like(point.dual) if is_far else point.dual
-        stiffness = self._limits.stiffness(point.at, point.dual / point.slack, bent)
+        states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, bent)
         multipliers = np.zeros_like(point.multipliers) if is_far else point.multipliers
-        states, heavy = stiffness
         for _ in range(10):
             more = max(convex, minimum)
             stiff = states + more * _EYE7, heavy + more

@@ -32,11 +32,8 @@ from knightcube.gnc.guidance.slew_model import (
     MINIMUM_TIME,
     BoresightEnd,
     ConeConstraints,
-    End,
     HermiteCubic,
     SlewCraft,
-    SlewDynamics,
-    SlewEnvironment,
     SlewPath,
     SlewTask,
     blocking_cone,
@@ -245,24 +242,14 @@ _SAME = 0.1
 """Relative difference of mode amplitudes below which two momentum curves count as equal."""
 
 
-def guesses(
-    motion: SlewDynamics,
-    craft: SlewCraft,
-    start: FloatArray,
-    end: End,
-    around: SlewEnvironment,
-    kept: ConeConstraints,
-    scale: float,
-) -> list[Trajectory]:
-    """Return initial guesses for a slew with the duration `scale` (s), the most promising guess first.
+def guesses(equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -> list[Trajectory]:
+    """Return initial guesses for a slew, the most promising guess first.
 
-    The slew leads from the state `start` (7,) to the end conditions `end`. The environment `around` is given
-    at 2 k + 1 times. The guesses avoid the exclusion cones of the constraints `kept`.
+    The guesses lead from the start to the end conditions of `equations`, and avoid the exclusion cones of the
+    constraints `kept`.
     """
-    curves = _curves(craft, around, start, end, scale)
-    fit = _MomentumFit(curves, craft, start, end, kept, scale)
-    found = []
-    for states in fit.found():
+    motion, found = equations.motion, []
+    for states in _MomentumFit(equations, craft, kept).found():
         # The dipole is the smallest dipole that produces the component of the required torque across the
         # field.
         still = motion.flow(states, np.zeros((len(states), 3)))
@@ -273,27 +260,17 @@ def guesses(
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _MomentumCurves:
-    """Curves of the angular momentum at n times, kg m^2/s, ICRS axes.
+def _curves(equations: Transcription, craft: SlewCraft) -> tuple[FloatArray, FloatArray]:
+    """Return a curve (n, 3) of the angular momentum from start to end, and d modes (d, n, 3) of its change.
 
-    Attributes:
-        base: momentum curve (n, 3) that leads to the attitude and rate at the end of the slew.
-        modes: changes (d, n, 3) of the momentum curve that preserve both ends; an amplitude of one
-            corresponds to the torques that rotate the body by about half a revolution.
+    The momentum is in kg m^2/s and ICRS axes. The modes preserve both ends, and are orthogonal, so that their
+    heats are additive. An amplitude of one corresponds to the torques that rotate the body by about half a
+    revolution.
     """
-
-    base: FloatArray
-    modes: FloatArray
-
-
-def _curves(
-    craft: SlewCraft, around: SlewEnvironment, start: FloatArray, end: End, scale: float
-) -> _MomentumCurves:
-    """Return the momentum curves from start to end, with orthogonal modes, whose heats are additive."""
-    count = len(around.field)
-    step, strength = scale / (count - 1), np.linalg.norm(around.field, axis=1)
-    field = around.field / strength[:, None]
+    field, start, end, scale = equations.around.field, equations.start, equations.end, equations.scale
+    count = len(field)
+    step, strength = scale / (count - 1), np.linalg.norm(field, axis=1)
+    field = field / strength[:, None]
     across = np.eye(3) - field[:, :, None] * field[:, None, :]
     in_time = np.cos(np.pi * np.outer(np.arange(_COSINES), np.linspace(0.0, 1.0, count)))
     slopes = np.einsum("nij,mn->mjni", across, in_time).reshape(3 * _COSINES, -1)
@@ -312,7 +289,7 @@ def _curves(
     fixed = right[:reached].T @ ((left.T @ wanted)[:reached] / sizes[:reached])
     half_turn = 2.0 * np.pi * float(np.trace(craft.inertia)) / scale**2
     free = half_turn * np.tensordot(right[reached:], curves, 1)
-    return _MomentumCurves(begun + np.tensordot(fixed, curves, 1), free)
+    return begun + np.tensordot(fixed, curves, 1), free
 
 
 def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
@@ -324,17 +301,10 @@ def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
 class _MomentumFit:
     """A Levenberg-Marquardt fit of mode amplitudes of momentum curves, from many random initial guesses."""
 
-    def __init__(
-        self,
-        curves: _MomentumCurves,
-        craft: SlewCraft,
-        start: FloatArray,
-        end: End,
-        kept: ConeConstraints,
-        scale: float,
-    ) -> None:
-        self._curves, self._start, self._end, self._kept = curves, start, end, kept
-        self._scale, self._lighter = scale, np.linalg.inv(craft.inertia)
+    def __init__(self, equations: Transcription, craft: SlewCraft, kept: ConeConstraints) -> None:
+        self._base, self._modes = _curves(equations, craft)
+        self._start, self._end, self._scale = equations.start, equations.end, equations.scale
+        self._kept, self._lighter = kept, np.linalg.inv(craft.inertia)
 
     def found(self) -> list[FloatArray]:
         """Return the states (n, 7) of each distinct guess, the most promising guess first."""
@@ -354,7 +324,7 @@ class _MomentumFit:
 
     def _fitted(self) -> FloatArray:
         """Return the mode amplitudes (m, d) found by the m least-squares fits."""
-        count = len(self._curves.modes)
+        count = len(self._modes)
         sums = _SPREAD * np.random.default_rng(16).normal(size=(_BEGINS, count))
         left = self._residuals(sums)
         damped, small = np.full(_BEGINS, _DAMPED), 1e-4
@@ -391,7 +361,7 @@ class _MomentumFit:
 
     def _propagated(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return attitudes (m, n, 4) by the midpoint rule and momenta (m, n, 3) for amplitudes (m, d)."""
-        momentum = self._curves.base + np.tensordot(sums, self._curves.modes, 1)
+        momentum = self._base + np.tensordot(sums, self._modes, 1)
         half = 0.5 * self._scale / (momentum.shape[1] - 1)
         middle = 0.5 * (momentum[:, 1:] + momentum[:, :-1])
         q = np.empty((*momentum.shape[:2], 4))
@@ -465,8 +435,7 @@ class HorizonContinuation:
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
-            times = self._begins(start, shortest)
-            ways = (self._over(start, time) for time in times)
+            ways = (self._over(start, time) for time in self._begins(start, shortest))
             begun = next(filter(None, ways), None)
             if begun is None:
                 continue
@@ -679,17 +648,7 @@ class SlewSearch:
         batch: list[SolvedPath] = []
         solver, patience = self.solver, self.solver.steps + _STEPS_WITHOUT_PATH
         equations = solver.equations(horizon, self._coarse)
-        kept = solver.kept(equations)
-        starts = guesses(
-            equations.motion,
-            self._task.craft,
-            equations.start,
-            equations.end,
-            equations.around,
-            kept,
-            horizon,
-        )
-        for guess in starts[:_MAXIMUM_TRIED]:
+        for guess in guesses(equations, self._task.craft, solver.kept(equations))[:_MAXIMUM_TRIED]:
             self.tried += 1
             descent = solver.descent(solver.equations(horizon, self._coarse), guess)
             if solver.steps > patience and not batch:

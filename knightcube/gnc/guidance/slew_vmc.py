@@ -56,7 +56,15 @@ from knightcube.gnc.guidance.slew_model import (
 )
 from knightcube.gnc.guidance.slew_plan import SlewPlan, integrated, is_within_limits, refusal
 from knightcube.gnc.guidance.slew_program import SlewLimits, SlewProgram, Trajectory
-from knightcube.gnc.guidance.slew_search import GRIDS, LAST_BARRIER, LONGER, SlewSearch, SolvedPath, guesses
+from knightcube.gnc.guidance.slew_search import (
+    GRIDS,
+    LAST_BARRIER,
+    LONGER,
+    SlewSearch,
+    SlewSolver,
+    SolvedPath,
+    guesses,
+)
 from knightcube.gnc.guidance.vmc_program import CONVERGED, SOLVER_STOPS, SamplePoints, discretisation
 
 Numbers = NDArray[Any]
@@ -133,11 +141,9 @@ def _check(task: SlewTask) -> None:
 
 def prey_paths(task: SlewTask, horizon: float) -> Iterator[FloatArray]:
     """Yield initial guesses as states (n, 7) at equal time steps, with rates in units of 1/`horizon`."""
-    search = SlewSearch(task, *GRIDS[0])
-    equations = search.solver.equations(horizon, GRIDS[0][0])
-    kept = search.solver.kept(equations)
-    parts = equations.motion, task.craft, equations.start, equations.end, equations.around, kept, horizon
-    found = guesses(*parts)[:_TRIED]
+    solver = SlewSolver(task)
+    equations = solver.equations(horizon, GRIDS[0][0])
+    found = guesses(equations, task.craft, solver.kept(equations))[:_TRIED]
     share = np.linspace(0.0, 1.0, 4 * NODES + 1)[:, None]
     last = _end_attitude(equations.end, task.quaternion)
     whole = to_rotation_vector(multiply(last, conjugate(task.quaternion)))

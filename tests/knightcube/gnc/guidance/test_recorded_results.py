@@ -73,9 +73,8 @@ def test_the_first_guesses_of_a_slew_are_as_recorded() -> None:
     (_, random), *_ = slews(1, 43, True)
     solver = SlewSolver(random)
     equations = solver.equations(random.horizon, 10)
-    surroundings = equations.start, equations.end, equations.around
     kept = solver.kept(equations)
-    found = guesses(equations.motion, random.craft, *surroundings, kept, random.horizon)
+    found = guesses(equations, random.craft, kept)
     check(__file__, "guesses", found)
     trajectory = found[0]
     check(

@@ -16,9 +16,7 @@ def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep
     solver = SlewSolver(task)
     equations = solver.equations(task.horizon, 24)
     kept, scale = solver.kept(equations), task.horizon
-    found = guesses(
-        equations.motion, task.craft, equations.start, equations.end, equations.around, kept, scale
-    )
+    found = guesses(equations, task.craft, kept)
     end = task.end(task.horizon)
     assert isinstance(end, AttitudeEnd)
     for guess in found[:3]:
@@ -36,17 +34,6 @@ def test_guesses_are_the_same_each_time() -> None:
     (_, task), *_ = slews(1, 43, False)
     solver = SlewSolver(task)
     equations = solver.equations(task.horizon, 10)
-    first, then = (
-        guesses(
-            equations.motion,
-            task.craft,
-            equations.start,
-            equations.end,
-            equations.around,
-            solver.kept(equations),
-            task.horizon,
-        )
-        for _ in range(2)
-    )
+    first, then = (guesses(equations, task.craft, solver.kept(equations)) for _ in range(2))
     assert len(first) == len(then) > 3
     np.testing.assert_array_equal(first[0].states, then[0].states)
