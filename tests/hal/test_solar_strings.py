@@ -36,10 +36,7 @@ class Bench:
 
 
 def bench(peak: float = 0.5, after_noon: float = 0.0) -> Bench:
-    """Return solar strings of `peak`
-
-    A in an orbit that begins `after_noon` degrees behind the Sun's meridian.
-    """
+    """Return strings of `peak` A in an orbit that begins `after_noon` degrees behind the Sun's meridian."""
     clock = SimClock()
     orbit = OrbitSection(local_time=12.0, true_anomaly_deg=after_noon)
     body = FreeBody(FreeBodySection(orbit=orbit, release=TipOff(speed=0.0)), lambda: np.zeros(3))
