@@ -1,4 +1,4 @@
-"""Satellites, orbits and weights for several tests of the pointing control."""
+"""Satellites, orbits and weights that several tests of the pointing control share."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ WEIGHTS = PointingWeights(turn=0.02, rate=1.0, dipole=0.001)
 def pushed(
     q: FloatArray, w: FloatArray, turned: FloatArray, at: FloatArray, dipole: FloatArray, seconds: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return attitude and rate of a body after `seconds` s under a dipole and all disturbance torques."""
+    """Return attitude and rate of a body after `seconds` s of a dipole and all disturbance torques."""
     position = turned @ ORBIT.position_at(at)[0]
     radius = float(np.linalg.norm(position))
     torque = 3.0 * GRAVITATIONAL_PARAMETER / radius**5 * np.cross(position, INERTIA @ position)

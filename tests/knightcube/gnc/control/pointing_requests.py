@@ -1,4 +1,4 @@
-"""Requests for several tests of the pointing planner."""
+"""Requests that several tests of the pointing planner share."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ BEGIN = SlewStart(
 
 
 def planned(sizes: FloatArray) -> PointingTable:
-    """Plan with torque coefficients `sizes` (9,), N m."""
+    """Return the plan for a body with the torque coefficients `sizes` (9,), N m."""
     begin = replace(BEGIN, sizes=sizes)
     path = slew(begin, WISH, NADIR, AXES, ORBIT, np.inf)
     assert path is not None

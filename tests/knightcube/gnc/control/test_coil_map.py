@@ -49,7 +49,8 @@ def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_no
     corners = np.array(list(itertools.product([-1.0, 1.0], repeat=3))) * coils.limits
     used = np.array([np.abs(coils.currents(corner)) / limits for corner in corners])
     assert used.max() == pytest.approx(1.0)
-    # A box that is longer along one axis, and shorter along another by the same factor, must not be feasible.
+    # The box of limits has the largest volume: a box that is longer along one axis, and shorter along another
+    # by the same factor, is not feasible.
     for grow, shrink in itertools.permutations(range(3), 2):
         factor = np.ones(3)
         factor[grow], factor[shrink] = 1.05, 1.0 / 1.05
@@ -61,7 +62,7 @@ def test_every_dipole_within_the_limits_can_be_made_and_no_limit_is_small_for_no
 def test_redundant_coils_share_a_dipole_with_the_least_heat_within_their_limits(
     seed: int, count: int
 ) -> None:
-    """Linear programming gives the feasible dipoles, and a general optimiser gives their heat."""
+    """The feasible dipoles equal those of linear programming, and the heat that of a general optimiser."""
     generator = np.random.default_rng(seed)
     dipoles = generator.standard_normal((3, count))
     limits, ohms = generator.uniform(0.05, 1.0, count), generator.uniform(5.0, 60.0, count)
@@ -85,7 +86,7 @@ def test_redundant_coils_share_a_dipole_with_the_least_heat_within_their_limits(
         )
         assert best.success
         assert ohms @ currents**2 <= best.fun * (1.0 + 1e-5)
-        # Find the largest multiple of `corner`, a dipole (3,), that the coils can generate. The last unknown
+        # Find the largest multiple of the dipole `corner` (3,) that the coils can generate. The last unknown
         # is this multiple.
         matrix = np.column_stack([dipoles, -corner])
         found = linprog([0.0] * count + [-1.0], A_eq=matrix, b_eq=np.zeros(3), bounds=[*bounds, (0.0, None)])
@@ -113,7 +114,7 @@ def test_the_coils_that_work_have_their_own_limits_and_heat() -> None:
     np.testing.assert_allclose(left.heat, expected.heat)
     np.testing.assert_allclose(left.limits, expected.limits)
     assert np.linalg.eigvalsh(left.heat - coils.heat).min() > -1e-12, "the same dipoles heat more"
-    # With two coils, the dipole normal to both is assumed to have half the limit.
+    # With two coils, the dipole normal to both coils is assigned half of the limit.
     pair = CoilMap.equal(0.6, 0.1, 20.0).working(np.array([True, False, True]))
     np.testing.assert_allclose(pair.limits, [0.06, 0.03, 0.06])
     np.testing.assert_allclose(np.diag(pair.heat), 20.0 / np.array([0.6, 0.3, 0.6]) ** 2)
@@ -130,7 +131,7 @@ def test_the_linear_shares_of_coils_are_those_of_the_allocation_below_the_limits
     wanted = np.array([0.01, -0.02, 0.03])
     linear = coils.currents(wanted)
     np.testing.assert_allclose(coils.linear_shares(every) @ linear, linear)
-    other = linear + 0.01 * np.array([1.0, -1.0, 1.0, -1.0])  # the same dipole
+    other = linear + 0.01 * np.array([1.0, -1.0, 1.0, -1.0])  # currents with the same dipole
     np.testing.assert_allclose(coils.linear_shares(every) @ other, linear)
     shared = coils.linear_shares(three) @ other
     assert shared[2] == 0.0
@@ -173,7 +174,10 @@ def test_the_covariance_of_coils_along_the_body_axes_is_that_of_gain_and_misalig
 
 
 def test_the_field_of_a_coil_is_that_of_a_loop_on_its_axis_and_of_a_dipole_far_away() -> None:
-    """On the axis of a loop, B = mu0 m / (2 pi (a^2 + z^2)^1.5) (Jackson, section 5.5)."""
+    """The field of a coil on its axis is that of a loop, B = mu0 m / (2 pi (a^2 + z^2)^1.5).
+
+    The formula is that of Jackson, section 5.5. Far away, the field is that of a dipole.
+    """
     area, height = 0.0081, 0.04
     moment = 0.648 * np.array([0.6, 0.0, 0.8])
     near = coil_field(moment, height * moment / 0.648, area)
@@ -190,7 +194,7 @@ AMPLE = np.full(3, 100.0)
 
 
 def test_three_coils_make_the_torque_across_the_field_with_the_least_dipole() -> None:
-    """The dipole is B x T / B^2, and its torque m x B."""
+    """Three coils make a torque T normal to the field by the smallest dipole, B x T / B^2."""
     torque = np.cross([1e-6, 2e-6, -1e-6], FIELD / np.linalg.norm(FIELD))
     found = allocate(torque, FIELD, COILS, AMPLE)
     assert PER_AMPERE * found.currents == pytest.approx(np.cross(FIELD, torque) / (FIELD @ FIELD))
@@ -203,7 +207,7 @@ def test_of_a_torque_along_the_field_nothing_is_made() -> None:
     found = allocate(1e-2 * FIELD, FIELD, COILS, AMPLE)
     assert found.torque == pytest.approx(np.zeros(3), abs=1e-18)
     assert found.share == pytest.approx(0.0, abs=1e-9)
-    # The normal component of a torque at 45 deg to the field has half of the squared magnitude of the torque.
+    # The component normal to the field of a torque at 45 deg to the field has half of the squared magnitude.
     across = np.cross(FIELD, [0.0, 0.0, 1.0])
     mixed = FIELD / np.linalg.norm(FIELD) + across / np.linalg.norm(across)
     assert allocate(1e-6 * mixed, FIELD, COILS, AMPLE).share == pytest.approx(0.5)
@@ -233,7 +237,10 @@ def test_two_coils_make_the_same_torque_unless_the_failed_axis_is_normal_to_the_
 
 @pytest.mark.parametrize(("sine", "kept"), [(0.14, False), (0.17, True)])
 def test_a_torque_that_would_take_all_the_current_is_discarded(sine: float, kept: bool) -> None:
-    """Without the coil on y, a field at this sine from the x-z plane permits only a small torque."""
+    """Without coil y, a torque along y is small if the field has this sine of its angle from the x-z plane.
+
+    A torque that would take nearly all the current is discarded.
+    """
     field = 3e-5 * np.array([np.sqrt(1.0 - sine**2), sine, 0.0])
     weak = np.array([0.0, 0.0, 1e-8])
     found = allocate(weak, field, COILS, AMPLE, available=np.array([True, False, True]))
@@ -258,7 +265,10 @@ def test_a_torque_or_a_field_that_is_not_finite_is_refused(wrong: float) -> None
 
 
 def test_redundant_coils_make_a_torque_with_the_least_heat() -> None:
-    """Two parallel coils share a current in inverse proportion to their resistances."""
+    """Two parallel coils share their dipole in inverse proportion to their resistances.
+
+    This minimises the heat of the coils.
+    """
     dipoles = np.column_stack([0.6 * np.eye(3), [0.0, 0.0, 0.6]])
     ohms = np.array([20.0, 20.0, 20.0, 60.0])
     torque = np.cross([0.01, 0.02, 0.03], FIELD)

@@ -1,4 +1,4 @@
-"""Tests that each configured name gives its controller, and that all have the same interface."""
+"""Tests that each name in a configuration gives its controller, and that all have the same interface."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ THREAD = replace(BELIEVED, stiffness=2e-5, damping=2e-6)
 
 @pytest.mark.parametrize("true", [PUSHED, THREAD], ids=["constant torque", "thread"])
 def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: SingleAxisPlant) -> None:
-    """The thesis's tracker has an offset of torque / stiffness: d / K_e = 4e-3 / 4.47 rad, or 0.051 deg.
+    """The LQ tracker holds the attitude within 0.03 deg, without the offset of the thesis's tracker.
 
-    With noise the attitude must be held within 0.03 deg, which excludes such an offset.
+    The thesis's tracker has an offset of torque / stiffness, d / K_e = 4e-3 / 4.47 rad, which is 0.051 deg.
     """
     target = 0.5 if true is THREAD else 0.3
     errors = {}
@@ -50,9 +50,9 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
     ids=["lq", "pid", "adaptive"],
 )
 def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: AngleController) -> None:
-    """A step of 0.1 rad within the coil's limit is held to 0.15 deg.
+    """After a step of 0.1 rad, which is within the coil's limit, the error is below 0.15 deg.
 
-    The adaptive controller adapts its gains to its errors.
+    The gains of the adaptive controller have then adapted to its errors.
     """
     rows = fly(controller, replace(THREAD, stiffness=1e-5), held(0.1), 60.0)
     assert largest_error(rows, 0.1, 10.0) < 0.15
@@ -72,9 +72,9 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
 
 
 def test_the_thesis_tracker_overshoots_there() -> None:
-    """The controller needs a planned path.
+    """The thesis's tracker overshoots a step of 0.7 rad, because it needs a planned path.
 
-    With a step as target it begins to brake too late: the coil's torque can then not stop the body in time.
+    For a step, it begins to brake so late that the coil's torque cannot stop the body in time.
     """
     rows = fly(LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
     assert rows[:, 1].max() > 0.7 * 1.3
@@ -101,7 +101,10 @@ def test_a_name_means_its_controller(name: str) -> None:
 
 
 def test_only_the_lq_tracker_feeds_the_estimated_disturbance_forward() -> None:
-    """The current per acceleration at theta = 0 is J / (n A B), 3.6 A per rad/s^2."""
+    """Only the LQ tracker compensates the estimated disturbance, by J / (n A B) = 3.6 A per rad/s^2.
+
+    This is the current per acceleration at theta = 0.
+    """
     rest = PathSample(0.0, 0.0, 0.0)
     for name in KINDS:
         controller = controller_of(Control(tracker=name), BELIEVED, 0.025, Identification())  # type: ignore[arg-type]  # any of KINDS

@@ -1,4 +1,4 @@
-"""Tests that windowed B-dot damps a body in a changing field and excludes the field of its own coils."""
+"""Tests that windowed B-dot damps a body in a changing field, and excludes the field of its own coils."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OWN_FIELD = 1e-3
 
 
 class FreeBody:
-    """A simulated rigid body in a rotating field; the magnetometer also measures the field of the coils."""
+    """A simulated rigid body in a rotating field. Its magnetometer also measures the field of the coils."""
 
     def __init__(
         self, rate: FloatArray, field: float, turn: FloatArray, inertia: FloatArray, seed: int
@@ -72,7 +72,7 @@ class FreeBody:
 
 
 def fly(body: FreeBody, seconds: float, detumbler: Detumbler) -> tuple[FloatArray, FloatArray]:
-    """Return the rate (m,) and the energy (m,) at each window's start."""
+    """Return the rate (m,) and the energy (m,) at the start of each window."""
     detumbler.begin(0)
     rates, energies = [], []
     for k in range(round(seconds / CYCLE)):
@@ -108,7 +108,10 @@ def test_an_uneven_body_loses_energy_monotonically_and_ends_below_the_limit() ->
 
 
 def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> None:
-    """The component along the field decays fastest at k = 2 Omega J (Avanzini and Giulietti 2012)."""
+    """A gain above the optimum couples the spin to the rotating field, and damps it less.
+
+    The component along the field decays fastest at k = 2 Omega J (Avanzini and Giulietti 2012).
+    """
     left = {}
     for share in (share_in_rotating_field(0.05, SCHEDULE), 0.3):
         body = FreeBody(np.array([0.3, -0.25, 0.31]), 4.5e-4, TURN, 1.05e-3 * np.eye(3), 3)
@@ -119,14 +122,14 @@ def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> No
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 2.0, 5.0, 10.0])
 def test_a_fast_body_is_braked_not_pushed(speed: float) -> None:
-    """The field is extrapolated between windows.
+    """A body of up to 10 rad/s is damped, because the field is extrapolated between windows.
 
-    For a body at 10 rad/s it rotates by 2.5 rad between them.
+    In the axes of a body at 10 rad/s, the field rotates by 2.5 rad between two windows.
     """
     body = FreeBody(np.array([0.0, speed, 0.0]), 4.5e-4, np.zeros(3), 1.05e-3 * np.eye(3), 4)
     rates, _ = fly(body, 15.0, Detumbler(SCHEDULE, BRAKING))
-    # A torque of 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time changes the rate by 0.37 rad/s, as long as
-    # the field is known accurately.
+    # A torque of 4.3e-5 N m on 1.05e-3 kg m^2 for 0.6 of the time changes the rate by 0.37 rad/s if the field
+    # is known accurately.
     assert rates[-1] < rates[0] - min(0.9 * speed, 0.33)
 
 
@@ -175,7 +178,7 @@ def test_without_samples_the_coils_stay_off_and_after_a_gap_two_windows_are_need
         now_ns = k * 25_000_000
         turn = attitude_matrix(from_rotation_vector(np.array([0.0, 0.4, 0.0]) * k * CYCLE))
         window = now_ns // SCHEDULE.period_ns
-        if window not in {2, 3, 4}:  # the unit is silent
+        if window not in {2, 3, 4}:  # the IMU is silent
             detumbler.sample(now_ns, turn @ field)
         if detumbler.current(now_ns).any():
             acted.append(window)
@@ -195,12 +198,15 @@ def test_a_window_without_time_to_measure_is_refused() -> None:
 
 @pytest.mark.parametrize("length_ms", [20, 40, 100, 99, 300])
 def test_an_exposure_waits_until_no_step_of_the_coils_falls_within(length_ms: int) -> None:
-    """The coils are off for 100 of every 250 ms, and a command may arrive 50 ms late."""
+    """An exposure is delayed until the coils do not switch during it.
+
+    The coils are off for 100 of every 250 ms, and a command may arrive 50 ms late.
+    """
     steps = np.arange(0, 2_000, 250)[:, None] + np.array([0, 100])
     for begin_ms in range(0, 500, 10):
         found = SCHEDULE.calm(begin_ms * 1_000_000, length_ms * 1_000_000) // 1_000_000
         if length_ms > 100:
-            assert found == begin_ms  # an exposure of this length cannot avoid all steps
+            assert found == begin_ms  # an exposure of this length is not delayed
             continue
         assert begin_ms <= found < begin_ms + 400
         assert not ((steps + 50 > found) & (steps < found + length_ms)).any()

@@ -1,6 +1,7 @@
-"""Tests of detumbling by magnetometer alone: its start, and a spin about the field direction.
+"""Tests of detumbling with a magnetometer alone: its start, and a spin about the field direction.
 
-The momentum plan must remove the planned momentum in the planned time, close to the minimum time.
+The momentum plan must remove the planned momentum in the planned time, which must be close to the minimum
+time.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
 LIMIT = 0.1
 FIELD, TURN = np.array([0.0, 0.0, 4e-5]), np.array([0.0, 2.2e-3, 0.0])
 OWN_FIELD = 4e-4
-"""Field that the coils cause at the magnetometer (T per A m^2); at full dipole it equals the Earth's
+"""Field (T per A m^2) that the coils cause at the magnetometer. At the dipole limit it equals the Earth's
 field."""
 CYCLE_NS = 100_000_000
 
 
 class Body(NamedTuple):
-    """A body whose inertia differs from its description, with the dipole limit of its coils (A m^2)."""
+    """A body whose inertia differs from its description, and the dipole limit of its coils (A m^2)."""
 
     described: FloatArray
     inertia: FloatArray
@@ -54,7 +55,7 @@ class Body(NamedTuple):
 
 
 def unlike(described: FloatArray, limit: float, seed: int) -> Body:
-    """Return a body with errors of up to 10 % (moments) and 5 deg (axes), as stated by `craft.accuracy`."""
+    """Return a body with inertia errors of up to 10 % (moments) and 5 deg (axes), as in `craft.accuracy`."""
     rng, errors = np.random.default_rng(seed), BodyErrors()
     moments, axes = np.linalg.eigh(described)
     while True:
@@ -87,11 +88,11 @@ def fly(
     body: Body | None = None,
     seed: int = 4,
 ) -> FloatArray:
-    """Return the magnitude (n,), rad/s, of the rate in each cycle; the function `gyro` measures the rate.
+    """Return the magnitude (n,), rad/s, of the rate in each cycle.
 
-    The field rotates `sooner` times as fast as in orbit; samples are `late` s older than the last command.
-    For a `body` that differs from its description, the result is computed from energy and mean moment of
-    inertia.
+    The field rotates `sooner` times as fast as in orbit. Samples are `late` s older than the last command.
+    The function `gyro` returns the measured rate. If `body` is given, the magnitude is computed from the
+    energy and the mean moment of inertia.
     """
     law, rng = detumbler(body), np.random.default_rng(seed)
     limit, inertia = (LIMIT, INERTIA) if body is None else (body.limit, body.inertia)
@@ -124,9 +125,9 @@ def fly(
 
 
 def test_a_slow_spin_along_the_field_is_braked_as_the_field_turns_and_spiked_samples_do_not_mislead() -> None:
-    """B-dot takes at least 2,000 s; the minimum time is 714 s, in which the field rotates by 90 deg.
+    """A spin along the field is reduced below 0.5 deg/s in 850 s, without a larger rate in between.
 
-    The rate falls to 0.5 deg/s a little earlier. The coils must not increase the spin.
+    B-dot takes at least 2,000 s. The minimum time to rest is 714 s, in which the field rotates by 90 deg.
     """
     speeds = fly(np.array([0.0, 0.0, 0.03]), 850.0, spikes=0.1)
     assert speeds.max() < 1.1 * speeds[0]
@@ -144,9 +145,10 @@ THREE_UNITS = np.diag([0.0066, 0.0333, 0.0333])
 def test_the_coils_never_spin_up_a_body_of_another_inertia_beyond_the_multiple(
     seed: int, described: FloatArray, limit: float, speed: float, multiple: float, seconds: float
 ) -> None:
-    """Initially the rate along the field is unknown, and the energy is known to the accuracy of the inertia.
+    """The rate of a body with another inertia never exceeds the permitted multiple by more than 15 %.
 
-    The rate of an elongated body changes by itself at constant energy. The simulation lasts 300 s, because in
+    Initially the rate along the field is unknown, and the energy is known to the accuracy of the inertia. The
+    rate of an elongated body varies at constant energy. A simulation of 300 s is sufficient, because in
     simulations of 400 s the bodies are fastest before 300 s.
     """
     body = unlike(described, limit, seed)
@@ -160,7 +162,10 @@ BIAS = np.array([4e-4, -3e-4, 5e-4])
 
 
 def test_with_a_gyro_a_slow_spin_along_the_field_is_never_made_faster() -> None:
-    """The field rotates by 90 deg in 178 s; the fastest plan would spin the body up fivefold."""
+    """With a gyro, a slow spin along the field is never accelerated by more than 10 %.
+
+    The field rotates by 90 deg in 178 s. The fastest plan would increase the spin fivefold.
+    """
     speeds = fly(np.array([0.001, 0.0, 0.02]), 260.0, sooner=4.0, gyro=lambda rate: rate + BIAS)
     assert speeds.max() < 1.1 * speeds[0]
     assert speeds[-1] < math.radians(0.5)
@@ -179,18 +184,21 @@ def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
 
 @pytest.mark.parametrize("late", [0.001, 0.04])
 def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
-    """The component along the field becomes observable only as the field rotates."""
+    """Samples that are older than the last command damp the body as well.
+
+    The rate along the field becomes observable only as the field rotates.
+    """
     speeds = fly(np.array([0.1, 0.05, 0.03]), 240.0, late=late)
     assert speeds[-1] < math.radians(0.5)
 
 
 def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
-    """The IMU responds, but its samples are rejected; the coils must not act on a predicted field alone."""
+    """The coils stay off if the samples of the IMU are rejected, and never act on a predicted field alone."""
     law = detumbler()
     law.begin(0)
 
     def acts(begin_ns: int, end_ns: int, good: float) -> bool:
-        """Return whether the coils acted while the body rotated at 0.1 rad/s normal to the field."""
+        """Return whether the coils were driven while the body rotated at 0.1 rad/s normal to the field."""
         acted = False
         for now_ns in range(begin_ns, end_ns, 25_000_000):
             turned = attitude_matrix(from_rotation_vector(np.array([1e-10 * now_ns, 0.0, 0.0]))) @ FIELD
@@ -208,7 +216,10 @@ def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
 
 
 def test_a_spin_of_a_turn_in_two_seconds_is_braked() -> None:
-    """The body rotates by 180 deg between pauses, so only the samples within a pause show the rate."""
+    """A spin of half a turn per second is damped. Only the samples within a pause show the rate.
+
+    The body rotates by 180 deg between two pauses.
+    """
     speeds = fly(np.array([2.0, -2.4, 0.3]), 60.0)
     assert speeds[-1] < 0.95 * speeds[0]
 
@@ -229,7 +240,10 @@ def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
 
 @pytest.mark.parametrize("gyro", [True, False])
 def test_the_coils_act_soon_after_the_begin_by_a_rate_that_is_bounded(gyro: bool) -> None:
-    """With the coils off, a gyro gives the rate at the first sample, the field within a second."""
+    """The coils are driven after 0.6 s with a gyro, and after 1.5 s with a magnetometer alone.
+
+    A gyro gives the rate at its first sample. With the coils off, the field gives the rate within a second.
+    """
     law, rate, rng = detumbler(), np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
     law.begin(0)
     for now_ns in range(0, 2_000_000_000, 25_000_000):
@@ -262,7 +276,7 @@ def driven(gyro: bool) -> tuple[FieldDetumbler, list[float]]:
         if before and not acts:
             found.append(1e-9 * (now_ns - begun_ns))
             assert law.listens(now_ns + LONG.settle_ns)
-        law.acts(np.zeros(3))  # the coils are disconnected, so the body keeps its rate
+        law.acts(np.zeros(3))  # the coils have no effect, so the body keeps its rate
         before = acts
     return law, found
 
@@ -307,7 +321,7 @@ FIELD_AHEAD = rotating_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022
 
 
 def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
-    """Return the fraction of the momentum that remains after the plan with dipoles at the limit."""
+    """Return the fraction of the momentum that remains if the plan is executed with dipoles at the limit."""
     now = momentum.copy()
     for there in FIELD_AHEAD[: round(horizon / STEP)]:
         dipole = -np.cross(there, costate)
@@ -317,7 +331,10 @@ def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
 
 
 def least_time(momentum: FloatArray, field: FloatArray) -> float:
-    """Return a lower bound (s): for any p, dipoles at the limit reduce p . h by at most their integral."""
+    """Return a lower bound (s) of the time in which dipoles at the limit can remove the momentum.
+
+    For any direction p, they reduce p . h by at most the integral of the largest torque along p.
+    """
     directions = np.random.default_rng(1).standard_normal((3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     most = (
@@ -352,7 +369,10 @@ def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
 
 
 def test_what_the_rest_allows_is_not_waited_for() -> None:
-    """A tenth of the momentum is along the field, which rotates slowly; the remainder is removed faster."""
+    """A momentum below the permitted remainder is not planned for, so the plan is shorter.
+
+    A tenth of the momentum is along the slowly rotating field, and the other nine tenths are removed faster.
+    """
     momentum = np.array([1e-4, 0.0, 1e-5])
     exact, allowed = (
         momentum_plan(momentum, FIELD_AHEAD, TIMES, DIPOLE_LIMIT, rest) for rest in (1e-7, 1.2e-5)
@@ -366,7 +386,7 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
         ahead = rng.standard_normal((9, 3))
         field = ahead[0] + 0.5 * rng.standard_normal(3)
         turned = aligned_to(ahead, field)
-        # The field series is only rotated.
+        # The series of fields was only rotated.
         np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)
         assert np.linalg.det(turned[1:4]) == pytest.approx(np.linalg.det(ahead[1:4]))
         if ahead[0] @ field > 0.0:
@@ -375,7 +395,10 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
 
 
 def test_a_field_along_the_orbit_is_known_from_its_direction_and_its_change() -> None:
-    """The direction of the field near the equator oscillates; the prediction is given in other axes."""
+    """The field along the orbit is predicted from its present direction and its change.
+
+    Near the equator the direction oscillates. The prediction is given in other axes.
+    """
     times = braking(LIMIT).instants
     angle = 0.3 * np.sin(1.1e-3 * times)
     true = 3e-5 * np.stack([np.sin(angle), 0.2 * np.cos(angle) ** 2, np.cos(angle)], axis=1)

@@ -26,7 +26,7 @@ WEIGHTS = 20.0, 1.0
 @settings(deadline=None)
 @given(st.floats(0.01, 1e4), st.floats(0.01, 1e3))
 def test_gains_are_those_of_a_general_solver(state_weight: float, input_weight: float) -> None:
-    """The gains (5.28-5.32) with the state (e', e) are those of scipy's solution of the Riccati equation."""
+    """The gains (5.28-5.32) for the state (e', e) are those of scipy's solution of the Riccati equation."""
     integrators, entry = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])
     riccati = solve_continuous_are(integrators, entry, state_weight * np.eye(2), [[input_weight]])
     expected = (entry.T @ riccati)[0] / input_weight
@@ -46,7 +46,7 @@ def fly(
     state: tuple[float, float],
     duration: float,
 ) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Return rows of (t, theta, omega, current); each Runge-Kutta stage evaluates the tracker."""
+    """Return rows of (t, theta, omega, current). Each Runge-Kutta stage evaluates the tracker."""
     step, rows = 0.005, []
     x = np.array(state)
 
@@ -72,7 +72,7 @@ def path() -> PolynomialPath:
 
 
 def test_the_error_follows_the_linear_system_exactly(path: PolynomialPath) -> None:
-    """From an error of 0.6 rad, the error e obeys e'' = -K (e', e) while the coil is strong enough."""
+    """An initial error e of 0.6 rad obeys e'' = -K (e', e), as long as the coil is strong enough."""
     tracker = LqTracker(STRONG, *WEIGHTS)
     start = path.sample(0)
     run = fly(STRONG, tracker, path, (start.angle - 0.6, start.rate + 0.1), 4.0)
@@ -87,7 +87,7 @@ def test_the_error_follows_the_linear_system_exactly(path: PolynomialPath) -> No
 
 
 def test_the_second_derivative_of_the_error_is_exact(path: PolynomialPath) -> None:
-    """Compare 5.24 and 5.25 (corrected) with differences of the error along an artificial motion."""
+    """The second derivative of the error (5.24, 5.25, corrected) agrees with finite differences."""
     step = 1e-3
 
     def angles(time: float) -> tuple[float, float, float]:
@@ -104,7 +104,7 @@ def test_the_second_derivative_of_the_error_is_exact(path: PolynomialPath) -> No
         d = wanted.angle - angle
         exact = math.cos(d) * (wanted.acceleration - acceleration) - math.sin(d) * (wanted.rate - rate) ** 2
         assert exact == pytest.approx(numeric, abs=1e-6)
-        # The commanded current must make the error's second derivative -K (e', e) through the plant model.
+        # With the commanded current, the plant model gives the second derivative -K (e', e) of the error.
         command = tracker.command(wanted, angle, rate)
         turned = STRONG.acceleration(angle, rate, command.current)
         made = math.cos(d) * (wanted.acceleration - turned) - math.sin(d) * (wanted.rate - rate) ** 2
@@ -147,7 +147,10 @@ def test_saturation_is_explicit() -> None:
 @settings(deadline=None)
 @given(st.floats(1.01, math.pi - 0.01), st.sampled_from([-1.0, 1.0]))
 def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float, sign: float) -> None:
-    """sin(d) decreases beyond 90 deg, but the command does not."""
+    """For errors beyond 1 rad, the command stays at its value for 1 rad and keeps its sign.
+
+    The sine of the error decreases beyond 90 deg.
+    """
     tracker = LqTracker(STRONG, *WEIGHTS)
     command = tracker.command(PathSample(sign * size, 0.0, 0.0), 0.0, 0.0)
     edge = tracker.command(PathSample(sign * 1.0, 0.0, 0.0), 0.0, 0.0)

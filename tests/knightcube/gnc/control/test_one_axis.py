@@ -24,14 +24,14 @@ PERIOD = 0.025
 
 
 def torque_current(angle: float, acceleration: float) -> float:
-    """Return the current (A) whose torque accelerates the body: I = J w' / (k cos theta)."""
+    """Return the current (A) whose torque accelerates the body by w': I = J w' / (k cos theta)."""
     return 1.05e-3 * acceleration / (2.916e-4 * math.cos(angle))
 
 
 def test_the_gains_solve_the_riccati_equation_of_the_double_integrator() -> None:
     weight, cost = 7.0, 2.0
     rate_gain, error_gain = lq_gains(weight, cost)
-    # The states are e', e; A' P + P A - P B R^-1 B' P + Q = 0 with K = R^-1 B' P and Q = weight I.
+    # The state is (e', e). P solves A' P + P A - P B R^-1 B' P + Q = 0 with Q = weight I, and K = R^-1 B' P.
     matrix, entry = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])
     other = rate_gain * error_gain * cost
     solution = np.array([[rate_gain * cost, error_gain * cost], [error_gain * cost, other]])
@@ -55,7 +55,10 @@ def test_a_command_is_limited_to_the_coil() -> None:
 
 
 def test_the_thesis_law_makes_the_sine_of_the_error_a_damped_oscillator() -> None:
-    """With e = sin(theta_p - theta): e'' = cos * (w_p' - w') - sin * (w_p - w)^2 = -K_e' e' - K_e e."""
+    """The thesis's law makes e = sin(theta_p - theta) a damped oscillator, e'' = -K_e' e' - K_e e.
+
+    By the plant model, e'' = cos * (w_p' - w') - sin * (w_p - w)^2.
+    """
     tracker = LqTracker(PLANT, 20.0, 1.0, as_in_thesis=True)
     wanted, angle, rate = PathSample(0.30, 0.02, 0.004), 0.27, 0.035
     current = tracker.command(wanted, angle, rate).demanded
@@ -78,7 +81,10 @@ def test_near_the_path_the_law_is_that_of_the_thesis_with_the_disturbance_subtra
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float) -> None:
-    """No torque is demanded at the rate sqrt(2 a e - r^2), with a = 0.8 of the torque, r = a K_e' / K_e."""
+    """A large error e is reduced at most at the rate sqrt(2 a e - r^2), at which no torque is demanded.
+
+    The acceleration a is 0.8 of that by the available torque, and r = a K_e' / K_e.
+    """
     tracker = LqTracker(PLANT, 20.0, 1.0)
     error = 0.5
     braking = 0.8 * STRENGTH * math.cos(error)
@@ -86,17 +92,17 @@ def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float)
     rate = math.sqrt(2.0 * braking * math.sin(error) - reach**2) / math.cos(error)
     wanted = PathSample(sign * error, 0.0, 0.0)
     demanded = tracker.command(wanted, 0.0, sign * rate).demanded
-    # The remaining difference is the curvature of the sine.
+    # The remaining demand is due to the curvature of the sine.
     curvature = -sign * math.sin(error) * rate**2 / math.cos(error)
     assert demanded == pytest.approx(torque_current(0.0, curvature), rel=1e-6)
 
 
 def test_a_disturbance_reduces_the_braking_down_to_a_twentieth_of_the_torque() -> None:
-    """The approach is slower for a larger disturbance, down to a minimum."""
+    """A larger disturbance slows the approach, down to the rate for a twentieth of the torque."""
     tracker, wanted = LqTracker(PLANT, 20.0, 1.0), PathSample(0.5, 0.0, 0.0)
 
     def wish(disturbance: float) -> float:
-        """Return the demanded acceleration without the disturbance."""
+        """Return the demanded acceleration without the compensation of the disturbance."""
         current = tracker.command(wanted, 0.0, 0.0, disturbance).demanded
         return PLANT.acceleration(0.0, 0.0, current) + disturbance
 
@@ -112,7 +118,10 @@ def test_a_disturbance_reduces_the_braking_down_to_a_twentieth_of_the_torque() -
     ("angle", "authority"), [(1.519, True), (1.522, False), (-1.519, True), (-1.522, False)]
 )
 def test_beyond_87_degrees_no_current_turns_the_body(angle: float, authority: bool) -> None:
-    """The cosine of 1.5208 rad, the angle of 87 deg, is 0.05."""
+    """Beyond 87 deg no current is commanded, because the torque falls below 0.05 of its maximum.
+
+    The angle of 87 deg is 1.5208 rad, and its cosine is 0.05.
+    """
     command = LqTracker(PLANT, 20.0, 1.0).command(PathSample(0.0, 0.0, 0.0), angle, 0.0)
     assert command.authority is authority
     assert (command.current != 0.0) is authority
@@ -131,7 +140,7 @@ def test_an_error_beyond_one_radian_is_treated_as_one_radian(error: float, is_he
 
 @pytest.mark.parametrize("strength", [0.02, 0.4])
 def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reach(strength: float) -> None:
-    """Accelerations are piecewise constant and integrated exactly."""
+    """Each manoeuvre ends at rest and stays within its reach. The motion is integrated exactly."""
     made = manoeuvres(strength, 0.2, 3.0)
     assert len(made) == 4
     extremes = []
@@ -147,7 +156,7 @@ def test_each_manoeuvre_ends_at_rest_and_turns_the_body_by_no_more_than_its_reac
         assert rate == pytest.approx(0.0, abs=1e-9)
         assert max(np.abs(angles)) < 0.2 + 1e-9
         extremes.append((min(angles), max(angles), angle))
-    # A free swing is released at its largest angle; a double pulse returns to its start.
+    # A free swing begins at its largest angle, and a double pulse returns to its start.
     assert extremes[1][2] == pytest.approx(0.2)
     assert extremes[3][2] == pytest.approx(-0.2)
     assert extremes[0][2] == pytest.approx(0.0, abs=1e-9)
@@ -181,7 +190,7 @@ def cycles(controller: ExcitationController, count: int, angle: float, rate: flo
 def test_a_manoeuvre_begins_after_a_second_at_rest(angle: float, rate: float, moves: bool) -> None:
     controller = ExcitationController(PLANT, PERIOD, SETTINGS)
     cycles(controller, 41, angle, rate)
-    # A pulse demands half of the coil's limit; the tracker demands its own current.
+    # A pulse demands half of the current limit. Otherwise the current is that of the tracker.
     pulses = {round(abs(one.demanded), 9) for one in cycles(controller, 20, angle, rate)}
     assert (pulses == {0.074}) is moves
 
@@ -198,7 +207,7 @@ def test_a_body_that_does_not_come_to_rest_is_given_up_after_a_minute() -> None:
 
 
 def test_a_pulse_ends_where_the_body_could_not_be_stopped_within_the_bound() -> None:
-    """The stopping distance w^2 / (2 a) assumes 0.7 of the available torque."""
+    """A pulse ends if the stopping distance w^2 / (2 a), with 0.7 of the torque, would exceed the bound."""
     bound = angle_of(0.2)
     braking = 0.7 * 0.5 * STRENGTH * math.cos(0.3)
     limit = math.sqrt(2.0 * braking * (bound - 0.3))
@@ -215,7 +224,7 @@ def test_a_reset_skips_the_manoeuvre_that_was_under_way() -> None:
     assert cycles(controller, 45, 0.0, 0.0)[-1].current == pytest.approx(0.074)
     controller.reset()
     assert controller.command(REST, 0.0, 0.0).current == pytest.approx(0.0)
-    # The second manoeuvre has one pulse, one opposite pulse, and a free swing.
+    # The second manoeuvre consists of a pulse, an opposite pulse and a free swing.
     swing = [one.current for one in cycles(controller, 1000, 0.0, 0.0)]
     zeros = sum(1 for one in swing[41:] if one == 0.0)
     assert zeros >= round(2.0 / PERIOD)

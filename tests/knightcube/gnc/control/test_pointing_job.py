@@ -1,4 +1,4 @@
-"""Tests that a slew under known torques ends at its target and stays there."""
+"""Tests that a slew under known torques ends at its target, and that the body stays at the target."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_a_slew_with_an_isolated_coil_is_made_by_the_other_two_within_their_limi
     assert np.abs(currents).max() < LIMIT
     missed = np.linalg.norm(torques - [found.torque for found in made], axis=1)
     assert missed.sum() < 0.05 * np.linalg.norm(torques, axis=1).sum()
-    # The planner's heat is that of the remaining coils.
+    # The heat of the plan is that of the remaining coils.
     heat = 5.0 * float((currents**2).sum(axis=1).mean()) * path.horizon
     assert heat < 1.2 * path.heat(left.heat)
 
@@ -157,7 +157,10 @@ def test_a_body_within_a_cone_slews_out_of_it() -> None:
 
 
 def test_a_body_within_one_cone_still_avoids_the_other() -> None:
-    """On a direct path the camera would cross the Sun halfway; it starts near the Earth's limb."""
+    """A slew that begins within the cone of the Earth's limb still avoids the cone of the Sun.
+
+    On the direct path, the camera would cross the Sun halfway.
+    """
     free = slew(BEGIN, WISH, NADIR, AXES, ORBIT, np.inf)
     assert free is not None
     halfway = len(free.quaternion) // 2
@@ -173,7 +176,7 @@ def test_a_body_within_one_cone_still_avoids_the_other() -> None:
 
 
 def rest_of(table: PointingTable, since: float, q: FloatArray, w: FloatArray) -> PointingTable | None:
-    """Return the plan for the remaining slew of a table, from an estimate `since` s after its start."""
+    """Return a new plan for the rest of a slew, from an estimate `since` s after the start of the slew."""
     assert table.slew is not None
     ahead = replace(ORBIT, times=ORBIT.times - STEP - since)
     at = np.zeros(1)
@@ -186,7 +189,10 @@ def rest_of(table: PointingTable, since: float, q: FloatArray, w: FloatArray) ->
 def test_the_rest_of_a_slew_begins_where_the_body_will_be_and_arrives_at_the_same_time(
     table: PointingTable,
 ) -> None:
-    """The body is 0.04 deg away from the path that it follows."""
+    """The new plan begins where the body will be after `LEAD` s, and ends at the time of the current path.
+
+    The body is 0.04 deg away from its current path.
+    """
     path = table.slew
     assert path is not None
     since = path.horizon / 3.0
@@ -219,7 +225,10 @@ def test_on_a_known_body_the_rest_is_the_rest_of_the_running_plan(table: Pointin
 
 
 def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> None:
-    """Near the end, a correction of 3 deg would need several times the heat of the current path."""
+    """A new plan that needs several times the heat of the current path is not used.
+
+    Near the end of a slew, a correction of 3 deg would need so much heat.
+    """
     assert table.slew is not None
     since = 0.8 * table.slew.horizon
     there = table.slew.references(np.array([since]))
@@ -229,7 +238,10 @@ def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> N
 
 
 def test_a_rest_goes_no_deeper_into_a_cone_than_the_running_path(table: PointingTable) -> None:
-    """The current path was planned without this exclusion cone, and crosses the Sun halfway."""
+    """A new plan goes no deeper into a cone than the current path does.
+
+    The current path was planned without this cone, and crosses the Sun halfway.
+    """
     path = table.slew
     assert path is not None
     halfway = path.references(np.array([0.5 * path.horizon])).quaternion[0]

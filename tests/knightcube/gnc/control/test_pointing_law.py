@@ -1,4 +1,4 @@
-"""Tests that a body far from its path is damped in any attitude until it is slow."""
+"""Tests that a body far from its path is damped, in any attitude, until its rate is low."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.knightcube.gnc.control.pointing_cases import (
 
 
 def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_000.0) -> PointingTable:
-    """Plan from a rotation error (3,), rad, and a rate error (3,), rad/s."""
+    """Return a plan from a rotation error (3,), rad, and a rate error (3,), rad/s."""
     times = np.arange(STEP, until, STEP)
     wanted = references(LAW, ORBIT, times)
     begin = multiply(from_rotation_vector(start), wanted.quaternion[0])
@@ -53,14 +53,14 @@ def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_
 
 @pytest.fixture(scope="module")
 def law() -> PointingLaw:
-    """Return the nadir law, in an orbit through the dipole's poles, where the field rotates least."""
+    """Return the nadir law, in an orbit through the dipole's poles, where the field rotates slowest."""
     return PointingLaw(table_from(np.zeros(3), np.zeros(3), 290, until=6_500.0), LIMIT)
 
 
 def fly(
     law: PointingLaw, start: FloatArray, sizes: FloatArray, residual: FloatArray, seconds: float
 ) -> FloatArray:
-    """Return rotation errors (n, 3), rad, every 10 s, of a body under the torques `SIZE` and `RESIDUAL`."""
+    """Return rotation errors (n, 3), rad, every 10 s, of a body with the torques `SIZE` and `RESIDUAL`."""
     now = law.wanted(STEP)
     q, w = multiply(from_rotation_vector(start), now.quaternion), now.rate
     turns = []
@@ -111,14 +111,17 @@ def test_the_shapes_are_constant_with_the_flight_and_with_the_sun() -> None:
     np.testing.assert_array_equal(torque[:, :, CONSTANT], np.tile(np.eye(3), (2, 1, 1)))
     for k, time in enumerate(times):
         place, flight = ORBIT.position_at(np.array([time]))[0], ORBIT.velocity_at(np.array([time]))[0]
-        flight = flight - np.cross([0.0, 0.0, 7.292115e-5], place)  # the air rotates with the Earth
+        flight = flight - np.cross([0.0, 0.0, 7.292115e-5], place)  # the atmosphere rotates with the Earth
         np.testing.assert_allclose(torque[k, :, AIR].T @ flight, 0.0, atol=1e-8)
     day, night = (np.linalg.norm(torque[k, :, AIR]) for k in (0, 1))
     assert day > 1.3 * night
 
 
 def test_a_path_from_upside_down_is_one_that_the_coils_manage_and_ends_in_the_law() -> None:
-    """Without feedback, the path's dipoles keep the body on the path, and near the law, for ten minutes."""
+    """A path from an upside-down attitude ends near the law, and its dipoles alone move the body along it.
+
+    The simulation without feedback lasts ten minutes, and ends within 8 deg of the path.
+    """
     table = table_from(np.array([0.0, 2.8, 0.6]), np.radians([0.2, -0.1, 0.1]), 200, until=4_000.0)
     off = np.degrees(angle_between(table.path.quaternion, table.wanted.quaternion))
     assert off[0] == pytest.approx(np.degrees(np.linalg.norm([0.0, 2.8, 0.6])), abs=0.1)
@@ -183,7 +186,8 @@ def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
     for _ in range(50):
         rate, field = 0.02 * rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
         torque = np.cross(damping_dipole(inertia, rate, field), field)
-        # The power of the torque -J rate across the field is never positive for equal moments of inertia.
+        # For equal moments of inertia, the power of the damping torque, -J rate normal to the field, is never
+        # positive.
         assert float(rate @ torque) < 1e-3 * float(np.linalg.norm(rate) * np.linalg.norm(torque))
         assert (
             abs(float(torque @ field)) < 1e-12 * float(np.linalg.norm(torque) * np.linalg.norm(field)) + 1e-24
@@ -199,7 +203,7 @@ def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
     astray = PathRecovery()
     assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
     assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
-    # The body is still damped when its error has become small again.
+    # The damping continues after the error has become small again.
     assert seen(astray, 0.0, 2.0 * SLOW, 20.0) == (10.0, False)
     assert seen(astray, 3.0 * FAR, 0.9 * SLOW, 30.0) == (10.0, True)
     astray.planned()

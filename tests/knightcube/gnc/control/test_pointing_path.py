@@ -1,4 +1,4 @@
-"""Tests of planned motions as references."""
+"""Tests of planned motions that serve as references."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from knightcube.gnc.control.pointing_path import PlannedMotion
 
 
 def test_references_have_the_accelerations_that_lead_from_rate_to_rate() -> None:
-    """The motion has four rates at intervals of 0.5 s; the last acceleration continues."""
+    """The acceleration of a reference leads from each rate to the next, and is constant after the last rate.
+
+    The motion has four rates at intervals of 0.5 s.
+    """
     rate = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 3.0, 0.0], [1.0, 3.0, -2.0]])
     quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     times = np.array([10.0, 10.5, 11.0, 11.5])

@@ -1,4 +1,4 @@
-"""Tests that a gyro propagates the Sun direction through an eclipse and that its drift shows the bias."""
+"""Tests that a gyro propagates the Sun direction through an eclipse, and that its drift shows the bias."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ NOISE = 0.02
 def follow(
     propagated: PropagatedSun, begin: int, end: int, seen: bool, bias: FloatArray = BIAS
 ) -> FloatArray:
-    """Simulate some seconds of a body that rolls about the Sun direction, and return the true direction."""
+    """Simulate for some seconds a body that rolls about the Sun direction; return the true Sun direction."""
     rng = np.random.default_rng(3)
     for second in range(begin, end):
-        # The body rotates about the Sun only, so the Sun's direction in body axes is constant.
+        # The body rotates about the Sun direction, so the Sun direction is constant in body axes.
         rate = 2e-4 * SUN
         measured = rate + bias - propagated.bias
         propagated.propagate(second * SECOND_NS, attitude_matrix(from_rotation_vector(measured)))
@@ -62,7 +62,10 @@ def test_a_sun_is_forgotten_after_the_longest_eclipse() -> None:
 
 
 def test_while_nobody_carries_it_no_bias_is_learned_and_an_old_direction_is_not_taken_up() -> None:
-    """In modes other than SAFE, the solar strings are read, but rotations are not propagated."""
+    """While the direction is not propagated, no bias is estimated, and an old direction is not used.
+
+    In modes other than SAFE, the solar strings are read, but the direction is not propagated.
+    """
     propagated = PropagatedSun()
     for second in range(100):
         propagated.measure(second * SECOND_NS, attitude_matrix(from_rotation_vector(second * BIAS)) @ SUN)

@@ -38,7 +38,7 @@ KEPT = 20
 def table(
     turn: tuple[float, float, float], weights: PointingWeights = WEIGHTS, limit: float = LIMIT
 ) -> PointingTable:
-    """Return a table from an attitude that differs from the law by a rotation vector, rad."""
+    """Return the table of a path from an attitude that differs from the law by a rotation vector (rad)."""
     wanted = references(LAW, ORBIT, TIMES)
     begin = multiply(from_rotation_vector(np.array(turn)), wanted.quaternion[0])
     way = approach(LAW, begin, np.array([1e-4, -2e-4, 1e-4]), STEP, 12.0 * STEP)

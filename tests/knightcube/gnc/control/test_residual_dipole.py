@@ -1,4 +1,4 @@
-"""Tests that the residual dipole is estimated from the rate within its bound, for any coil currents."""
+"""Tests that the residual dipole is estimated from the rate, within its bound and for any coil currents."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ STEP = 0.1
 
 
 def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
-    """Return the dipole estimated in 1,500 s, in a field that rotates as along half an orbit."""
+    """Return the dipole that is estimated in 1,500 s, in a field that rotates as in half an orbit."""
     observer, rng = ResidualDipole(np.diag(INERTIA), bound), np.random.default_rng(5)
     rate = np.array([1e-3, -2e-3, 5e-4])
     for k in range(round(1500.0 / STEP)):
         angle = 4e-3 * k * STEP
         field = 3e-5 * np.array([np.cos(angle), np.sin(angle), 0.6])
         acting = coils * np.sin(0.7 * k * STEP)
-        # A known coil torque opposes the rate, so the body stays slow.
+        # A known coil torque opposes the rate, so that the body stays slow.
         hold = cross_product(field, -2e-5 * rate) / (field @ field)
         torque = cross_product(acting + hold + dipole, field) - cross_product(rate, INERTIA * rate)
         rate = rate + STEP * torque / INERTIA

@@ -1,4 +1,4 @@
-"""Tests that a body points to the Sun by gyro, strings and field, and is damped without a Sun."""
+"""Tests that a body points to the Sun by gyro, strings and field, and is damped without a Sun direction."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def seeker() -> SunAcquisition:
 
 
 def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
-    """Return the angle of the axis from the Sun, deg, and the speed, deg/s, every ten seconds."""
+    """Return every ten seconds the angle (deg) between axis and Sun, and the rate (deg/s)."""
     law, rng, step = seeker(), np.random.default_rng(2), 1e-9 * STEP_NS
     attitude, dipole, notes = IDENTITY, np.zeros(3), []
     for k in range(round(seconds / step)):
@@ -85,7 +85,8 @@ def test_a_single_field_or_one_that_jumps_starts_no_coil() -> None:
         law.sample(now_ns, field, np.zeros(3))
         if law.dipole(now_ns).any():
             acted.append(int(window))
-    # The first pause gives a single field; the third and the fourth contradict the previous pause.
+    # After the first pause there is only one field. The fields of pauses 2 and 3 contradict their
+    # predecessors.
     assert set(acted) == {1, 4}
 
 

@@ -1,15 +1,15 @@
 """Flights that compare the filter's errors with its covariance: NEES and NIS with all disturbances.
 
 The worlds are sim_hal's testbed and a body that is free in orbit. The testbed has a thread of 0 to 2e-5 N
-m/rad and 0 to 4e-6 N m s/rad, which the filter does not know, and an aerodynamic torque. A controller moves
-it through steps of q2 on the basis of the estimate. The free body rotates about three axes from a random
+m/rad and 0 to 4e-6 N m s/rad, which the filter does not know, and an aerodynamic torque. A controller that
+uses the estimate moves the testbed through steps of q2. The free body rotates about three axes from a random
 attitude, with a random walk of the torque and a rotating field. The coils' gain has an error of 10 % (1
 sigma).
 
 The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias. It loses 2 % of its
-packets, and is silent twice for 0.5 to 1 s. Every 5 s the star camera gives the mean rate over 1 s with a
-full covariance if the stars are streaks, and on the free body also an attitude. The camera's results are
-delayed by 0.2 to 0.6 s.
+packets, and sends nothing in two intervals of 0.5 to 1 s. Every 5 s the star camera gives the mean rate over
+1 s with a full covariance if the stars are streaks, and on the free body also an attitude. The camera's
+results are delayed by 0.2 to 0.6 s.
 
 NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band is that of chi-square over
 independent runs. NIS divided by its degrees of freedom has a similar band, over all accepted measurements.
@@ -67,15 +67,15 @@ QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4
 EXPOSURE, CAMERA_PERIOD = 40, 200
 """Exposure and period of the camera in cycles."""
 LEAST_STREAK = 1.0e-3
-"""Length (rad) of the shortest streak, which is 3 px in a field of 20 deg."""
+"""Length (rad) of the shortest measurable streak, 3 px in a field of 20 deg."""
 RATE_SIGMAS: FloatArray = np.array([1.5e-5, 1.5e-5, 1.5e-4])
 TRACKER_SIGMAS: FloatArray = np.array([5e-5, 5e-5, 5e-4])
 
 
 class Unit:
-    """The emulated VN-100's sensors, aligned with the body, at the position of the testbed.
+    """The sensors of an emulated VN-100, aligned with the body, at the position of the testbed.
 
-    `claimed` is the ratio of claimed to true variances.
+    `claimed` is the ratio of stated to true variances.
     """
 
     def __init__(self, rng: np.random.Generator, bias: FloatArray, claimed: float = 1.0) -> None:
@@ -131,7 +131,7 @@ class Camera:
 
 
 class Pilot:
-    """Steering by the estimate: steps of q2 on the thread, or excitation of all axes of a free body."""
+    """Control by the estimate: steps of q2 on the thread, or excitation of all axes of a free body."""
 
     def __init__(self, rng: np.random.Generator, suspended: bool) -> None:
         self._suspended = suspended
@@ -150,7 +150,7 @@ class Pilot:
 
 
 def mean_rate(start: FloatArray, end: FloatArray, span: float) -> FloatArray:
-    """Return the constant rate (3,) that rotates the attitude `start` to `end` in `span` s (Rodrigues)."""
+    """Return the constant rate (3,) that rotates the attitude `start` into `end` in `span` s (Rodrigues)."""
     vector = np.array(
         [
             start[3] * end[0] - end[3] * start[0] - (end[2] * start[1] - end[1] * start[2]),
@@ -175,7 +175,7 @@ def seen_from(
 
 
 def random_axes(rng: np.random.Generator) -> FloatArray:
-    """Return three orthogonal directions (3, 3), as a random mounting of the camera."""
+    """Return three orthogonal directions (3, 3) as a random mounting of the camera."""
     return np.asarray(np.linalg.qr(rng.standard_normal((3, 3)))[0])
 
 
@@ -188,14 +188,14 @@ LOST_SHARE = 0.02
 
 @dataclass(slots=True)
 class Tally:
-    """Sums of one run."""
+    """Sums of the statistics of one run."""
 
     nis: dict[str, list[float]] = field(default_factory=dict)
     nees: list[float] = field(default_factory=list)
     refused: dict[str, int] = field(default_factory=dict)
 
     def measured(self, filter_: AttitudeFilter, kind: str, measurement: Measurement) -> None:
-        """Pass a measurement to the filter, and record its result."""
+        """Pass a measurement to the filter, and record whether it was used and its NIS."""
         used = filter_.measure(measurement)
         if np.isfinite(filter_.nis):
             self.nis.setdefault(kind, []).append(filter_.nis)
@@ -203,7 +203,7 @@ class Tally:
 
 
 def filter_of(world: World) -> AttitudeFilter:
-    """Return the filter for a world: it has the noise settings, but not the unknown errors."""
+    """Return the filter for a world, with the noise settings but without the unknown errors."""
     push = DRAUGHT if world.suspended else DRAG
     settings = replace(
         KNOWN_PLANT,
@@ -219,7 +219,7 @@ def filter_of(world: World) -> AttitudeFilter:
 
 
 def run(scene: str, seed: tuple[int, ...], seconds: int = SECONDS, claimed: float = 1.0) -> Result:
-    """Fly `testbed` or `free`; `claimed` multiplies the assumed variances of the IMU."""
+    """Simulate `testbed` or `free`. `claimed` multiplies the assumed variances of the IMU."""
     rng = np.random.default_rng(seed)
     world: World = SuspendedWorld(rng) if scene == "testbed" else FreeWorld(rng)
     bias = rng.normal(0.0, BIAS_SIGMA, 3)
@@ -239,7 +239,7 @@ def run(scene: str, seed: tuple[int, ...], seconds: int = SECONDS, claimed: floa
             tally.measured(filter_, "gyro", rate)
         for kind, measurement in camera.due(cycle, world):
             tally.measured(filter_, kind, measurement)
-        if not filter_.started:  # the filter restarted
+        if not filter_.started:  # the filter has restarted
             filter_.start(attitude, rate)
         estimate = filter_.at(now_ns)
         if cycle and cycle % 40 == 0:
@@ -286,12 +286,12 @@ def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
 
 
 def _free_errors(suspended: bool) -> IntArray:
-    """Return the indices of the filter's 15 error states that can differ from zero in the world."""
+    """Return the indices of the 15 error states of the filter that can differ from zero in the world."""
     return np.array([1, 4, 7, 10, 12, 13, 14]) if suspended else np.array([*range(12), 14])
 
 
 def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
-    """Return for each cycle whether the IMU is silent: one interval in each half."""
+    """Return for each cycle whether the IMU is silent: one interval in each half of the run."""
     silent = [False] * (seconds * 40 + 1)
     for half in range(2):
         begin = int(40 * seconds * (0.5 * half + rng.uniform(0.05, 0.4)))
@@ -301,7 +301,7 @@ def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
 
 
 def scene_facts(results: Sequence[Result]) -> dict[str, Any]:
-    """Return the statistics of all runs of one scene."""
+    """Return the statistics of all runs of one world."""
     degrees = results[0]["degrees"]
     nees = np.array([result["nees"] for result in results]) / degrees
     means = nees.mean(axis=0)

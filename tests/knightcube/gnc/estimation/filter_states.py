@@ -1,4 +1,4 @@
-"""Filter states for several tests of the estimation."""
+"""Filter states that several tests of the estimation share."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ NO_ERRORS = BodyErrors(
     camera=0.0,
     horizon=0.0,
 )
-"""Description of body and devices without errors."""
+"""Description of a body and devices without errors."""
 
 
 def moved(state: FilterState, error: FloatArray) -> FilterState:
-    """Return a filter state to which an error vector is added."""
+    """Return a filter state plus an error vector."""
     e = error.tolist()
     return FilterState(
         compose(exponential(*e[0:3]), state.quaternion),

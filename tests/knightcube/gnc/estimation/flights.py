@@ -41,7 +41,7 @@ RATE_COVARIANCE: FloatArray = np.eye(3) * RATE_SIGMA**2
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """Truth (n, 4) and (n, 3), samples and commands; cycle k is at k CYCLE_NS, when its command begins."""
+    """Truth (n, 4) and (n, 3), samples and commands; cycle k and its command begin at k CYCLE_NS."""
 
     attitudes: FloatArray
     rates: FloatArray
@@ -59,9 +59,10 @@ def fly(
     amplitude: float = 0.05,
     driven: Callable[[int, FloatArray], FloatArray] = lambda _, command: command,
 ) -> Flight:
-    """Return a flight with noise of the IMU and of the coils, a gyro bias, and a thread or drag.
+    """Return a flight with noise of IMU and coils, a gyro bias, and a suspension thread or drag.
 
-    `amplitude` (A) is the amplitude of the currents; `driven` gives the coils' currents by cycle and command.
+    `amplitude` (A) is the amplitude of the currents. `driven` returns the true currents for a cycle and its
+    command.
     """
     rng = np.random.default_rng(seed)
     world = SuspendedWorld(rng) if suspended else FreeWorld(rng)
@@ -95,7 +96,7 @@ def begin(flight: Flight, suspended: bool, settings: FilterSettings = SETTINGS) 
 
 
 def follow(filter_: AttitudeFilter, flight: Flight, first: int = 1, last: int | None = None) -> None:
-    """Run a filter on the cycles `first` to `last` (exclusive) of a simulated run."""
+    """Run a filter over the cycles `first` to `last` - 1 of a simulated run."""
     for cycle in range(first, len(flight.samples) if last is None else last):
         for sample in flight.samples[cycle]:
             filter_.measure(sample)

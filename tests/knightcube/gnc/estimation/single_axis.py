@@ -1,4 +1,4 @@
-"""A linear Kalman filter of the rotation about the thread, as reference for the three-axis filter.
+"""A linear Kalman filter of the rotation about the thread, a reference for the three-axis filter.
 
 Its states are angle, rate and disturbance. The angle theta = 2 asin q2 is used instead of q2, because its
 kinematics are linear (Sease 5.9 is not): theta' = omega and omega' = u + d. The acceleration u is that of the
@@ -28,7 +28,7 @@ ANGLE, RATE = 0, 1
 class Measurement:
     """One scalar measurement of state `component` (ANGLE or RATE) at `time_ns`, with its variance.
 
-    With `since_ns` it is the mean rate between that time and `time_ns`.
+    If `since_ns` is given, the measurement is the mean rate from `since_ns` to `time_ns`.
     """
 
     time_ns: int
@@ -48,13 +48,12 @@ class FilterSettings:
     """Noise and limits of the filter.
 
     Attributes:
-        current_noise: standard deviation (A) of the coil current about its command, independent in each
-        cycle.
+        current_noise: standard deviation (A) of the error of the coil current, independent in each cycle.
         control_period: control period, s.
         disturbance_walk: random walk of the unmodelled acceleration, rad/s^2 per sqrt(s).
-        disturbance_start: standard deviation of that acceleration at the start, rad/s^2.
+        disturbance_start: standard deviation of the unmodelled acceleration at the start, rad/s^2.
         gate_sigma: largest normalised innovation of an accepted measurement.
-        history_ns: largest delay of a measurement that is used, ns.
+        history_ns: largest delay of a usable measurement, ns.
     """
 
     current_noise: float
@@ -67,7 +66,7 @@ class FilterSettings:
 
 @dataclass(slots=True)
 class _Checkpoint:
-    """A measurement, whether it passed the gate, and the state just after it."""
+    """A measurement, whether it passed the gate, and the state after it."""
 
     measurement: Measurement
     used: bool
@@ -100,7 +99,7 @@ class SingleAxisFilter:
         self._command_times.append(time_ns)
         self._commands.append(current)
         oldest = bisect.bisect_right(self._command_times, time_ns - self._settings.history_ns) - 1
-        if oldest > 64:  # old commands are removed occasionally, not in each cycle
+        if oldest > 64:  # old commands are removed only occasionally, to save time
             del self._command_times[:oldest], self._commands[:oldest]
 
     def start(self, angle: Measurement, rate: Measurement) -> None:
@@ -117,7 +116,7 @@ class SingleAxisFilter:
         return bool(self._history)
 
     def measure(self, measurement: Measurement) -> bool:
-        """Apply a measurement at its own time; return whether it passed the gate (or was too late)."""
+        """Apply a measurement at its own time; return whether it passed the gate or was too late."""
         if self._history and measurement.begin_ns >= self._history[-1].measurement.time_ns:
             used = self._apply([measurement], measurement)
         else:
@@ -127,7 +126,7 @@ class SingleAxisFilter:
         return used
 
     def at(self, time_ns: int) -> Estimate:
-        """Return the estimate propagated to `time_ns`; the filter itself does not change."""
+        """Return the estimate propagated to `time_ns`, without a change of the filter."""
         last = self._history[-1]
         newest = next((c for c in reversed(self._history) if c.used), last)
         state, covariance = self._propagate(last.state, last.covariance, last.measurement.time_ns, time_ns)
@@ -135,7 +134,7 @@ class SingleAxisFilter:
         return Estimate(time_ns, angle, rate, disturbance, covariance, newest.measurement.time_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time, or None if the time is before the stored history."""
+        """Return the estimate at a past time, or None if the time precedes the stored history."""
         index = bisect.bisect_right(self._history, time_ns, key=lambda c: c.measurement.time_ns)
         if index == 0:
             return None
@@ -145,7 +144,7 @@ class SingleAxisFilter:
         return Estimate(time_ns, angle, rate, disturbance, covariance, then.measurement.time_ns)
 
     def _insert(self, measurement: Measurement) -> bool:
-        """Return to the start of the measurement, and apply the later measurements again."""
+        """Go back to the start of a measurement, apply it, and apply the later measurements again."""
         index = self._index_before(measurement.begin_ns)
         if index == 0:
             return False
@@ -156,9 +155,9 @@ class SingleAxisFilter:
         return self._apply(later, measurement)
 
     def _index_before(self, begin_ns: int) -> int:
-        """Return the number of checkpoints up to `begin_ns`, or fewer if an averaging interval spans it.
+        """Return the number of checkpoints before the time from which measurements are applied again.
 
-        A mean measurement must be applied again from the start of its averaging interval.
+        This time is `begin_ns`, or the start of an averaging interval that contains `begin_ns`.
         """
         while True:
             index = bisect.bisect_right(self._history, begin_ns, key=lambda c: c.measurement.time_ns)
@@ -169,7 +168,7 @@ class SingleAxisFilter:
             begin_ns = earliest
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
-        """Apply measurements in order of time from the last checkpoint; return whether `asked` was used."""
+        """Apply measurements in order of time after the last checkpoint; return whether `asked` was used."""
         last = self._history[-1]
         state, covariance, time_ns = last.state, last.covariance, last.measurement.time_ns
         begins = sorted({m.since_ns for m in measurements if m.since_ns is not None})
@@ -192,7 +191,7 @@ class SingleAxisFilter:
     def _propagate(
         self, state: FloatArray, covariance: FloatArray, from_ns: int, to_ns: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Propagate state and covariance with the commands between two times, forward only."""
+        """Propagate state and covariance to a later time, with the commands of this interval."""
         time_ns = from_ns
         index = max(bisect.bisect_right(self._command_times, from_ns) - 1, 0)
         while time_ns < to_ns:
@@ -207,7 +206,7 @@ class SingleAxisFilter:
     def _step(
         self, state: FloatArray, covariance: FloatArray, current: float, dt: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Propagate the first three states by `dt` s; stored angles of the past are constant."""
+        """Propagate the first three states by `dt` s. Stored angles of the past stay constant."""
         angle, rate, disturbance = state[:3].tolist()
         acceleration = self._plant.acceleration(angle + 0.5 * dt * rate, rate, current) + disturbance
         state = state.copy()
@@ -250,7 +249,7 @@ class SingleAxisFilter:
             self.restarts += 1
 
     def _forget(self, now_ns: int) -> None:
-        """Delete checkpoints and commands that are too old; this is not done in each cycle."""
+        """Delete checkpoints and commands that are too old. This is done only occasionally, to save time."""
         horizon_ns = now_ns - self._settings.history_ns
         if len(self._history) > 2 and self._history[0].measurement.time_ns < horizon_ns - 1_000_000_000:
             keep = bisect.bisect_left(self._history, horizon_ns, key=lambda c: c.measurement.time_ns)
@@ -258,13 +257,13 @@ class SingleAxisFilter:
 
 
 def _clone_angle(state: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return state (n + 1,) and covariance (n + 1, n + 1) with the present angle as additional last state."""
+    """Return state (n + 1,) and covariance (n + 1, n + 1) with the present angle as last state."""
     pick = np.append(np.arange(len(state)), ANGLE)
     return state[pick], covariance[np.ix_(pick, pick)]
 
 
 def _row(measurement: Measurement, size: int, columns: dict[int, int]) -> FloatArray:
-    """Return the Jacobian row (size,) of the measurement."""
+    """Return the row (size,) of the measurement Jacobian."""
     row = np.zeros(size)
     if measurement.since_ns is None:
         row[measurement.component] = 1.0

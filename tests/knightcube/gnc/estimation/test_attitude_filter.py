@@ -1,4 +1,4 @@
-"""Tests that the filter applies late measurements at their time, rejects outliers and learns biases."""
+"""Tests that the filter applies late measurements at their time, rejects outliers and estimates biases."""
 
 from __future__ import annotations
 
@@ -60,7 +60,10 @@ def assert_same(a: Estimate, b: Estimate) -> None:
 
 @BOTH
 def test_late_measurements_give_what_they_would_have_given_in_time(suspended: bool) -> None:
-    """A mean rate, and a star attitude at the middle of the exposure, arrive late in all orders."""
+    """Late measurements, in any order, give the same estimate as measurements that arrive in time.
+
+    The measurements are a mean rate and a star attitude at the middle of the exposure.
+    """
     flight = fly(1, 100, suspended)
     mean = exposure(flight, 40, 60, 1e-10 * np.eye(3))
     off = multiply(from_rotation_vector(np.full(3, 1e-5)), flight.attitudes[50])
@@ -97,7 +100,7 @@ def test_exposures_may_overlap(suspended: bool) -> None:
 
 @BOTH
 def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
-    """In 20 s of attitudes and rates, a bias of 1 mrad/s is found to 2 %."""
+    """From 20 s of attitudes and rates, a bias of 1 mrad/s is estimated to 2 % and within three sigma."""
     flight = fly(3, 800, suspended)
     filter_ = begin(flight, suspended)
     follow(filter_, flight)
@@ -109,7 +112,10 @@ def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
 
 
 def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> None:
-    """After 30 s errors are within three sigma, and torsion and gain are ten times more accurate."""
+    """After 30 s, torsion, damping and gain are within three sigma, and separate from a steady torque.
+
+    The sigmas of torsion and gain have decreased to less than a tenth.
+    """
     flight = fly(4, 1200, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -122,7 +128,7 @@ def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> N
 
 
 def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
-    """The current that holds the body is correct for each assumed plant."""
+    """Due to the estimated disturbance, the current that holds the body is the same for any assumed plant."""
     flight = fly(5, 400, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -141,7 +147,7 @@ def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out(
 
 
 def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
-    """The filter ignores what the sensors measure about the other axes, such as a swing of the thread."""
+    """The filter of a body on a thread ignores the measured motion about the other axes, such as a swing."""
     flight = fly(6, 60, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -156,9 +162,9 @@ def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
 
 @BOTH
 def test_a_drop_out_widens_the_covariance_and_is_recovered_from(suspended: bool) -> None:
-    """In three seconds without samples, sigma grows and the error stays within four sigma.
+    """In three seconds without samples, sigma increases and the error stays within four sigma.
 
-    Then sigma and error decrease again.
+    Sigma and error decrease again when samples arrive.
     """
     flight = fly(7, 500, suspended)
     filter_ = begin(flight, suspended)
@@ -197,18 +203,21 @@ def test_an_outlier_is_refused_and_the_next_good_one_is_not(suspended: bool) -> 
 
 
 def test_the_gate_knows_its_degrees_of_freedom() -> None:
-    """A gate of 2 sigma refuses 4.55 % of Gaussian measurements, suspended and free (99.9 % band)."""
+    """A gate of 2 sigma refuses 4.55 % of Gaussian measurements, for a suspended and for a free body."""
     for suspended in (True, False):
         flight = fly(9, 1000, suspended)
         filter_ = begin(flight, suspended, replace(SETTINGS, gate_sigma=2.0))
         follow(filter_, flight)
-        # Of 2000 measurements; refusals reduce the spread of the accepted ones.
+        # The bounds are for 2000 measurements. Refusals reduce the spread of the accepted measurements.
         assert 60 < filter_.refused < 125
         assert filter_.restarts == 0
 
 
 def test_when_attitudes_disagree_for_a_second_the_filter_restarts() -> None:
-    """Refusals of attitudes and rates are counted separately, so an agreeing gyro has no effect."""
+    """The filter restarts if attitudes are refused for a second, although the rates are accepted.
+
+    Refusals of attitudes and of rates are counted separately.
+    """
     flight = fly(10, 100, False)
     filter_ = begin(flight, False)
     follow(filter_, flight, 1, 50)
@@ -245,7 +254,7 @@ def test_as_many_rejections_as_earlier_attitudes_restart_the_filter_but_3_to_40(
 
 
 def test_a_start_on_a_sample_from_before_the_release_is_given_up_at_once() -> None:
-    """A delayed line first sends samples of the held body; three contradicting rates restart the filter."""
+    """Three contradicting rates restart a filter that has started with a delayed sample of the held body."""
     flight = fly(16, 40, True)
     thrown = RateMeasurement(0, np.array([0.0, 0.3, 0.0]), RATE_COVARIANCE)
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
@@ -331,9 +340,9 @@ def test_an_attitude_that_wraps_round_is_a_small_innovation() -> None:
 
 @BOTH
 def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
-    """On average a cycle takes less than 0.5 ms of processor time, and a replay of 1.6 s less than 20 ms.
+    """A cycle takes less than 1 ms of processor time, and a replay of 1.6 s less than 40 ms.
 
-    The tested bounds are twice these times.
+    The expected averages are half of these bounds: 0.5 ms and 20 ms.
     """
     flight = fly(14, 400, suspended)
     filter_ = begin(flight, suspended)

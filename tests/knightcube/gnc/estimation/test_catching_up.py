@@ -53,7 +53,7 @@ def _begun() -> AttitudeFilter:
 
 
 def _frame(rate: float = RATE) -> list[Measurement]:
-    """Return mean rate and attitude of a frame that is exposed from 0.6 to 1.6 s and is available at 2 s."""
+    """Return mean rate and attitude of a frame that is exposed from 0.6 to 1.6 s, and available at 2 s."""
     since, middle, until = (round(t * 1e9) for t in (0.6, 1.1, 1.6))
     return [
         MeanRateMeasurement(since, until, np.array([0.0, rate, 0.0]), np.eye(3) * 1e-10),

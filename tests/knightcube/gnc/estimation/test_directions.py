@@ -1,4 +1,4 @@
-"""Tests that directions and fields, late or in time, add only their own information to the filter."""
+"""Tests that directions and fields add only their own information to the filter, late or in time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FIELD: FloatArray = np.array([2e-5, -1e-5, 3e-5])
 def direction(
     quaternion: FloatArray, reference: FloatArray = REFERENCE, time_ns: int = 0, off: float = 0.0
 ) -> DirectionMeasurement:
-    """Return the direction measured at `quaternion`, rotated by `off` rad about body x."""
+    """Return a direction measured at the attitude `quaternion`, rotated by `off` rad about body x."""
     turned = multiply(from_rotation_vector(np.array([off, 0.0, 0.0])), quaternion)
     return DirectionMeasurement(time_ns, attitude_matrix(turned) @ reference, reference, SIGMA**2 * np.eye(3))
 
@@ -45,7 +45,7 @@ def as_array(state: FilterState) -> FloatArray:
 
 
 def field(quaternion: FloatArray) -> FieldMeasurement:
-    """Return the reading of a magnetometer without a bias."""
+    """Return the reading of an unbiased magnetometer."""
     return FieldMeasurement(0, attitude_matrix(quaternion) @ FIELD, FIELD, 1e-16 * np.eye(3))
 
 
@@ -71,7 +71,8 @@ def test_rows_are_how_the_innovation_answers_to_each_error(
         bump = step * np.eye(SIZE)[column]
         up, down = (np.array(innovation(moved(STATE, sign * bump), seen, False).value) for sign in (1, -1))
         scale = 1.0 if name == "direction" else 4e-5
-        # The tangent plane is normal to the expected direction, whose motion changes it only in second order.
+        # The tangent plane is normal to the expected direction. A motion of this direction changes the plane
+        # only in second order.
         np.testing.assert_allclose((down - up) / (2.0 * step), rows[:, column], atol=2e-6 * scale)
 
 
@@ -96,13 +97,13 @@ def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
         for measurement in (seen, wide)
     ]
     assert squares[0] > 0.01
-    # The tangent plane is normal to the expected direction, which is wrong by 2 mrad, so the squared
+    # The tangent plane is normal to the expected direction, which is wrong by only 2 mrad, so the squared
     # innovation hardly changes.
     assert squares[1] == pytest.approx(squares[0], rel=0.05)
 
 
 def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
-    """With a very weak prior, the result equals a least-squares fit of the two directions."""
+    """With a very weak prior, two directions give the attitude of a least-squares fit."""
     rng = np.random.default_rng(4)
     truth = multiply(from_rotation_vector(np.array([0.01, -0.02, 0.015])), as_array(STATE))
     state, covariance = STATE, np.eye(SIZE)
@@ -111,7 +112,7 @@ def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
         exact = direction(truth, reference)
         noisy = exact.observed + SIGMA * rng.standard_normal(3)
         seen.append(replace(exact, observed=noisy / np.linalg.norm(noisy)))
-    for _ in range(2):  # the second update starts from the first result, as in an iterated least-squares fit
+    for _ in range(2):  # the second pass is linearised at the first result, as in an iterated fit
         covariance = np.eye(SIZE)
         for measurement in seen:
             found = innovation(state, measurement, False)
@@ -161,7 +162,7 @@ def test_a_wrong_direction_does_not_pass_the_gate_and_a_right_one_does() -> None
 
 
 def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> None:
-    """From 100 readings with 20 nT of noise, 300 nT of hard iron are found to 2 nT, as claimed."""
+    """From 100 readings with 20 nT of noise, a hard iron of 300 nT is estimated to 2 nT, as stated."""
     rng = np.random.default_rng(6)
     flight = fly(4, 400, False)
     filter_ = AttitudeFilter(FREE, replace(SETTINGS, field_bias_start=5e-7))

@@ -1,4 +1,4 @@
-"""Tests of the declared error state, and of the Kalman update that all filters use."""
+"""Tests of the declaration of the error state, and of the Kalman update that all filters share."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BLOCKS = [
 
 
 def problem(measured: int, seed: int = 3) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return a covariance (6, 6), an innovation, its Jacobian and its noise."""
+    """Return a covariance (6, 6), and an innovation with its Jacobian and noise."""
     rng = np.random.default_rng(seed)
     root, noise = rng.standard_normal((6, 6)), rng.standard_normal((measured, measured))
     rows = rng.standard_normal((measured, 6))
@@ -36,7 +36,7 @@ def problem(measured: int, seed: int = 3) -> tuple[FloatArray, FloatArray, Float
 
 
 def joseph(covariance: FloatArray, gain: FloatArray, rows: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the covariance after a correction with an arbitrary gain, by Joseph's form."""
+    """Return the covariance after a correction with any gain, by Joseph's form."""
     keep = np.eye(len(covariance)) - gain @ rows
     return np.asarray(keep @ covariance @ keep.T + gain @ noise @ gain.T)
 

@@ -1,4 +1,4 @@
-"""Tests that the filter estimates the field model's error with stars, and includes it in its covariance."""
+"""Tests that the filter estimates the error of the field model with stars, and covers it without stars."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Sky:
 
 @cache
 def flown_with_stars(sigma: float) -> Sky:
-    """Return a body after 6,000 s with stars; a test that continues the run must take a copy."""
+    """Return a body after 6,000 s with stars. A test that continues the run must copy the body."""
     sky = Sky(sigma, 4)
     sky.fly(6_000.0, stars=True)
     return sky
@@ -97,7 +97,10 @@ def test_a_contradicted_estimate_expects_the_error_of_the_start_again() -> None:
 
 @pytest.mark.parametrize("sigma", [1e-8, 5e-8])
 def test_without_stars_the_attitude_is_off_by_what_is_claimed(sigma: float) -> None:
-    """Five times the body has no star attitudes for 1,000 s, with 300 s of star attitudes in between."""
+    """After 1,000 s without stars, the attitude error agrees with its covariance.
+
+    The body has five such intervals, with 300 s of star attitudes before each.
+    """
     nees, claims, sky = [], [], copy.deepcopy(flown_with_stars(sigma))
     for _ in range(5):
         sky.fly(300.0, stars=True)

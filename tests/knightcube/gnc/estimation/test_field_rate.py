@@ -1,4 +1,4 @@
-"""Tests of the rate by magnetometer alone: accuracy and covariance when tumbling, and restarts."""
+"""Tests of the rate from the magnetometer alone: accuracy and covariance in a tumble, and restarts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def settings(inertia: FloatArray = INERTIA) -> FieldRateSettings:
 
 
 def tumbling(rate: FloatArray, inertia: FloatArray, times: FloatArray, dipole: FloatArray) -> FloatArray:
-    """Return rate and field (n, 6) in body axes, by an integrator that is independent of the filter."""
+    """Return rate and field (n, 6) in body axes, from an integrator that is independent of the filter."""
 
     def flow(time: float, state: FloatArray) -> FloatArray:
         w = state[4:]
@@ -56,7 +56,7 @@ def follow(
 def test_all_three_components_of_the_rate_are_found_and_the_claim_is_honest(degrees: FloatArray) -> None:
     found, last = follow(np.radians(degrees), INERTIA, 60.0)
     error = found.rate - last[:3]
-    # Limit that one in a thousand cases exceeds.
+    # Limit that is exceeded in one of a thousand cases.
     assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3
     assert np.linalg.norm(error) < 0.04 * np.linalg.norm(last[:3])
     assert found.restarts == 0
@@ -79,7 +79,7 @@ def test_an_inertia_off_by_several_per_cent_is_found_from_the_tumble(seed: int) 
 
 
 def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() -> None:
-    """The field does not rotate, so the spin along it is not observable."""
+    """A spin along a field that does not rotate is not observable, so its variance stays large."""
     found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
     for _ in range(50):
         found.advance(np.zeros(3), 0.2)
@@ -90,7 +90,10 @@ def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() ->
 
 
 def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
-    """The body is at rest in a constant field, so only the gyro measures a rotation about the field."""
+    """The estimate of a false gyro is discarded when the gyro measures correctly again.
+
+    The body is at rest in a constant field, so only the gyro measures a rotation about the field.
+    """
     found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
     false = 0.05 * FIELD / np.linalg.norm(FIELD)
 

@@ -1,4 +1,4 @@
-"""Tests that a free satellite's filter is consistent, learns the dipole and uses late attitudes."""
+"""Tests that a free satellite's filter is consistent, estimates the dipole and uses late attitudes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def around(time: float) -> FilterEnvironment:
 def fly(
     seconds: int, seed: int, age: float = 0.0, settings: FreeFilterSettings | None = None
 ) -> tuple[FreeFilter, FloatArray, FloatArray]:
-    """Return filter, true attitude and rate after `seconds` without control, with stars every 10 s."""
+    """Return filter, true attitude and true rate after `seconds` without control, with stars every 10 s."""
     rng = np.random.default_rng(seed)
     found = FreeFilter(INERTIA, settings or FreeFilterSettings())
     q, w = IDENTITY, np.array([1e-3, -5e-4, 8e-4])
@@ -115,7 +115,7 @@ def test_two_directions_make_a_coarse_attitude_fine_and_a_false_one_is_refused()
     assert found.knowledge is Knowledge.COARSE
     precise = 1e-4**2 * np.eye(3)
     for reference in np.eye(3)[:2]:
-        # Two updates, because the first starts with an error of a degree and is linearised.
+        # The update is repeated, because the first update is linearised at an error of one degree.
         for _ in range(2):
             assert found.direction(attitude_matrix(true) @ reference, reference, precise) or found.refused
     assert found.knowledge.value == "fine"

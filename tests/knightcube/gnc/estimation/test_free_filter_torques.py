@@ -47,7 +47,7 @@ AROUND = FilterEnvironment(FIELD, np.array([6.878e9, 0.0, 0.0]), NOTHING, 0.0)
 
 
 class Craft:
-    """A rigid body with rotated principal axes, and gyros with a bias."""
+    """A rigid body whose principal axes are rotated, and biased gyros."""
 
     def __init__(self, turn: FloatArray, rate: FloatArray, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -56,7 +56,7 @@ class Craft:
         self.quaternion, self.rate = IDENTITY, rate
 
     def second(self, dipole: FloatArray, noise: float) -> FloatArray:
-        """Simulate a second under a dipole (3,) with `noise` (A m^2) per cycle; return the gyro's mean."""
+        """Simulate a second with a dipole (3,) and `noise` (A m^2) per cycle; return the mean of the gyro."""
         dt, rates, inverse = 1.0 / CYCLES, [], np.linalg.inv(self.inertia)
         for _ in range(CYCLES):
             acting = dipole + noise * self.rng.standard_normal(3)
@@ -89,10 +89,10 @@ def fly(
     variation: float = 0.0,
     every: int = 20,
 ) -> None:
-    """Simulate with a gyro mean every second and stars every ten.
+    """Simulate a body with a gyro mean every second, and star attitudes every ten seconds.
 
-    The true dipole of each coil deviates from the command by the standard deviation `variation`, and changes
-    after `every` seconds.
+    The true dipole of each coil deviates from the command by the standard deviation `variation`. The
+    deviation changes after `every` seconds.
     """
     true = dipole
     for second in range(1, seconds + 1):
@@ -107,7 +107,7 @@ def fly(
 
 
 def started(craft: Craft, settings: FreeFilterSettings) -> FreeFilter:
-    """Return a filter with a star attitude and one sample of the gyro."""
+    """Return a filter that has received a star attitude and one gyro sample."""
     found = FreeFilter(INERTIA, settings)
     gyro = craft.rate + BIAS + GYRO_SIGMA * craft.rng.standard_normal(3)
     found.start(craft.seen(STAR), STAR**2 * np.eye(3), gyro, by_stars=True)
@@ -230,7 +230,10 @@ def test_currents_that_scatter_in_each_cycle_are_in_the_claim() -> None:
 
 @pytest.mark.parametrize("every", [5, 20, 60])
 def test_coils_that_vary_over_tens_of_seconds_are_in_the_claim(every: int) -> None:
-    """The filter assumes a correlation time of 20 s; the true interval is shorter, equal or longer."""
+    """The covariance covers coils that vary every 5, 20 or 60 s.
+
+    The filter assumes a correlation time of 20 s.
+    """
     honest = FreeFilterSettings(errors=NO_ERRORS, dipole=(1e-6, 0.0), sunlit=(1e-6, 0.0), field=1e-9)
     nees = {}
     for settings in (honest, dataclasses.replace(honest, coil_error=0.0)):
@@ -245,7 +248,7 @@ def test_coils_that_vary_over_tens_of_seconds_are_in_the_claim(every: int) -> No
             squares.append(error @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], error) / 6.0)
         nees[settings.coil_error] = float(np.mean(squares))
     assert 0.5 < nees[honest.coil_error] < 1.7, "36 errors: 99.9 % of a chi-square over 36"
-    # Independent variations in shorter intervals partly cancel each other.
+    # Variations in short intervals partly cancel each other, as they are independent.
     assert nees[0.0] > (3.0 if every >= 20 else 2.0)
 
 
@@ -263,9 +266,9 @@ def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> N
 
 
 def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
-    """False directions have caused a wrong gyro bias.
+    """A filter that restarts after a contradiction discards a gyro bias that is not plausible.
 
-    If the filter restarted with this bias, each restart would give a wrong estimate.
+    False directions have caused this bias. With it, each restart would give a wrong estimate.
     """
     craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
     known = settings.error_state(INERTIA).prior[SLOW, SLOW]
@@ -283,7 +286,10 @@ def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
 
 
 def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_size() -> None:
-    """With strong drag, a constant random walk is too small; the filter would finally reject stars."""
+    """The random walk of the drag torque increases with the torque, because the air density varies.
+
+    With strong drag, a constant random walk would be too small, and the filter would finally reject stars.
+    """
     settings = FreeFilterSettings(errors=NO_ERRORS)
     prior = settings.error_state(INERTIA).prior[SLOW, SLOW]
     first, seconds = TORQUES.start - SLOW.start + AIR.start, 100
@@ -302,7 +308,7 @@ def test_the_torque_by_air_changes_with_its_density_and_so_by_a_fraction_of_its_
 
 
 def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
-    """A dipole in the second half of a step rotates the body less than its mean over the whole step."""
+    """A dipole in the second half of a step rotates the body less than the same mean dipole over the step."""
     dipole = np.array([0.0, 0.09, 0.0])
     apart, together = (FreeFilter(INERTIA, FreeFilterSettings(errors=NO_ERRORS)) for _ in range(2))
     for found in (apart, together):
@@ -315,13 +321,15 @@ def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
     off = to_rotation_vector(multiply(apart.quaternion, conjugate(together.quaternion)))
     assert np.linalg.norm(off) < 1e-8
     assert np.linalg.norm(together.motion.inverse @ np.cross(uneven, FIELD)) > 1e-6
-    # The rotation that the dipole causes also rotates the field in body axes, an effect of third order in
-    # time.
+    # The rotation by the dipole also rotates the field in body axes, an effect of third order in time.
     assert apart.rate == pytest.approx(together.rate, abs=1e-8)
 
 
 def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time() -> None:
-    """The field in the axes of a rotating body differs between the middle and the end of a step."""
+    """A dipole that changes within a step acts in the field at its own time, not in the field at mid-step.
+
+    The field in the axes of a rotating body differs between these times.
+    """
     spin, dipole = np.array([0.05, -0.1, 0.08]), np.array([0.09, -0.05, 0.02])
     rates = []
     for late in (False, True):
@@ -340,14 +348,17 @@ def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time()
 
 
 def test_after_a_large_correction_the_remaining_error_is_that_of_the_corrected_axes() -> None:
-    """A direction that a measurement determines accurately is fixed in inertial space, not in the body."""
+    """After a large correction, the covariance is that of errors in the corrected axes.
+
+    A direction that a measurement determines accurately is fixed in inertial space, not in the body.
+    """
     prior, noise = 0.3**2 * np.eye(3), np.diag([1.0, 1e-4, 1e-4]) ** 2
     wide = FreeFilter(INERTIA, FreeFilterSettings(errors=NO_ERRORS))
     wide.start(IDENTITY, prior, np.zeros(3))
     assert wide.attitude(from_rotation_vector(np.array([0.0, 0.4, 0.0])), noise)
     covariance = wide.covariance[ATTITUDE, ATTITUDE]
     correction = to_rotation_vector(wide.quaternion)
-    # An error e before the correction c becomes log(exp(e) exp(-c)).
+    # An error e before the correction c is log(exp(e) exp(-c)) after the correction.
     drawn = np.random.default_rng(3).multivariate_normal(
         np.zeros(3), np.linalg.inv(np.linalg.inv(prior) + np.linalg.inv(noise)), 4000
     )

@@ -19,7 +19,7 @@ KNIGHTCUBE = np.diag([1.10e-3, 1.05e-3, 0.99e-3])
 
 
 def _acceleration(inertia: FloatArray, rate: FloatArray) -> FloatArray:
-    """Return Euler's torque-free acceleration J^-1 (J w x w)."""
+    """Return the torque-free acceleration J^-1 (J w x w) of Euler's equations."""
     return np.asarray(np.linalg.solve(inertia, np.cross(inertia @ rate, rate)))
 
 
@@ -34,9 +34,9 @@ def test_the_coefficients_give_eulers_acceleration_of_a_full_tensor() -> None:
 
 @pytest.mark.parametrize("believed", [CUBESAT_3U, KNIGHTCUBE])
 def test_the_modes_span_other_bodies_and_gyros_with_weights_of_about_one(believed: FloatArray) -> None:
-    """The modes are corrections of the gyroscopic coefficients for errors of inertia and gyro.
+    """The modes describe the acceleration errors of other bodies and gyros to a hundredth.
 
-    Such errors cause an error of the acceleration, which the modes describe to a hundredth.
+    The modes are corrections of the gyroscopic coefficients for errors of inertia and gyro.
     """
     rng = np.random.default_rng(7)
     modes = coefficient_modes(believed, BodyErrors())

@@ -1,4 +1,4 @@
-"""Tests that the age of delayed samples is estimated, so that the estimate does not lag the body."""
+"""Tests that the age of delayed samples is estimated, so that the estimate does not lag behind the body."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ESTIMATING = replace(SETTINGS, latency_start=0.05)
 
 
 def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[AttitudeFilter, Estimate]:
-    """Give a filter samples with time stamps `late` cycles too late; return it and its last estimate."""
+    """Give a filter samples whose time stamps are `late` cycles late; return filter and last estimate."""
     filter_ = AttitudeFilter(SUSPENDED, settings)
     for cycle in range(late, len(flight.samples)):
         age = filter_.latency if settings.latency_start else None
@@ -38,16 +38,16 @@ def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[At
 
 
 def sigmas(flight: Flight, last: Estimate) -> float:
-    """Return the error of the estimated rotation in units of its claimed sigma."""
+    """Return the error of the estimated rotation in units of its stated sigma."""
     error = angle_about_axis_y(flight.attitudes[-1]) - angle_about_axis_y(last.quaternion)
     return float(abs(error) / np.sqrt(last.covariance[1, 1]))
 
 
 @pytest.mark.parametrize("late", [0, 2, 3])
 def test_the_age_is_found_and_made_up_for(late: int) -> None:
-    """After 20 s the age is known to 12 ms, as claimed.
+    """After 20 s, the age of the samples is known to 12 ms and within three sigma.
 
-    Without a correction, an age of two cycles causes errors of ten sigma.
+    Without a correction, an age of two cycles causes errors of more than ten sigma.
     """
     flight = fly(32, 800, True, SWING)
     filter_, last = follow_late(flight, late, ESTIMATING)
@@ -61,7 +61,7 @@ def test_the_age_is_found_and_made_up_for(late: int) -> None:
 
 
 def test_the_error_of_the_age_is_as_large_as_the_filter_says() -> None:
-    """The sum of ten flights' normalised squares is in the 99.9 % band of chi-square with ten degrees."""
+    """The squared normalised errors of the age in ten flights have a sum in the 99.9 % band of chi-square."""
     squares = []
     for seed in range(20, 30):
         _, last = follow_late(fly(seed, 300, True, SWING), 1, ESTIMATING)
@@ -83,7 +83,10 @@ def test_a_rate_alone_does_not_show_the_age() -> None:
 
 
 def test_no_age_is_taken_that_is_none() -> None:
-    """Before the start of the filter the age is unknown, and an age beyond its limits is rejected."""
+    """The estimated age stays between zero and the longest latency.
+
+    Before the start of the filter, it is zero.
+    """
     filter_ = AttitudeFilter(SUSPENDED, ESTIMATING)
     assert filter_.latency == 0.0
     flight = fly(13, 400, True)
@@ -92,7 +95,10 @@ def test_no_age_is_taken_that_is_none() -> None:
 
 
 def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
-    """The noise is half the step of the acceleration times one sigma of the age, and zero without a step."""
+    """If a current changes within the uncertainty of the age, the change adds noise to the acceleration.
+
+    The noise is half the step of the acceleration per sigma of the age, and zero without a step.
+    """
     state = AttitudeFilter(SUSPENDED, ESTIMATING)
     flight = fly(14, 1, True)
     state.start(*flight.samples[0])

@@ -1,4 +1,4 @@
-"""Tests of the filter's derivatives against finite differences, and of its noise against Monte Carlo."""
+"""Tests of the filter's derivatives against finite differences, and of its noise by Monte Carlo runs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def walks_of(bias: float, disturbance: float) -> FloatArray:
 
 
 def difference(a: FilterState, b: FilterState) -> FloatArray:
-    """Return the error (19,) of b relative to a."""
+    """Return the error vector (19,) of b relative to a."""
     turn = logarithm(compose(a.quaternion, inverse(b.quaternion)))
     mine, theirs = (
         np.array([*s.rate, *s.bias, *s.disturbance, *s.parameters, s.latency, *s.field_bias]) for s in (a, b)
@@ -59,7 +59,10 @@ def difference(a: FilterState, b: FilterState) -> FloatArray:
 
 
 def test_the_transition_is_how_errors_grow() -> None:
-    """Compare with central differences over one cycle; the remainder is of third order in the step."""
+    """The transition of the errors agrees with central differences over one cycle.
+
+    The remainder is of third order in the step.
+    """
     for body, state, free in ((FREE, STATE, [*range(12), 14]), (SUSPENDED, HUNG, ABOUT_THREAD)):
         step = 1e-5
         for column in free:
@@ -68,14 +71,14 @@ def test_the_transition_is_how_errors_grow() -> None:
             down, _ = propagate(body, STILL, moved(state, -bump), np.eye(SIZE), TORQUING, 0.025)
             covariance = np.outer(bump, bump) / step**2
             _, carried = propagate(body, STILL, state, covariance, TORQUING, 0.025)
-            # A covariance of rank one is the outer product of a column with itself, so outer products are
-            # compared.
+            # Outer products are compared, because a covariance of rank one is the outer product of a column
+            # with itself.
             grown = difference(up, down) / (2.0 * step)
             np.testing.assert_allclose(carried, np.outer(grown, grown), atol=3e-5)
 
 
 def test_a_step_is_the_product_of_the_whole_matrices() -> None:
-    """Compare with dense products (22, 22) of transition, noise and a cloned attitude, up to rounding."""
+    """A step equals dense products (22, 22) of transition, noise and a cloned attitude, up to rounding."""
     rng = np.random.default_rng(4)
     rate_noise = np.diag(rng.uniform(0.0, 1e-8, 3))
     noise = ProcessNoise(1e-7, rate_noise, rng.uniform(0.0, 1e-9, SIZE), unknown_current=0.1)
@@ -93,7 +96,7 @@ def test_a_step_is_the_product_of_the_whole_matrices() -> None:
 def dense_step(
     body: RigidBody, noise: ProcessNoise, state: FilterState, torquing: Torquing, dt: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transition and added noise (22, 22) of one step with one cloned attitude, as dense matrices."""
+    """Return transition and added noise (22, 22) of one step with one cloned attitude."""
     middle = compose(exponential(*(0.5 * dt * w for w in state.rate)), state.quaternion)
     model = body.linearise(middle, state.rate, state.parameters, torquing, 0.5 * dt)
     flow, added = np.zeros((22, 22)), np.zeros((22, 22))
@@ -109,7 +112,10 @@ def dense_step(
 
 
 def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
-    """The diagonals over 4000 random sequences of 20 cycles with held noise agree within 10 %."""
+    """The process noise agrees within 10 % with 4000 random sequences of 20 cycles, whose noise is held.
+
+    The diagonals of the covariances are compared.
+    """
     rng = np.random.default_rng(3)
     draws, cycles, dt = 4000, 20, 0.025
     sigma, walk, bias_walk = 2e-3, 5e-4, 1e-5
@@ -179,13 +185,16 @@ def test_correcting_by_an_exact_attitude_gives_that_attitude() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
-    """Accurate and inaccurate measurements, from a microradian to a radian, come in any order."""
+    """After accurate and inaccurate measurements in any order, the covariance is symmetric and positive.
+
+    The sigmas of the measurements are from a microradian to a radian.
+    """
     rng = np.random.default_rng(seed)
     noise = ProcessNoise(1e-7, np.zeros((3, 3)), walks_of(1e-9, 1e-9))
     state, covariance = STATE, np.diag(10.0 ** rng.uniform(-8.0, 0.0, SIZE))
     for _ in range(20):
         size = 10.0 ** rng.uniform(-12.0, 0.0)
-        # Each measurement equals its prediction, so it changes the covariance only.
+        # Each measurement equals its prediction, so only the covariance changes.
         if rng.random() < 0.5:
             seen = AttitudeMeasurement(0, np.array(state.quaternion), size * np.eye(3))
             found = innovation(state, seen, False)

@@ -21,7 +21,7 @@ DIPOLE = np.array([0.02, -0.01, 0.015])
 
 
 def around(second: float) -> FilterEnvironment:
-    """Return the environment at a time (s): a rotating field, air and sunlight."""
+    """Return the environment at a time (s): a rotating field, air drag and sunlight."""
     turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * second, 0.0])))
     pressed = Pressures(np.array([[0.6, 0.0, 0.8]]), np.array([[0.0, 1.0, 0.0]]))
     position = 6.9e6 * np.array([np.cos(1e-3 * second), 0.1, np.sin(1e-3 * second)])

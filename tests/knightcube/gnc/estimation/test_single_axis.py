@@ -33,7 +33,7 @@ def run(filter_: SingleAxisFilter, commands: list[float], measurements: list[Mea
 
 
 def test_its_errors_are_as_large_as_its_covariance_says() -> None:
-    """The summed NEES of angle and rate over 40 runs is in the 99.9 % band of chi-square(80)."""
+    """The NEES of angle and rate, summed over 40 runs, is in the 99.9 % band of chi-square(80)."""
     rng = np.random.default_rng(7)
     nees = []
     for _ in range(40):
@@ -80,7 +80,7 @@ def test_a_late_measurement_gives_what_it_would_have_given_in_time() -> None:
 
 
 def test_mean_rates_over_an_exposure_keep_it_consistent_while_the_body_accelerates() -> None:
-    """With a mean rate each second, 0.25 s late, the NEES of 40 runs is in the 99.9 % chi-square band."""
+    """With mean rates each second, 0.25 s late, the NEES of 40 runs is in the 99.9 % chi-square band."""
     rng = np.random.default_rng(11)
     nees, used, plain_sigma = [], 0, 0.0
     for _ in range(40):

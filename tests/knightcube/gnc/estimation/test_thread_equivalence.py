@@ -1,4 +1,4 @@
-"""Tests that the three-axis filter on a thread gives the estimates of the single-axis filter."""
+"""Tests that the three-axis filter of a body on a thread gives the estimates of the single-axis filter."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from tests.knightcube.gnc.estimation.single_axis_flights import PERIOD, PLANT, S
 from tests.support.consistency_worlds import KNOWN_PLANT
 
 ODD: FloatArray = np.array([3e-3, 0.0, -1e-2])
-"""Rate (rad/s) about the other axes, which does not affect the thread."""
+"""Rate (rad/s) about the other two axes, which does not affect the rotation about the thread."""
 
 
 def on_three_axes(measurement: single_axis.Measurement) -> Measurement:
-    """Return a scalar measurement as a measurement of three axes."""
+    """Return a scalar measurement as a measurement about three axes."""
     covariance = measurement.variance * np.eye(3)
     if measurement.component == single_axis.ANGLE:
         return AttitudeMeasurement(measurement.time_ns, about_axis_y(measurement.value), covariance)
@@ -49,7 +49,7 @@ def largest_difference(driven: bool) -> tuple[float, float]:
         disturbance_start=SETTINGS.disturbance_start,
         bias_start=0.0,
         bias_walk=0.0,
-        # The single-axis filter assumes the coil noise of a coil across the field at every angle.
+        # At every angle, the single-axis filter assumes the noise of a coil normal to the field.
         rate_walk=gain * SETTINGS.current_noise * math.sqrt(SETTINGS.control_period),
     )
     one, three = single_axis.SingleAxisFilter(PLANT, SETTINGS), AttitudeFilter(SUSPENDED, settings)
@@ -88,7 +88,10 @@ def test_adrift_the_two_filters_agree_to_rounding() -> None:
 
 
 def test_driven_they_differ_by_what_the_single_axis_leaves_out() -> None:
-    """The single-axis filter's covariance ignores the change of torque with angle: 0.5 %."""
+    """With driven coils, the covariances of both filters differ by 0.5 %.
+
+    The single-axis filter ignores in its covariance that the torque changes with the angle.
+    """
     states, covariances = largest_difference(driven=True)
     assert states < 5e-3
     assert covariances < 5e-3

@@ -1,4 +1,4 @@
-"""Tests that the filter follows its measurements, but estimates no parameters, while currents are unknown."""
+"""Tests that the filter follows its measurements, without parameter estimates, while currents are unknown."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LIMIT = 0.148
 
 @pytest.fixture(scope="module")
 def flown() -> Flight:
-    """Return a flight in which the chip keeps a large current in its registers for five seconds."""
+    """Return a flight in which the PWM chip keeps a large current for five seconds."""
 
     def keep(cycle: int, wanted: FloatArray) -> FloatArray:
         return np.array([LIMIT, 0.0, 0.0]) if STUCK <= cycle < FREE_AGAIN else wanted
@@ -32,7 +32,10 @@ def flown() -> Flight:
 
 
 def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
-    """Return the filter after the flight; the loop may report from `FOUND` that the chip does not respond."""
+    """Return the filter after a flight.
+
+    If `FOUND` is reported, the loop knows that the chip does not respond.
+    """
     filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
     follow(filter_, flown, 1, min(FOUND, until))
     if reported:
@@ -47,7 +50,7 @@ def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
 
 
 def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
-    """Return the errors of angle, rate and gain at the last cycle, in units of their sigmas."""
+    """Return the final errors of angle, rate and gain in units of their sigmas."""
     estimate = filter_.at((END - 1) * CYCLE_NS)
     sigma = np.sqrt(np.diag(estimate.covariance))
     found = np.array([angle_about_axis_y(estimate.quaternion), estimate.rate[1], estimate.parameters.gain])

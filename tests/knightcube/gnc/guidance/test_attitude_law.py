@@ -1,4 +1,4 @@
-"""Tests of attitude laws: pointing axes, and rates and accelerations against the attitude."""
+"""Tests of attitude laws: pointing axes, and consistency of rates and accelerations with the attitude."""
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ def test_nadir_along_the_flight_turns_once_an_orbit_about_the_pitch_axis() -> No
 
 
 def test_rate_and_acceleration_carry_the_attitude_on() -> None:
-    """The ground target passes at 3 km/s or more, so rate and acceleration change continuously."""
+    """Rate and acceleration of a law predict its attitude over a short time.
+
+    A ground target passes at 3 km/s or more, so its rate and acceleration change continuously.
+    """
     beneath = celestial_to_terrestrial(JULIAN_DATE) @ ORBIT.position_at(np.array([300.0]))[0]
     longitude, latitude, _ = (float(part) for part in geodetic(beneath))
     law = AttitudeLaw(Z, ground(latitude, longitude), X, velocity)
@@ -64,7 +67,7 @@ def test_rate_and_acceleration_carry_the_attitude_on() -> None:
     assert np.linalg.norm(found.rate, axis=1).max() > 5.0 * RATE
     overhead = law.attitudes(ORBIT, np.array([300.0]))[0]
     down = nadir(ORBIT, np.array([300.0]))[0]
-    # In 300 s the Earth's rotation moves the target by 1.3 deg as seen from 500 km.
+    # In 300 s the Earth's rotation moves the target by 1.3 deg, as seen from an altitude of 500 km.
     assert np.degrees(np.arccos(attitude_matrix(overhead)[2] @ down)) < 20.0
 
 

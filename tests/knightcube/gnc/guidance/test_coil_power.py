@@ -1,4 +1,4 @@
-"""Tests of the power of chopped coils against hand-computed values and the simulated supply."""
+"""Tests of the power of chopped coils against values computed by hand and against the simulated supply."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FULL = VOLTAGE / RESISTANCE
 
 
 def test_the_supply_delivers_power_only_while_a_coil_is_driven_and_either_way() -> None:
-    """At the duties 0, 0.25, 0.5, -0.5 and 1, the coil takes these fractions of 3.4^2/23 = 0.50261 W."""
+    """At the duty cycles 0, 0.25, 0.5, -0.5 and 1, a coil takes |duty| times 3.4^2/23 W = 0.50261 W."""
     duty = np.array([0.0, 0.25, 0.5, -0.5, 1.0])
     expected = [0.0, 0.12565, 0.25130, 0.25130, 0.50261]
     np.testing.assert_allclose(supply_power(duty * FULL, VOLTAGE), expected, atol=1e-5)
@@ -27,14 +27,14 @@ def test_the_bus_delivers_the_same_current_at_its_higher_voltage() -> None:
 
 
 def test_the_heat_of_a_steady_current_is_the_supply_power_times_the_duty_cycle() -> None:
-    """With half a duty the current is 0.07391 A and the heat 0.12565 W, half of what the supply delivers."""
+    """At a duty cycle of 0.5, the current is 0.07391 A and the heat 0.12565 W, half of the supply power."""
     duty = np.array([0.0, 0.25, 0.5, -0.5, 1.0])
     expected = [0.0, 0.03141, 0.12565, 0.12565, 0.50261]
     np.testing.assert_allclose(steady_heat(duty * FULL, RESISTANCE), expected, atol=1e-5)
 
 
 def test_each_coil_has_its_own_resistance() -> None:
-    """Two coils have 0.1 A in 20 ohm and 0.2 A in 10 ohm at two times."""
+    """Each coil has its own resistance: 0.1 A in 20 ohm and 0.2 A in 10 ohm, at two times."""
     current = np.array([[0.1, 0.2], [-0.1, 0.0]])
     np.testing.assert_allclose(steady_heat(current, np.array([20.0, 10.0])), [[0.2, 0.4], [0.2, 0.0]])
 
@@ -43,7 +43,10 @@ def test_each_coil_has_its_own_resistance() -> None:
 def test_it_is_the_charge_that_the_simulated_bridges_take_from_their_supply(
     current: tuple[float, float, float],
 ) -> None:
-    """The simulated circuit integrates the chopped current over three whole periods."""
+    """The power agrees with that of the simulated circuit.
+
+    The circuit integrates the chopped current over three whole periods.
+    """
     rig = Rig()
     rig.coils.start()
     rig.command(*current)
@@ -63,7 +66,7 @@ def test_the_smoothed_power_has_its_slope_and_is_within_a_tenth_of_full_power(co
     ahead, behind = (cost.smooth(plant, current + shift)[0] for shift in (step, -step))
     np.testing.assert_allclose(slope, (ahead - behind) / (2.0 * step), atol=1e-5)
     assert value[20] == pytest.approx(0.0, abs=1e-12)
-    # The smoothed power is lower than the exact power by at most a tenth of full power.
+    # The smoothed power is at most a tenth of the full power below the exact power.
     lower = cost.power(plant, current) - value
     assert lower.min() > -1e-12
     assert lower.max() < 0.1 * VOLTAGE * FULL

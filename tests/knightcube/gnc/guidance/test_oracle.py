@@ -10,7 +10,7 @@ from tests.support.step_problems import known_optima
 
 
 def test_the_oracle_reproduces_the_published_optima_to_1e_4() -> None:
-    """The trapezoidal rule with 400 intervals agrees with each of twenty Hermite-Simpson optima to 4e-5."""
+    """The trapezoidal rule with 400 intervals agrees with twenty Hermite-Simpson optima to 4e-5."""
     for known in known_optima():
         found = solve(known.problem.slew(known.problem.horizon))
         assert found is not None
@@ -18,7 +18,10 @@ def test_the_oracle_reproduces_the_published_optima_to_1e_4() -> None:
 
 
 def test_the_oracle_reproduces_the_closed_form_of_a_small_slew() -> None:
-    """With cos(theta) = 1 and no limit, theta'' is linear in time, and int I^2 dt = 12 a^2 / T^3."""
+    """For a small slew, int I^2 dt is that of the closed form, 12 a^2 / T^3.
+
+    With cos(theta) = 1 and without a limit, theta'' is linear in time.
+    """
     angle, horizon, gain = 1e-3, 10.0, 2.916e-4 / 1.05e-3
     found = solve(Slew(0.0, 0.0, angle, 0.0, horizon, 1.05e-3, 2.916e-4, 23.0, 0.148))
     assert found is not None

@@ -1,4 +1,4 @@
-"""Tests of Legendre-Gauss-Lobatto nodes and their exactness, and of the cubic prey of 5.35-5.38."""
+"""Tests of Legendre-Gauss-Lobatto nodes and their exactness, and of the cubic prey path of 5.35-5.38."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from knightcube.gnc.guidance.plant import CubicPrey, lgl_rule
 def test_nodes_and_weights_are_the_published_ones(
     count: int, nodes: list[float], weights: list[float]
 ) -> None:
-    """The expected values are those of Abramowitz & Stegun, table 25.6."""
+    """Nodes and weights are those of Abramowitz & Stegun, table 25.6."""
     rule = lgl_rule(count)
     np.testing.assert_allclose(rule.nodes, nodes, atol=1e-14)
     np.testing.assert_allclose(rule.weights, weights, atol=1e-14)
@@ -85,7 +85,7 @@ def test_the_prey_joins_both_states(
 
 
 def test_coefficients_are_those_of_equations_5_37_and_5_38() -> None:
-    """From 0.4 at 0.01 to -0.3 at rest in 10 s: C2 = [3 (-0.7) - 0.2]/100 and C3 = (-0.01 + 0.46)/300."""
+    """From 0.4 with 0.01 to -0.3 at rest in 10 s: C2 = [3 (-0.7) - 0.2]/100 and C3 = (-0.01 + 0.46)/300."""
     prey = CubicPrey.between(0.4, 0.01, -0.3, 0.0, 10.0)
     assert (prey.c0, prey.c1) == (0.4, 0.01)
     assert prey.c2 == pytest.approx(-0.023, abs=1e-15)

@@ -1,4 +1,4 @@
-"""Tests of accepted and refused plans, with an accepted plan for each refusal."""
+"""Tests of plans that are accepted and of plans that are refused, with an accepted plan for each refusal."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def newer() -> StepPlan:
 
 @pytest.fixture
 def guidance(good: StepPlan) -> PathGuidance:
-    """Return guidance that follows the plan `good` from 100 s on."""
+    """Return a guidance that follows the plan `good` from 100 s on."""
     guidance = PathGuidance(KNIGHTCUBE, RULES)
     guidance.aim(TARGET)
     assert guidance.offer(good, 100 * SECOND, 100 * SECOND, START, 0.0).accepted
@@ -66,7 +66,7 @@ def test_a_newer_plan_replaces_the_older(guidance: PathGuidance, newer: StepPlan
 
 
 def spoilt(path: PolynomialPath, row: int, value: float) -> PolynomialPath:
-    """Return the path with one coefficient of q2 overwritten."""
+    """Return a path with one changed coefficient of q2."""
     series = list(path.series)
     series[row] = (value, *series[row][1:])
     return replace(path, series=tuple(series))
@@ -75,7 +75,7 @@ def spoilt(path: PolynomialPath, row: int, value: float) -> PolynomialPath:
 def refused(
     guidance: PathGuidance, offered: StepPlan, origin: float, now: float, angle: float, rate: float
 ) -> str:
-    """Return why `offered` is refused, and check that the old path is still followed."""
+    """Return the reason why `offered` is refused, and check that the old path is still followed."""
     before = guidance.path
     verdict = guidance.offer(offered, round(origin * SECOND), round(now * SECOND), angle, rate)
     assert not verdict.accepted
@@ -99,14 +99,15 @@ def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) 
 
 
 def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
-    """A ripple of Chebyshev degree 40 is too fine for 24 nodes.
+    """A path is refused if its current exceeds the limit between the nodes.
 
-    The current of the ripple is almost zero at most of the nodes, and amperes between them.
+    A ripple of Chebyshev degree 40 is too fine for 24 nodes. Its current is almost zero at most of the nodes,
+    and several amperes between the nodes.
     """
     count = 41
     columns = np.zeros((count, 3))
     columns[-len(newer.path.series) :] = newer.path.series
-    columns[0, 2] = 0.02  # in q2'' only, like an error of a planner between nodes
+    columns[0, 2] = 0.02  # a change of q2'' alone, like a planner's error between nodes
     rippled = replace(newer.path, series=tuple((a, b, c) for a, b, c in columns.tolist()))
     assert "limit is 0.148 A" in refused(guidance, replace(newer, path=rippled), 101, 101, START, 0.004)
 
@@ -209,7 +210,10 @@ def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: PathGuidance)
 
 
 def test_the_limit_is_judged_under_the_disturbance_that_the_plan_allowed_for() -> None:
-    """With a disturbance of 0.03 rad/s^2, whose compensation takes 108 mA, the path is within the limit."""
+    """The current limit is checked with the disturbance that the plan assumed.
+
+    With a disturbance of 0.03 rad/s^2, which takes 108 mA to compensate, the path is within the limit.
+    """
     pushed = replace(KNIGHTCUBE, disturbance=0.03)
     helped = plan(pushed, 0.1, 0.0, 0.2, 0.0, 5.5)
     guidance = PathGuidance(KNIGHTCUBE, RULES)

@@ -1,4 +1,4 @@
-"""Tests of the relations of the single-axis plant against each other and physics."""
+"""Tests of the relations of the single-axis plant against each other and against physics."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ def test_current_and_acceleration_are_inverse(angle: float, rate: float, acceler
 
 
 def test_full_current_turns_the_knightcube_as_the_torque_says() -> None:
-    """80 x 0.0081 m^2 x 4.5e-4 T x 0.148 A = 4.3157e-5 N m on 1.05e-3 kg m^2: 0.041102 rad/s^2."""
+    """The full current accelerates a KnightCube by 4.3157e-5 N m / 1.05e-3 kg m^2 = 0.041102 rad/s^2.
+
+    The torque is 80 x 0.0081 m^2 x 4.5e-4 T x 0.148 A.
+    """
     assert KNIGHTCUBE.acceleration(0.0, 0.0, 0.148) == pytest.approx(0.041102, rel=1e-4)
     assert KNIGHTCUBE.acceleration(math.pi / 3, 0.0, 0.148) == pytest.approx(0.020551, rel=1e-4)
 
@@ -53,7 +56,7 @@ def test_q2_and_angle_are_two_names_of_one_motion(angle: float, rate: float) -> 
 
 
 def test_the_acceleration_of_q2_is_the_derivative_of_the_rate() -> None:
-    """Compare with central differences of 5.9 along q2 = 0.5 sin(0.3 t)."""
+    """The acceleration of q2 (5.9) agrees with central differences along q2 = 0.5 sin(0.3 t)."""
     step = 1e-5
 
     def rate_at(time: float) -> float:

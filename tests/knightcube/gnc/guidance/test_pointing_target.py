@@ -1,4 +1,4 @@
-"""Tests that targets that define an attitude are accepted, all others refused, and that each has a text."""
+"""Tests that a target is accepted only if it defines an attitude, and that each target has a text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ HALF = 0.5 * math.pi
 
 
 def test_goals_keep_their_numbers_in_the_command_packet() -> None:
-    """Recorded commands and ground databases use these numbers."""
+    """The numbers of the goals in command packets do not change.
+
+    Recorded commands and ground databases use these numbers.
+    """
     labels = ["nadir", "velocity", "sun", "inertial", "ground", "object"]
     assert [Goal(number).label for number in range(6)] == labels
     assert [Goal.named(label).value for label in labels] == list(range(6))

@@ -37,7 +37,7 @@ SLEW = "E-cube-3u-sso-y90-300"
 
 
 def task(nodes: int = 8, **changes: Any) -> SlewTask:
-    """Return a slew of 90 deg."""
+    """Return the task of a slew by 90 deg."""
     case = problem(SLEW)
     return replace(task_of(case, case["T"], nodes=nodes), **changes)
 
@@ -124,7 +124,7 @@ def test_the_attitude_of_each_goal_is_as_recorded() -> None:
 
 
 def plant(current_limit: float | None = None) -> SingleAxisPlant:
-    """Return the demonstration's testbed with another current limit (A)."""
+    """Return the testbed of the demonstration with a changed current limit (A)."""
     config = demo_config(1.0)
     if current_limit is not None:
         coils = configuration.replace(config.coils, current_limit=current_limit)
@@ -133,11 +133,11 @@ def plant(current_limit: float | None = None) -> SingleAxisPlant:
 
 
 _ROUNDING = 1e-10
-"""Largest value that rounding gives to a path coefficient that should be exactly zero."""
+"""Largest value that rounding gives to a coefficient of a path that is zero in exact arithmetic."""
 
 
 def without_counts(found: StepPlan) -> StepPlan:
-    """Return a plan without its number of evaluations, which depends on the rounding of the processor."""
+    """Return a plan without its number of evaluations, which depends on the processor's rounding."""
     return replace(found, evaluations=0)
 
 

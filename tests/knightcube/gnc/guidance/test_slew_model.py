@@ -1,4 +1,4 @@
-"""Tests of cubic Hermite interpolation against scipy and cubic functions."""
+"""Tests of cubic Hermite interpolation against scipy and against cubic functions."""
 
 from __future__ import annotations
 

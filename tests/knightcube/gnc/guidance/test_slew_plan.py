@@ -1,4 +1,4 @@
-"""Tests of slews by coils alone, against another method's optima and an independent integrator."""
+"""Tests of slews by coils alone, against the optima of another method and an independent integrator."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> No
 
 
 def test_a_slew_of_least_time_is_found_although_the_first_path_cannot_be_flown() -> None:
-    """The first path is shorter than the optimum, and its integration fails."""
+    """A slew of minimum time is found, although its first path is too short and cannot be integrated."""
     case = problem("T-knightcube-1u-sso-y180")
     task = task_of(case, case["T"], time_cost=MINIMUM_TIME)
     plan = plan_task(task)
@@ -68,7 +68,10 @@ def test_a_slew_of_least_time_is_found_although_the_first_path_cannot_be_flown()
 
 
 def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
-    """In case 21 of `bench orbit_slews` no initial guess leads to a path over the requested time."""
+    """If no initial guess leads to a path of the requested duration, a longer slew is planned and shortened.
+
+    This is case 21 of `bench orbit_slews`.
+    """
     *_, (_, task) = slews(22, 1, False)
     plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
@@ -93,7 +96,10 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
 
 
 def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> None:
-    """In case 0 of `bench orbit_slews --cones --seed 43` every path without limits passes through a cone."""
+    """A slew is led around the cones, although every path without limits passes through a cone.
+
+    This is case 0 of `bench orbit_slews --cones --seed 43`.
+    """
     (_, task), *_ = slews(1, 43, True)
     plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
@@ -103,7 +109,10 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 
 @pytest.mark.parametrize(("seed", "case"), [(43, 18), (43, 40), (44, 44)])
 def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
-    """In the first two slews, rotations about the field lead all initial guesses through cones."""
+    """Slews are planned although all initial guesses by rotations about the field pass through cones.
+
+    This holds for the first two of the three slews.
+    """
     *_, (_, task) = slews(case + 1, seed, True)
     plan = plan_task(task)
     assert plan.peak <= 1.001
@@ -114,7 +123,10 @@ def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int,
 
 
 def test_a_path_beyond_the_limit_when_flown_takes_longer() -> None:
-    """In case 27 of `bench orbit_slews --seed 44` the dipoles with feedback exceed their limit by 1.4 %."""
+    """A path whose dipoles with feedback exceed their limit is planned again with a longer duration.
+
+    In case 27 of `bench orbit_slews --seed 44` they exceed the limit by 1.4 %.
+    """
     *_, (_, task) = slews(28, 44, False)
     plan = plan_task(task)
     assert plan.status is SlewStatus.STRETCHED
@@ -191,7 +203,7 @@ def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
 
 
 def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() -> None:
-    """In axes rotated from the coils' axes, the heat has a full matrix, and the optimum is the same."""
+    """In axes rotated from the coils' axes, the heat has a full matrix, and the optimum has the same heat."""
     orbit, heat, inertia = circular(3_000.0), np.array([3.0, 30.0, 12.0]), np.array([0.0066, 0.0333, 0.0300])
     turn = attitude_matrix(from_rotation_vector(np.array([0.5, -0.7, 0.3])))
     order = SlewOrder(
@@ -210,7 +222,7 @@ def test_a_slew_with_coupled_heat_costs_what_it_does_in_the_axes_of_the_coils() 
     tilted = plan_order(replace(order, craft=turned, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert tilted.energy == pytest.approx(along.energy, rel=1e-4)
     assert tilted.path.heat(turned.weights) == pytest.approx(tilted.energy, rel=1e-3)
-    # A plan that ignores the off-diagonal terms of the heat gives another path with more heat.
+    # A plan that ignores the off-diagonal elements of the heat matrix has more heat.
     alone = replace(turned, weights=np.diag(turned.weights))
     careless = plan_order(replace(order, craft=alone, axes=axes, camera=turn[:, 2]), orbit, 20.0).plan
     assert careless.path.heat(turned.weights) > 1.02 * along.energy

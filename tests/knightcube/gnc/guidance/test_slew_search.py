@@ -1,4 +1,4 @@
-"""Tests of initial guesses of slews: feasible momenta that end at the target outside the cones."""
+"""Tests of initial guesses of slews: their momenta are feasible and end at the target, outside the cones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from tests.support.random_slews import slews
 
 
 def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep_the_cones() -> None:
-    """In case 0 of `bench orbit_slews --cones --seed 43` every path without limits passes through a cone."""
+    """Initial guesses need no torque along the field, end at the target and avoid the cones.
+
+    In case 0 of `bench orbit_slews --cones --seed 43` every path without limits passes through a cone.
+    """
     (_, task), *_ = slews(1, 43, True)
     solver = SlewSolver(task)
     equations = solver.equations(task.horizon, 24)

@@ -1,4 +1,4 @@
-"""Tests of slews planned by virtual motion camouflage against recorded optima and finite differences."""
+"""Tests of slews planned by virtual motion camouflage, against recorded optima and finite differences."""
 
 from __future__ import annotations
 

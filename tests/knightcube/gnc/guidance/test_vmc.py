@@ -1,4 +1,4 @@
-"""Tests that paths are optimal for their duration, and of duration, start and limits of a path."""
+"""Tests that paths are optimal for their duration, and of the duration, start and limits of paths."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
 
 
 def peak_between_nodes(problem: Problem, found: StepPlan) -> float:
-    """Return the largest |I| over the limit at 2001 uniform points of the path."""
+    """Return the largest |I| relative to the limit, at 2001 uniform points of the path."""
     motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 2001))
     return float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
 
 
 def flown_energy(problem: Problem, found: StepPlan) -> float:
-    """Return the integral of R I^2 of the flown path by the trapezoidal rule."""
+    """Return the integral of R I^2 along the path, by the trapezoidal rule."""
     times = np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001)
     current = problem.plant.currents(*found.path.motion(times))
     return float(problem.plant.resistance * np.trapezoid(current**2, times))
@@ -57,7 +57,10 @@ def flown_energy(problem: Problem, found: StepPlan) -> float:
 
 @pytest.mark.parametrize("problem", [*STEPS, THESIS], ids=lambda p: f"{p.start_q2}->{p.end_q2}")
 def test_the_cost_is_within_half_a_percent_of_the_oracle_at_the_same_horizon(problem: Problem) -> None:
-    """The problems are the steps in 10 s, and the thesis's slew in the duration that the planner chooses."""
+    """The energy is within 0.5 % of the oracle's for the same duration, for the steps and the thesis's slew.
+
+    The steps last 10 s. The planner chooses the duration of the thesis's slew.
+    """
     found = problem.planned()
     optimum = solve(problem.slew(found.horizon), intervals=800)
     assert optimum is not None
@@ -73,9 +76,9 @@ def test_a_step_of_a_tenth_is_optimal_within_ten_seconds(problem: Problem) -> No
 
 
 def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
-    """The median cost is within 0.1 % of the optimum, and the worst within 1 %.
+    """For twenty problems, the median energy is within 0.1 % of the optimum, and the largest within 1 %.
 
-    Durations are at least 1.1 times the shortest.
+    The durations are at least 1.1 times the shortest duration.
     """
     ratios = []
     for known in known_optima():
@@ -89,15 +92,17 @@ def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
 
 
 def bang_bang_time(problem: Problem) -> float:
-    """Return the shortest time without a thread: full torque in one direction, then in the other.
+    """Return the shortest time (s) without a thread, by full torque in one direction and then in the other.
 
-    Energy determines the switch: J w^2/2 changes by the torque constant times I times the change of
-    sin(theta). Time is the integral of d(theta)/w; theta = end + x^2 removes the square root at each end.
+    The energy determines the angle of the switch, because J w^2/2 changes by the torque constant times I
+    times the change of sin(theta). The time is the integral of d(theta)/w. The substitution theta = end + x^2
+    removes the singularity at each end.
     """
     pull = problem.plant.torque_constant * problem.plant.current_limit / problem.plant.inertia
     start, end = angle_of(problem.start_q2), angle_of(problem.end_q2)
     sign = math.copysign(1.0, end - start)
-    # If the initial rate is against the slew, the body first moves outwards until the torque has stopped it.
+    # If the initial rate is opposite to the slew, the torque first stops the body, which moves outwards until
+    # then.
     sine = math.sin(start) - sign * problem.start_rate**2 / (2.0 * pull)
     rest = math.asin(sine)
     switch = math.asin(0.5 * (sine + math.sin(end)))
@@ -117,7 +122,7 @@ def bang_bang_time(problem: Problem) -> float:
 def test_the_thesis_slew_is_stretched_to_nearly_the_bang_bang_time_and_says_so() -> None:
     found = THESIS.planned()
     shortest = bang_bang_time(THESIS)
-    assert shortest == pytest.approx(13.7, abs=0.05)  # errata.md
+    assert shortest == pytest.approx(13.7, abs=0.05)  # value of errata.md
     assert found.status == PlanStatus.STRETCHED
     assert found.horizon_asked == 10.0
     assert shortest < found.horizon < 1.015 * shortest
@@ -180,9 +185,9 @@ def test_the_reference_point_changes_the_parameters_and_not_the_path() -> None:
 
 @pytest.mark.parametrize("horizon", [9.0, 14.0])
 def test_gradients_are_exact(horizon: float) -> None:
-    """Compare the gradients of energy and limits with central differences.
+    """The gradients of energy and limits agree with central differences.
 
-    The gradients are those with respect to every parameter and to the duration (horizon).
+    The gradients are with respect to every parameter and to the duration (horizon).
     """
     family = PathFamily.around(BoundaryStates(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
     program = PathProgram(THREAD, family, 0.68, horizon, PathCost.HEAT)
@@ -225,7 +230,10 @@ def test_a_plan_survives_the_way_to_another_process() -> None:
 
 
 def test_staying_where_one_is_costs_nothing() -> None:
-    """NLopt may end this trivial problem with the status of rounding errors."""
+    """If the start is the target, the plan has no energy and is optimal.
+
+    NLopt may end this trivial problem with the status for rounding errors.
+    """
     found = plan(KNIGHTCUBE, 0.2, 0.0, 0.2, 0.0, 10.0)
     assert found.status == PlanStatus.OPTIMAL
     assert found.energy == pytest.approx(0.0, abs=1e-12)
@@ -233,9 +241,10 @@ def test_staying_where_one_is_costs_nothing() -> None:
 
 
 def test_q2_is_kept_within_its_bound_where_the_optimum_would_pass_it() -> None:
-    """The unbounded optimum moves outwards to 0.48.
+    """A bound on q2 is respected if the unbounded optimum would exceed it.
 
-    With a bound of 0.465 the path reverses earlier, at a higher cost.
+    The unbounded optimum moves outwards to 0.48. With a bound of 0.465, the path reverses earlier, at a
+    higher cost.
     """
 
     def largest_q2(found: StepPlan) -> float:
@@ -254,7 +263,10 @@ def test_q2_is_kept_within_its_bound_where_the_optimum_would_pass_it() -> None:
 def test_an_optimiser_that_gives_no_path_is_an_error_and_no_plan(
     monkeypatch: pytest.MonkeyPatch, failure: str
 ) -> None:
-    """NLopt returns NaN without an exception, and raises for trivial or infeasible problems."""
+    """If the optimiser returns NaN or raises an exception, the plan fails with an error.
+
+    NLopt returns NaN without an exception, and raises for trivial or infeasible problems.
+    """
 
     class Failing(nlopt.opt):  # type: ignore[misc]  # nlopt has no types
         def optimize(self, start: FloatArray) -> FloatArray:
@@ -296,13 +308,13 @@ def test_what_cannot_be_planned_is_refused_with_its_reason(
 
 @pytest.mark.parametrize("max_stretch", [1.0, 1e3])
 def test_both_ends_of_the_range_of_the_stretch_are_permitted(max_stretch: float) -> None:
-    """A horizon that may not be stretched at all is a common wish."""
+    """The factor by which a duration may be stretched may be 1 (no stretching) or 1000."""
     found = plan(KNIGHTCUBE, 0.1, 0.0, 0.2, 0.0, 10.0, max_stretch=max_stretch)
     assert found.horizon == pytest.approx(10.0)
 
 
 def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
-    """The problems are those of the step demonstration, of the thesis, and twenty with a known optimum.
+    """The median plan takes less than 3 ms of processor time, for steps, thesis and twenty known problems.
 
     The benchmark `plan` measures more problems.
     """
@@ -311,7 +323,7 @@ def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
 
 
 def test_the_planner_starts_without_scipys_optimisers() -> None:
-    """Their import takes half a second on board."""
+    """The planner does not import scipy's optimisers, because this import takes half a second on board."""
     code = "import sys, knightcube.gnc.guidance.path_guidance; print('scipy.optimize' in sys.modules)"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == "False"
@@ -321,13 +333,19 @@ CARRIED = replace(KNIGHTCUBE, stiffness=2e-5, damping=2e-6, disturbance=-3e-3)
 
 
 def test_the_shortest_times_are_the_published_ones() -> None:
-    """For twenty problems, the tests' shooting method agrees with another collocation to 1e-3."""
+    """For twenty problems, the shortest times of two independent methods agree to 1e-3.
+
+    The methods are the tests' shooting method and the collocation of another program.
+    """
     for known in known_optima():
         assert shortest_time(known.problem.slew(1.0)) == pytest.approx(known.shortest, rel=1e-3)
 
 
 def test_from_a_tenth_above_the_shortest_horizon_on_paths_are_optimal_and_within_the_limits() -> None:
-    """Part of the benchmark `plan`, with a thread, a disturbance and non-zero rates at both ends."""
+    """Paths of at least 1.1 times the shortest duration are optimal and within the limits.
+
+    This is a part of the benchmark `plan`, with a thread, a disturbance and non-zero rates at both ends.
+    """
     costs = []
     for problem, shortest in feasible_problems(40, seed=11):
         found = problem.planned()
@@ -350,9 +368,10 @@ def test_a_horizon_just_long_enough_is_kept_or_stretched_by_less_than_a_percent(
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1e-3, 2e-2), st.floats(2e-5, 2e-3))
 def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price: float) -> None:
-    """With cos(theta) = 1 the minimum energy is 12 R (a/g)^2 / T^3.
+    """A cost per time gives the duration at which the closed form of the total cost is minimal.
 
-    At the optimum duration, the energy falls as fast as the price of the time rises.
+    With cos(theta) = 1, the minimum energy is 12 R (a/g)^2 / T^3. At the optimum duration, the energy
+    decreases as fast as the cost of the time increases.
     """
     gain = KNIGHTCUBE.torque_constant / KNIGHTCUBE.inertia
     expected = (36.0 * KNIGHTCUBE.resistance * (angle / gain) ** 2 / price) ** 0.25
@@ -363,7 +382,7 @@ def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price
 
 
 def test_no_horizon_nearby_is_better_at_the_price() -> None:
-    """Compare with the collocation oracle's sum of energy and time cost for other durations."""
+    """No other duration has a smaller sum of energy and time cost, by the collocation oracle."""
     price = 0.2
     for problem, _ in feasible_problems(10, seed=3):
         found = problem.planned(time_cost=price)
@@ -389,9 +408,9 @@ def test_an_impossible_price_is_refused(price: float) -> None:
 
 
 def rest_of(problem: Problem, found: StepPlan, share: float) -> tuple[Problem, int]:
-    """Return the rest of a problem after the fraction `share` of its path, and the elapsed time (ns).
+    """Return the remaining problem after the fraction `share` of a path, and the elapsed time (ns).
 
-    The rest begins slightly off the path, in angle and rate.
+    The remaining problem begins slightly off the path, in angle and rate.
     """
     elapsed_ns = round(share * found.horizon * 1e9)
     at = found.path.sample(elapsed_ns)
@@ -417,7 +436,7 @@ def test_the_last_path_makes_the_next_plan_cheaper_and_changes_nothing_else() ->
         np.testing.assert_allclose(warm.node_q2, cold.node_q2, atol=1e-4)
         cold_total += cold.evaluations
         warm_total += warm.evaluations
-    # The number of evaluations differs slightly with the rounding of the processor.
+    # The number of evaluations varies slightly with the rounding of the processor.
     assert warm_total < 0.9 * cold_total
 
 
@@ -430,7 +449,10 @@ def test_a_last_path_that_does_not_fit_does_no_harm() -> None:
 
 
 def test_the_planned_current_flies_the_body_under_thread_and_disturbance_to_its_moving_end() -> None:
-    """Without feedback, the equation of motion with the path's current ends at the end point of the plan."""
+    """Without feedback, the planned current leads the body to the end point of the plan.
+
+    The body has a thread and a disturbance, and the end point moves.
+    """
     found = plan(CARRIED, 0.1, 0.01, -0.2, 0.015, 11.0)
     count = 2200
     step = found.horizon / count
