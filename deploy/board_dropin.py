@@ -24,7 +24,7 @@ from flight.schema.devices import AravisDevice, driver_of, fitted_devices
 from flight.schema.document import ConfigError, read_document, read_text
 from flight.schema.reader import LOOPBACK, load, peer_networks
 from flight.schema.sections import Config
-from hal.buses.i2c_bus import device_file
+from hal.buses.linux_wires import device_file
 from hal.interfaces.guardian import CoilReach
 from knightcube.errors import UsageError
 

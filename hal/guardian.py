@@ -33,8 +33,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from hal.buses import linux_process
-from hal.buses.clock import SystemClock
+from hal.buses import system
+from hal.buses.system import SystemClock
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import ACTED, BEAT, BYE, FAILED, READY, CoilReach, GuardianNews
 
@@ -225,8 +225,8 @@ def main(arguments: list[str]) -> int:
 
 def _survive() -> None:
     """Request real-time priority, locked memory and protection from the OOM killer, ignoring refusals."""
-    linux_process.prioritise(0, PRIORITY)
-    linux_process.lock_memory()
+    system.prioritise(0, PRIORITY)
+    system.lock_memory()
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:
         score.write("-1000")
     os.chdir("/")

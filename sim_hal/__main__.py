@@ -19,8 +19,8 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.document import config_path, names
-from hal.buses.clock import SystemClock
-from hal.buses.i2c_bus import device_file
+from hal.buses.linux_wires import device_file
+from hal.buses.system import SystemClock
 from knightcube.errors import UsageError
 from sim_hal.emulators.serial_line import PtyLine
 from sim_hal.emulators.vn100 import BAUD_RATES, Vn100Emulator, Vn100EmulatorSettings

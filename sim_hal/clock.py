@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from hal.buses.clock import ContainedJob
+from hal.buses.system import ContainedJob
 from hal.interfaces.wires import Ticker
 
 NEVER = 1 << 62

@@ -28,9 +28,8 @@ from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig
-from hal.buses.clock import SystemClock
-from hal.buses.i2c_bus import device_file, lock_bus
-from hal.buses.serial_port import PySerialPort
+from hal.buses.linux_wires import PySerialPort, device_file, lock_bus
+from hal.buses.system import SystemClock
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import CoilReach
@@ -52,8 +51,7 @@ from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults import schedule
-from sim_hal.faults.bench import Bench
-from sim_hal.faults.catalogue import listing
+from sim_hal.faults.catalogue import Bench, listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, put, scheduled
 from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus

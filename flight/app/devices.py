@@ -39,22 +39,32 @@ from flight.schema.devices import (
 from flight.schema.document import ConfigError, imported
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
-from hal.buses.clock import SystemClock
-from hal.buses.i2c_bus import device_file
-from hal.buses.linux_wires import LinuxWires
-from hal.drivers import ads1115, drv8830, ina219
-from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
+from hal.buses.linux_wires import LinuxWires, device_file
+from hal.buses.system import SystemClock
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import CameraDevice, ServedCamera
-from hal.drivers.coils import CoilSettings, PwmTorqueCoils, wirings
-from hal.drivers.drv8830 import Drv8830Bridges, Drv8830Coils
-from hal.drivers.ina219 import Ina219
-from hal.drivers.nmea import NmeaReceiver
+from hal.drivers.coils import (
+    CONTROL,
+    OFF,
+    CoilSettings,
+    Drv8830Bridges,
+    Drv8830Coils,
+    PwmTorqueCoils,
+    wirings,
+)
+from hal.drivers.current_monitors import (
+    ADS1115_CONFIG,
+    CONFIG,
+    AdsSolarStrings,
+    Ina219,
+    StringWiring,
+    range_for,
+)
+from hal.drivers.gps import EARLIEST_NS, NmeaReceiver, UbloxReceiver
 from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL, MODE1, Pca9685
 from hal.drivers.sensor_unit import CircuitPythonI2c, SensorPart, SensorUnit, SensorUnitSettings
-from hal.drivers.ublox import EARLIEST_NS, UbloxReceiver
 from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
-from hal.drivers.vn100.driver import Vn100, Vn100Settings
+from hal.drivers.vn100 import Vn100, Vn100Settings
 from hal.interfaces.devices import (
     FrameSource,
     GpsReceiver,
@@ -421,12 +431,12 @@ def open_drv8830(rig: Rig, coils: Coils) -> TorqueCoils:
 
 def probe_drv8830(rig: Rig, coils: Coils) -> str:
     """Read a register of each bridge. Raises NotResponding."""
-    return _read_chips(rig, coils.bus, drv8830.CONTROL, *_bridges(coils))
+    return _read_chips(rig, coils.bus, CONTROL, *_bridges(coils))
 
 
 def off_drv8830(coils: Coils) -> Sequence[tuple[int, int, int]]:
     """Return the writes that switch all bridges off."""
-    return tuple((address, drv8830.CONTROL, drv8830.OFF) for address in _bridges(coils))
+    return tuple((address, CONTROL, OFF) for address in _bridges(coils))
 
 
 def _bridges(coils: Coils) -> range:
@@ -444,12 +454,12 @@ def open_ina219(rig: Rig, monitor: PowerMonitorSection) -> Ina219:
 
 def check_ina219(monitor: PowerMonitorSection) -> int:
     """Return the range bits of the current monitor. Raises OutOfRange if no range covers its current."""
-    return ina219.range_for(monitor.maximum_current, monitor.shunt)
+    return range_for(monitor.maximum_current, monitor.shunt)
 
 
 def probe_ina219(rig: Rig, monitor: PowerMonitorSection) -> str:
     """Read a register of the current monitor. Raises NotResponding."""
-    return _read_chips(rig, monitor.bus, ina219.CONFIG, monitor.address)
+    return _read_chips(rig, monitor.bus, CONFIG, monitor.address)
 
 
 def files_ina219(monitor: PowerMonitorSection) -> Sequence[str]:
@@ -500,7 +510,7 @@ def open_ads1115(rig: Rig, section: SolarStringsSection) -> AdsSolarStrings:
 def probe_ads1115(rig: Rig, section: SolarStringsSection) -> str:
     """Read a register of each converter. Raises NotResponding."""
     addresses = sorted({string.address for string in section.strings})
-    return _read_chips(rig, section.bus, ads1115.CONFIG, *addresses)
+    return _read_chips(rig, section.bus, ADS1115_CONFIG, *addresses)
 
 
 def files_ads1115(section: SolarStringsSection) -> Sequence[str]:

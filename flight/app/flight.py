@@ -77,8 +77,7 @@ from flight.schema import reader as configuration
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
 from flight.schema.document import ConfigError, imported, merged_text, read_text
 from flight.schema.sections import CONTROL_RATE_HZ, Config
-from hal.buses.clock import SystemClock
-from hal.buses.linux_process import worker_cores
+from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.compiled import use_numpy_forms
 from knightcube.errors import UsageError

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from flight.link.telemetry.log import DISK_TROUBLE, FlightLog, begin_run, find_runs, open_segment
 from flight.schema.sections import Config
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.interfaces.wires import SECOND_NS, Rig
 from knightcube.errors import UsageError
 

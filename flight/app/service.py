@@ -65,9 +65,8 @@ from flight.loop.state import LARGEST_FILE, LinuxFiles, replace_file, service_fo
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError, UnreadConfigError, checked_length, no_such_file, read_text
 from flight.schema.sections import Config
-from hal.buses import linux_process
-from hal.buses.clock import SystemClock
-from hal.buses.linux_process import ServiceManager
+from hal.buses import system
+from hal.buses.system import ServiceManager, SystemClock
 from hal.drivers.coils import DEVICE as COILS
 from hal.guardian import GuardianLine
 from hal.interfaces.errors import DeviceError
@@ -462,8 +461,8 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     overseer = ServiceManager(os.environ, os.getpid())
     stack.callback(overseer.close)
     first = [thread for thread in threading.enumerate() if thread.name == COILS]
-    obtained = linux_process.obtain([0, *(thread.native_id or 0 for thread in first)], CONTROL_PRIORITY)
-    stack.callback(linux_process.relinquish)
+    obtained = system.obtain([0, *(thread.native_id or 0 for thread in first)], CONTROL_PRIORITY)
+    stack.callback(system.relinquish)
     stack.callback(overseer.stopping)
     coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
 
@@ -491,7 +490,7 @@ def prioritise_other_threads() -> None:
     """
     for thread in threading.enumerate():
         if thread is not threading.main_thread() and thread.name != COILS:
-            linux_process.prioritise(thread.native_id or 0, NEXT_PRIORITY)
+            system.prioritise(thread.native_id or 0, NEXT_PRIORITY)
 
 
 FOLDER = "flown"

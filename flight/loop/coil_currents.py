@@ -101,7 +101,7 @@ class Sampling:
 
 NEWEST = Sampling(0.2, 1.0)
 """Error bounds of one ADC sample at an unknown time in its window. The PWM chopping of the current alone
-causes an error of 18 % (`hal.drivers.ina219`).
+causes an error of 18 % (`hal.drivers.current_monitors`).
 """
 MEAN = Sampling(0.02, 0.25)
 """Error bounds of the mean of five ADC samples.

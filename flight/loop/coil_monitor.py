@@ -42,7 +42,7 @@ ten minutes after its diagnosis, and at most three times. If the fault persists,
 broken again.
 
 The error bounds are 3.5 mA for each coil's current (Sease thesis, chapter 5), the error of the resistance,
-and 18 % for a single ADC sample of the chopped current (`hal.drivers.ina219`).
+and 18 % for a single ADC sample of the chopped current (`hal.drivers.current_monitors`).
 """
 
 from __future__ import annotations

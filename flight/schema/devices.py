@@ -456,7 +456,7 @@ PixelName = Literal[
     "BYR2", "GB16", "GR16", "RG16", "pBAA", "pGAA", "pgAA", "pRAA", "pBCC", "pGCC", "pgCC", "pRCC",
 ]
 # fmt: on
-"""Names of the pixel formats of V4L2 that `hal.drivers.pixel_formats` reads."""
+"""Names of the pixel formats of V4L2 that `hal.drivers.camera` reads."""
 
 
 class V4l2Device(Section, frozen=True, kw_only=True, tag_field="driver", tag="v4l2"):
@@ -728,7 +728,7 @@ class Driver:
 def _ours(kind: str, section: type[Any], name: str, **more: Any) -> Driver:
     """Return the registration of a built-in driver, with functions in `flight.app.devices`."""
     functions = {word: later(f"flight.app.devices:{word}_{name}") for word in ("open", "probe", "files")}
-    emulate = None if kind == "camera" else later(f"sim_hal.devices:emulate_{name}")
+    emulate = None if kind == "camera" else later(f"sim_hal.emulation:emulate_{name}")
     return Driver(kind, section, emulate=emulate, **functions, **more)
 
 
@@ -776,7 +776,7 @@ DRIVERS: Mapping[str, Mapping[str, str]] = {
 SENSOR_PARTS: Mapping[str, str] = {
     "icm20948": "adafruit_icm20x:ICM20948",
     "lis3mdl": "adafruit_lis3mdl:LIS3MDL",
-    "adis16470": "hal.drivers.adis16470:Adis16470",
+    "adis16470": "hal.drivers.sensor_unit:Adis16470",
 }
 """Classes (`module:class`) of the sensors with an emulator, by name."""
 

@@ -17,9 +17,9 @@ from flight.app.devices import open_camera
 from flight.schema.devices import driver_of, fitted_devices
 from flight.schema.sections import Config
 from ground.bringup.diagnosis import Finding
-from hal.drivers.ina219 import config_for
-from hal.drivers.vn100.driver import BAUD_RATES
-from hal.drivers.vn100.protocol import StreamParser
+from hal.drivers.current_monitors import config_for
+from hal.drivers.vn100 import BAUD_RATES
+from hal.drivers.vn100_protocol import StreamParser
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import I2cBus, Rig
 

@@ -1,18 +1,393 @@
-"""The connections of a board to its devices: serial ports, I2C buses and SPI devices, opened by name."""
+"""Serial ports, I2C buses and SPI devices of a Linux machine.
+
+The receiving thread of a serial port records the arrival times of the data, and reopens a lost port. A udev
+rule keeps the device name when an adapter is unplugged and plugged in again.
+
+A call on an I2C bus waits until the previous transaction has ended. The transaction of the call then takes at
+most the timeout of the I2C adapter, which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are
+disabled (I2C_RETRIES 0), so that the drivers count each failure. An advisory lock on the device file reserves
+the bus for one flight process. The kernel releases the lock when the process ends. The guardian and
+`deploy/coils-off` ignore the lock, because they may switch the coils off at any time.
+"""
 
 from __future__ import annotations
 
-import fcntl
+import errno
 import os
+import select
+import termios
+import threading
 from array import array
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from fcntl import LOCK_EX, LOCK_NB, flock, ioctl
+from pathlib import Path
 from struct import Struct, pack
+from typing import TypeVar
 
-from hal.buses.i2c_bus import LinuxI2cBus, device_file
-from hal.buses.serial_port import PySerialPort
-from hal.interfaces.errors import NotResponding
-from hal.interfaces.wires import Clock
+import serial
+from smbus2 import I2cFunc, SMBus, i2c_msg
+
+from hal.buses.smbus_byte import I2C_TIMEOUT
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+from hal.interfaces.wires import SECOND_NS, Clock
+
+_READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port is to be closed
+_WRITE_TIMEOUT_S = 0.005  # a fifth of a control cycle; usually the kernel's buffer accepts a command at once
+_PENDING_LIMIT = 1 << 16
+_REOPEN_S = 0.25
+
+# Exceptions of pyserial's POSIX implementation; pyserial's own exceptions are subclasses of OSError.
+_PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
+
+
+class PySerialPort:
+    """Serial port in raw 8N1 mode without flow control, opened exclusively.
+
+    The class implements `hal.interfaces.wires.SerialPort`. The modem lines are neither read nor set, so that
+    a pseudo-terminal works as well.
+
+    Attributes:
+        baud_rate: baud rate of the port, bits per second.
+        lost_bytes: number of received bytes that were dropped because `receive` was not called for too long.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        baud_rate: int,
+        clock: Clock,
+        patient: bool = False,
+        write_timeout: float = _WRITE_TIMEOUT_S,
+    ) -> None:
+        """Open the port.
+
+        Raises NotResponding if the port cannot be opened. If `patient` is true, no error is raised: the port
+        counts as lost, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is
+        short enough for the thread that drives the coils.
+        """
+        self.baud_rate = baud_rate
+        self.lost_bytes = 0
+        self._device = device
+        self._write_timeout = write_timeout
+        self._clock = clock
+        self._pending: deque[tuple[int, bytes]] = deque()
+        self._pending_bytes = 0
+        self._lock = threading.Lock()
+        # The lock is held while the port is used or replaced, because a closed descriptor may be reused.
+        self._port_lock = threading.Lock()
+        self._failure = ""
+        self._closing = threading.Event()
+        try:
+            self._serial = self._open()
+        except _PORT_ERRORS as error:
+            self._failure = (
+                f"cannot be opened at {baud_rate} baud ({error}): is the device plugged in, the name right, "
+                "the port free, and may this user open it (group dialout)?"
+            )
+            if not patient:
+                raise NotResponding(device, self._failure) from error
+            self._serial = serial.Serial()  # not open
+        self._thread = threading.Thread(target=self._read, name=f"serial {device}", daemon=True)
+        self._thread.start()
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        """Return the data received since the last call as tuples (arrival_ns, bytes), oldest first.
+
+        Raises NotResponding if the port is lost and all data received before the loss have been returned.
+        """
+        with self._lock:
+            chunks = list(self._pending)
+            self._pending.clear()
+            self._pending_bytes = 0
+        if not chunks and self._failure:
+            raise NotResponding(self._device, self._failure)
+        return chunks
+
+    def send(self, data: bytes) -> None:
+        """Write bytes. Raises NotResponding if the port is lost or the output queue remains full."""
+        if self._failure:
+            raise NotResponding(self._device, self._failure)
+        try:
+            with self._port_lock:
+                self._write(data)
+        except _PORT_ERRORS as error:
+            message = f"writing failed ({error}): is the device still there?"
+            raise NotResponding(self._device, message) from error
+
+    def set_baud_rate(self, baud_rate: int) -> None:
+        """Change the baud rate. Raises NotResponding if the port rejects the baud rate."""
+        # The value is stored even if the port is lost, because the port is reopened at this baud rate.
+        self.baud_rate = baud_rate
+        try:
+            with self._port_lock:
+                self._serial.baudrate = baud_rate
+        except _PORT_ERRORS as error:
+            raise NotResponding(self._device, f"does not support {baud_rate} baud ({error})") from error
+
+    def close(self) -> None:
+        """Stop the thread and close the port. Calling `close` again has no effect."""
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        with self._port_lock:
+            self._serial.cancel_read()  # this has no effect on a closed port
+        self._thread.join(timeout=2.0)
+        self._serial.close()
+        self._failure = self._failure or "the port was closed"
+
+    def _write(self, data: bytes) -> None:
+        """Write bytes, and wait while the output queue is full. Raises TimeoutError.
+
+        The method `write` of pyserial also raises an error if all bytes were written but the thread was
+        suspended in between.
+        """
+        file, until_ns = self._serial.fileno(), self._clock.now_ns() + round(self._write_timeout * SECOND_NS)
+        while data:
+            with suppress(BlockingIOError):
+                data = data[os.write(file, data) :]
+            left = max(until_ns - self._clock.now_ns(), 0) / SECOND_NS
+            if data and not select.select([], [file], [], left)[1]:
+                raise TimeoutError("the output queue is full")
+
+    def _open(self) -> serial.Serial:
+        return serial.Serial(
+            self._device,
+            self.baud_rate,
+            timeout=_READ_TIMEOUT_S,
+            exclusive=True,
+        )
+
+    def _read(self) -> None:
+        if self._failure:
+            self._open_again()
+        while not self._closing.is_set():
+            try:
+                # The thread waits for the first byte, and then reads all bytes that have arrived.
+                data = self._serial.read(1)
+                if data:
+                    data += self._serial.read(self._serial.in_waiting)
+            except _PORT_ERRORS as error:
+                if not self._closing.is_set():
+                    self._failure = f"reading failed ({error}): is the device still there?"
+                    self._open_again()
+                continue
+            if data:
+                self._keep(self._clock.now_ns(), data)
+
+    def _open_again(self) -> None:
+        """Try to reopen the port until this succeeds or `close` is called.
+
+        The receiving thread calls this method.
+        """
+        with self._port_lock:
+            self._serial.close()
+        while not self._closing.wait(_REOPEN_S):
+            try:
+                port = self._open()
+            except _PORT_ERRORS:
+                continue
+            with self._port_lock:
+                self._serial = port
+            self._failure = ""
+            return
+
+    def _keep(self, arrival_ns: int, data: bytes) -> None:
+        with self._lock:
+            self._pending.append((arrival_ns, data))
+            self._pending_bytes += len(data)
+            while self._pending_bytes > _PENDING_LIMIT:
+                _, oldest = self._pending.popleft()
+                self._pending_bytes -= len(oldest)
+                self.lost_bytes += len(oldest)
+
+
+def lock_bus(descriptor: int) -> None:
+    """Lock an open file until it is closed. Raises OSError (EUSERS) if another process holds the lock."""
+    try:
+        flock(descriptor, LOCK_EX | LOCK_NB)
+    except BlockingIOError as error:
+        raise OSError(errno.EUSERS, "another flight drives the coils on this bus") from error
+
+
+_Answer = TypeVar("_Answer")
+
+I2C_RETRIES = 0x0701
+_TIMEOUT_UNIT_NS = 10_000_000
+_BLOCK_LIMIT = 32
+
+# Meanings of the kernel's fault codes (Documentation/i2c/fault-codes).
+_MEANING = {
+    errno.EREMOTEIO: "no acknowledge",
+    errno.ENXIO: "no acknowledge of the address",
+    errno.ETIMEDOUT: "time-out, the clock line may be held low",
+    errno.EAGAIN: "arbitration lost",
+    errno.EBUSY: "the address is held by a kernel driver",
+    errno.EBADF: "the bus has been closed",
+    errno.EUSERS: "another flight drives the coils on this bus",
+}
+# Errors that do not indicate a failure of the bus, so that the device file stays open.
+_LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
+
+
+class LinuxI2cBus:
+    """Thread-safe I2C bus /dev/i2c-N, whose device file is reopened after a bus failure."""
+
+    def __init__(
+        self,
+        device: int | str,
+        timeout_ns: int = 20_000_000,
+        patient: bool = False,
+        exclusive: bool = False,
+    ) -> None:
+        """Open a bus.
+
+        Args:
+            device: number N of the bus /dev/i2c-N, or a device file, for example with a udev name.
+            timeout_ns: timeout of a transaction (ns), rounded up to the kernel's steps of 10 ms.
+            patient: whether a bus that does not exist yet is opened by a later transaction instead of raising
+                an error.
+            exclusive: whether the bus is locked, so that two flight processes cannot drive the same coils.
+
+        Raises NotResponding if there is no such bus. Raises Refused if the permission to open the bus is
+        missing or the adapter does not support block transfers.
+        """
+        if timeout_ns <= 0:
+            raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
+        self.name = device_file(device)
+        self._timeout_units = -(-timeout_ns // _TIMEOUT_UNIT_NS)
+        # A transaction has at most two messages, and each message may time out.
+        self._patience = 2.0 * self._timeout_units * _TIMEOUT_UNIT_NS * 1e-9
+        self._exclusive = exclusive
+        self._lock = threading.Lock()
+        self._bus: SMBus | None = None
+        self._closed = False
+        try:
+            self._bus = self._open()
+        except FileNotFoundError as error:
+            if patient:
+                return
+            raise NotResponding(self.name, _how_to_find_a_bus()) from error
+        except PermissionError as error:
+            raise Refused(self.name, "no permission: add the user to the group that owns it (i2c)") from error
+        except OSError as error:
+            reason = _MEANING.get(error.errno or 0, error.strerror)
+            raise NotResponding(self.name, f"not a usable I2C bus: {reason}") from error
+        if self._bus.funcs & I2cFunc.SMBUS_I2C_BLOCK != I2cFunc.SMBUS_I2C_BLOCK:
+            self.close()
+            raise Refused(self.name, "the adapter cannot do I2C block transfers; choose another bus")
+
+    def write_byte(self, address: int, value: int) -> None:
+        """Write one byte to a device without a register address."""
+        self._transact(address, lambda bus: bus.write_byte(address, value))
+
+    def read_byte_data(self, address: int, register: int) -> int:
+        """Read one byte from a register of a device."""
+        return self._transact(address, lambda bus: bus.read_byte_data(address, register))
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        """Write one byte to a register of a device."""
+        self._transact(address, lambda bus: bus.write_byte_data(address, register, value))
+
+    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
+        """Read `length` bytes, at most 32, from consecutive registers of a device."""
+        _check_length(length)
+        answer = self._transact(address, lambda bus: bus.read_i2c_block_data(address, register, length))
+        if len(answer) != length:
+            raise OSError(errno.EIO, f"{len(answer)} bytes, not {length}, from 0x{address:02x}, {self.name}")
+        return answer
+
+    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
+        """Write at most 32 bytes to consecutive registers of a device."""
+        _check_length(len(values))
+        self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
+
+    def exchange(self, address: int, data: bytes, count: int) -> bytes:
+        """Write `data` if there are any, then read `count` bytes after a repeated START, if any."""
+        messages = [i2c_msg.write(address, data)] if data or not count else []
+        if count:
+            messages.append(i2c_msg.read(address, count))
+        self._transact(address, lambda bus: bus.i2c_rdwr(*messages))
+        return bytes(messages[-1]) if count else b""
+
+    def close(self) -> None:
+        """Close the bus. Calling `close` again has no effect."""
+        self._closed = True
+        # The bus is closed even without the lock, because a hung transaction must not delay the exit.
+        locked = self._lock.acquire(timeout=self._patience)
+        self._drop()
+        if locked:
+            self._lock.release()
+
+    def _open(self) -> SMBus:
+        bus = SMBus()
+        try:
+            bus.open(self.name)
+            if bus.fd is not None:
+                if self._exclusive:
+                    lock_bus(bus.fd)
+                ioctl(bus.fd, I2C_TIMEOUT, self._timeout_units)
+                ioctl(bus.fd, I2C_RETRIES, 0)
+        except OSError:
+            bus.close()
+            raise
+        return bus
+
+    def _drop(self) -> None:
+        if self._bus is not None:
+            self._bus.close()
+            self._bus = None
+
+    def _transact(self, address: int, action: Callable[[SMBus], _Answer]) -> _Answer:
+        if not self._lock.acquire(timeout=self._patience):
+            raise OSError(errno.ETIMEDOUT, f"a transaction on {self.name} does not end")
+        try:
+            if self._closed:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            if self._bus is None:
+                self._bus = self._open()
+            return action(self._bus)
+        except OSError as error:
+            code = error.errno or errno.EIO
+            if code not in _LINE_IN_ORDER:
+                self._drop()
+            meaning = _MEANING.get(code, os.strerror(code))
+            raise OSError(code, f"{meaning}, address 0x{address:02x} on {self.name}") from error
+        finally:
+            self._lock.release()
+
+
+def device_file(bus: int | str) -> str:
+    """Return the device file of a bus that is given by its number or its device file."""
+    return f"/dev/i2c-{bus}" if isinstance(bus, int) else bus
+
+
+def adapters(folder: Path = Path("/sys/bus/i2c/devices")) -> list[tuple[int, str]]:
+    """Return the number and name of each I2C adapter that the kernel knows."""
+    found = []
+    for entry in folder.glob("i2c-*"):
+        number = entry.name.removeprefix("i2c-")
+        if number.isdigit() and (entry / "name").is_file():
+            found.append((int(number), (entry / "name").read_text(encoding="utf-8").strip()))
+    return sorted(found)
+
+
+def _how_to_find_a_bus() -> str:
+    known = adapters()
+    if not known:
+        return "no such bus, and the kernel knows no adapter: enable one in the firmware, modprobe i2c-dev"
+    listing = ", ".join(f"i2c-{number} ({name})" for number, name in known)
+    return (
+        f"no such bus; the kernel knows {listing}. Is i2c-dev loaded? Numbers change between boots: use"
+        ' the permanent name of a udev rule with SUBSYSTEM=="i2c-dev", ATTR{name} and SYMLINK+='
+    )
+
+
+def _check_length(length: int) -> None:
+    if not 1 <= length <= _BLOCK_LIMIT:
+        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to {_BLOCK_LIMIT}")
+
 
 SPI_MODE, SPI_SPEED, SPI_MESSAGE = 0x40016B01, 0x40046B04, 0x40006B00
 """Requests SPI_IOC_WR_MODE, SPI_IOC_WR_MAX_SPEED_HZ and SPI_IOC_MESSAGE(0) of linux/spi/spidev.h."""
@@ -30,8 +405,8 @@ class LinuxSpiDevice:
         self._speed_hz = speed_hz
         try:
             self._descriptor = os.open(device, os.O_RDWR | os.O_CLOEXEC)
-            fcntl.ioctl(self._descriptor, SPI_MODE, pack("=B", mode))
-            fcntl.ioctl(self._descriptor, SPI_SPEED, pack("=I", speed_hz))
+            ioctl(self._descriptor, SPI_MODE, pack("=B", mode))
+            ioctl(self._descriptor, SPI_SPEED, pack("=I", speed_hz))
         except OSError as error:
             cure = "is the SPI bus enabled, and may this user open it?"
             raise NotResponding(device, f"cannot be opened ({error.strerror}): {cure}") from error
@@ -53,7 +428,7 @@ class LinuxSpiDevice:
             )
             for index, pair in enumerate(buffers)
         )
-        fcntl.ioctl(self._descriptor, request, calls)
+        ioctl(self._descriptor, request, calls)
         return [received.tobytes() for _, received in buffers]
 
     def close(self) -> None:

@@ -35,8 +35,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hal.drivers.camera import CameraCounts, FrameNumbers
-from hal.drivers.pixel_formats import PIXEL_FORMATS, PixelCoding, PixelError, fourcc, fourcc_name
+from hal.drivers.camera import (
+    PIXEL_FORMATS,
+    CameraCounts,
+    FrameNumbers,
+    PixelCoding,
+    PixelError,
+    fourcc,
+    fourcc_name,
+)
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import CorruptData, DeviceError, NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import Clock

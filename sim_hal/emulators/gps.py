@@ -1,9 +1,9 @@
-"""Emulated u-blox GPS receiver with UBX messages on a serial line and the errors of a receiver in orbit.
+"""Emulated GPS receivers on a serial line, with the errors of a receiver in orbit: u-blox and NMEA 0183.
 
-The receiver starts without a configuration and sends NMEA sentences until a message enables NAV-PVT. Fixes
-are computed at UTC times that are multiples of the period, and their frames are sent `latency` s later. The
-position error is a random walk (ionosphere, ephemerides) plus white noise, and the velocity error is white
-noise.
+The u-blox receiver starts without a configuration and sends NMEA sentences until a message enables NAV-PVT.
+Fixes are computed at UTC times that are multiples of the period, and their frames are sent `latency` s later.
+The position error is a random walk (ionosphere, ephemerides) plus white noise, and the velocity error is
+white noise. The NMEA receiver sends its sentences by itself and ignores commands.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 
 import numpy as np
 
-from hal.drivers.ublox import (
+from hal.drivers.gps import (
     ACK_ACK,
     ACK_NAK,
     CFG_MSG,
@@ -23,9 +25,11 @@ from hal.drivers.ublox import (
     CFG_VALSET,
     DATE_AND_TIME,
     FIX_OK,
+    KNOT,
     MON_VER,
     NAV_PVT,
     PVT_ON_UART1,
+    RANGE_ERROR,
     RATE_MEASUREMENT,
     THREE_DIMENSIONS,
     UART1_BAUDRATE,
@@ -222,3 +226,34 @@ class EmulatedGps:
             velocity=(round(north), round(east), round(down)),
             speed_accuracy=max(1, round(1e3 * math.sqrt(3.0) * errors.velocity_noise)) if found else 20_000,
         )
+
+
+class EmulatedNmeaGps(EmulatedGps):
+    """An emulated receiver with RMC and GGA sentences instead of UBX messages."""
+
+    def _message(self, epoch_ns: int) -> bytes:
+        pvt = self._measure(epoch_ns)
+        year, month, day, hour, minute, second = pvt.date
+        clock = f"{hour:02}{minute:02}{second + pvt.nano * 1e-9:06.3f}"
+        fixed = bool(pvt.flags & FIX_OK)
+        latitude = _angle(pvt.latitude, 2, "NS") if fixed else ","
+        longitude = _angle(pvt.longitude, 3, "EW") if fixed else ","
+        place = f"{latitude},{longitude}"
+        north, east, _ = pvt.velocity
+        speed = (
+            f"{1e-3 * math.hypot(north, east) / KNOT:.3f},{math.degrees(math.atan2(east, north)) % 360.0:.4f}"
+        )
+        dilution = math.hypot(self._errors.walk, self._errors.noise) / RANGE_ERROR
+        height = f"{dilution:.2f},{1e-3 * pvt.height:.2f},M,0.0,M" if fixed else ",,M,,M"
+        bodies = (
+            f"GNRMC,{clock},{'A' if fixed else 'V'},{place},{speed if fixed else ','},"
+            f"{day:02}{month:02}{year % 100:02},,,A",
+            f"GNGGA,{clock},{place},{int(fixed)},{pvt.satellites:02},{height},,",
+        )
+        return b"".join(f"${body}*{reduce(xor, body.encode()):02X}\r\n".encode() for body in bodies)
+
+
+def _angle(value: int, digits: int, hemispheres: str) -> str:
+    """Return an angle (1e-7 deg) as degrees and minutes, with its hemisphere."""
+    minutes = round(abs(value) * 60e-7, 6)
+    return f"{int(minutes // 60):0{digits}}{minutes % 60.0:09.6f},{hemispheres[value < 0]}"

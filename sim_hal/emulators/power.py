@@ -1,24 +1,44 @@
-"""The simulated power system: battery, solar panels and loads on one unregulated bus, with two monitors.
+"""The simulated power system, and the solar strings of a body in orbit with the converters that measure them.
 
-Each load draws constant power, so the bus current depends on the bus voltage. The power of the panels is
-proportional to the cosine of the angle of incidence and to the visible fraction of the Sun's disc; light from
-the Earth is neglected. A full battery accepts no current. An empty battery keeps the voltage of an empty
-cell, because the simulated board cannot lose its supply.
+Battery, solar panels and loads are on one unregulated bus, with two monitors. Each load draws constant power,
+so the bus current depends on the bus voltage. The power of the panels is proportional to the cosine of the
+angle of incidence and to the visible fraction of the Sun's disc; light from the Earth is neglected. A full
+battery accepts no current. An empty battery keeps the voltage of an empty cell, because the simulated board
+cannot lose its supply.
+
+A solar string is a group of cells in series on one face of the body. The currents are computed from sunlight,
+sunlight reflected by the Earth, shadow, and the errors of the cells. The reflected light is summed over the
+visible ground, which is Lambertian and has a uniform albedo. The default albedo of 0.3 is close to the
+Earth's mean of 0.29 (Stephens et al. 2015, Rev. Geophys. 53).
+
+The emulated ADS1115 has the registers Config and Conversion and the conversion times of the data sheet (TI
+SBAS444, Table 8-3). It converts single-ended inputs in single-shot mode, which the driver uses. Other
+settings are stored, but start no conversion. A conversion returns the voltage at the end of the conversion
+time.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from flight.schema.devices import Battery
+from hal.drivers.current_monitors import StringWiring
+from hal.interfaces.errors import check_limits
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray, tangent_basis
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.settings import PowerTruth
-from sim_hal.worlds.world import OrbitingWorld
+from sim_hal.worlds.orbit import sun_position
+from sim_hal.worlds.world import OrbitingWorld, utc_date
 
 PERIOD_NS = 250_000_000
 """Period (ns) of the steps, shorter than the time over which the coils' supply current is recorded."""
@@ -141,3 +161,223 @@ class EmulatedPower:
         powers = self._peaks * np.maximum(self._normals @ to_body @ np.array(around.sun), 0.0)
         lost = 0.0 if self.lost_panel is None else float(powers[self.lost_panel - 1 : self.lost_panel].sum())
         return around.light * (float(powers.sum()) - lost)
+
+
+DEVICE = "solar strings"
+LAMP = 0.2
+"""Irradiance of a halogen lamp at a short distance, relative to sunlight."""
+_RINGS, _SPOKES = 16, 32
+"""Numbers of rings and of radial directions of the sampling points on the visible ground."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolarCellsModel:
+    """Properties of n solar strings.
+
+    Attributes:
+        normals: outward unit vectors (n, 3) of the strings' faces, body axes.
+        peaks: nominal currents (n,) at normal incidence and one astronomical unit, A.
+        gain_errors: relative errors (n,) of the peak currents.
+        grazing: angle (rad) between light and surface below which the reflected fraction of the light
+            increases.
+        noise: standard deviation of the current noise, A.
+        albedo: reflectance (albedo) of the Earth, from 0 to 1.
+    """
+
+    normals: FloatArray
+    peaks: FloatArray
+    gain_errors: FloatArray
+    grazing: float = math.radians(5.0)
+    noise: float = 2e-3
+    albedo: float = 0.3
+
+    def __post_init__(self) -> None:
+        count = len(self.normals)
+        if np.shape(self.normals) != (count, 3) or np.shape(self.peaks) != (count,):
+            raise ValueError(f"{DEVICE}: give normals (n, 3) and peaks (n,)")
+        if np.shape(self.gain_errors) != (count,):
+            raise ValueError(f"{DEVICE}: give one gain error per string")
+        limits = {"grazing": (0.0, 0.5, "rad"), "noise": (0.0, 10.0, "A"), "albedo": (0.0, 1.0, "")}
+        check_limits(DEVICE, self, limits)
+
+    def currents(
+        self, position: FloatArray, sun: FloatArray, body: FloatArray, generator: np.random.Generator
+    ) -> FloatArray:
+        """Return the currents (n,), A, of the solar strings.
+
+        `position` (3,) and the Sun's position `sun` (3,) are geocentric, m, ICRS. `body` (3, 3) is the
+        attitude matrix, ICRS into body axes.
+        """
+        to_sun = sun - position
+        distance = float(np.linalg.norm(to_sun))
+        share = float(sunlit_share(position, sun)) * (ASTRONOMICAL_UNIT / distance) ** 2
+        normals = self.normals @ body
+        light = share * self._accepted(normals @ to_sun / distance)
+        light = light + self._earthlight(normals, position, sun)
+        noise = self.noise * generator.standard_normal(len(self.peaks))
+        # The diode of a solar string blocks reverse current.
+        return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
+
+    def in_lamplight(self, lamp: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return the currents (n,), A, while a lamp shines onto the panel with the normal `lamp` (3,)."""
+        light = LAMP * (self.normals @ lamp > math.cos(math.radians(5.0)))
+        noise = self.noise * generator.standard_normal(len(self.peaks))
+        return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
+
+    def _accepted(self, cosines: FloatArray) -> FloatArray:
+        """Return the relative currents (...), 0 to 1, for `cosines` (...) of the angle of incidence."""
+        grazing = math.sin(self.grazing)
+        dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
+        return np.asarray(np.maximum(dimmed, 0.0))
+
+    def _earthlight(self, normals: FloatArray, position: FloatArray, sun: FloatArray) -> FloatArray:
+        """Return the Earth's light (n,), relative to sunlight, on strings with `normals` (n, 3), ICRS."""
+        rays, ground, solid = _ground_in_view(position)
+        lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
+        return np.asarray(self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit))
+
+
+def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return directions (m, 3) to ground points, unit verticals (m, 3) at these points, and a solid angle.
+
+    The directions sample the visible disc of the Earth in rings of equal solid angle. The returned solid
+    angle (sr) is the part of the disc that each direction represents.
+    """
+    distance = float(np.linalg.norm(position))
+    down = -position / distance
+    widest = math.sqrt(1.0 - (EARTH_RADIUS / distance) ** 2)
+    cosine = 1.0 - (np.arange(_RINGS) + 0.5) / _RINGS * (1.0 - widest)
+    sine = np.sqrt(1.0 - cosine**2)
+    angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
+    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(down)
+    rays = cosine[:, None, None] * down + sine[:, None, None] * spokes
+    length = distance * cosine - np.sqrt(EARTH_RADIUS**2 - (distance * sine) ** 2)
+    ground = (position + length[:, None, None] * rays) / EARTH_RADIUS
+    return rays.reshape(-1, 3), ground.reshape(-1, 3), 2.0 * np.pi * (1.0 - widest) / (_RINGS * _SPOKES)
+
+
+CONVERSION, CONFIG = 0x00, 0x01
+_GENERAL_CALL, _RESET = 0x00, b"\x06"
+POWER_ON_CONFIG = 0x8583
+_START = 0x8000
+_SINGLE_SHOT = 0x0100
+_FULL_SCALE = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256, 0.256, 0.256)
+_RATES = (8, 16, 32, 64, 128, 250, 475, 860)
+
+
+class EmulatedAds1115:
+    """An emulated ADS1115; the function `measure(channel)` returns the present voltage at an input.
+
+    Attributes:
+        address: I2C address of the converter.
+    """
+
+    def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:
+        self.address = address
+        self._now_ns = now_ns
+        self._measure = measure
+        self.brown_out()
+
+    def brown_out(self) -> None:
+        """Return to the power-on state."""
+        self._pointer = CONVERSION
+        self._config = POWER_ON_CONFIG & ~_START
+        self._conversion = 0
+        self._ready_ns = self._now_ns()
+        self._converting = False
+
+    def answers(self, address: int) -> bool:
+        """Return whether the address is the converter's own or the general call."""
+        return address in {_GENERAL_CALL, self.address}
+
+    def write(self, address: int, data: bytes) -> None:
+        """Store a register pointer, and a word for the register Config; thresholds are not modelled.
+
+        The reset by general call restores the power-on state (TI SBAS444, section 9.5.1.2).
+        """
+        if address == _GENERAL_CALL:
+            if data == _RESET:
+                self.brown_out()
+            return
+        self._complete()
+        self._pointer = data[0] & 0b11
+        if len(data) >= 3 and self._pointer == CONFIG:
+            word = data[1] << 8 | data[2]
+            self._config = word & ~_START
+            if word & _START and word & _SINGLE_SHOT:
+                self._converting = True
+                self._ready_ns = self._now_ns() + 1_000_000_000 // _RATES[word >> 5 & 0b111]
+
+    def read(self, count: int) -> bytes:
+        """Return the two bytes of the selected register, repeatedly."""
+        self._complete()
+        word = self._conversion if self._pointer == CONVERSION else self._config
+        if self._pointer == CONFIG and not self._converting:
+            word |= _START
+        return (word.to_bytes(2, "big") * (count // 2 + 1))[:count]
+
+    def _complete(self) -> None:
+        """Complete a conversion whose time has passed."""
+        if not self._converting or self._now_ns() < self._ready_ns:
+            return
+        self._converting = False
+        mux = self._config >> 12 & 0b111
+        volts = self._measure(mux & 0b11) if mux & 0b100 else 0.0
+        counts = round(volts / _FULL_SCALE[self._config >> 9 & 0b111] * 32_768)
+        self._conversion = min(0x7FFF, max(-0x8000, counts)) & 0xFFFF
+
+
+_FRESH_NS = 20_000_000
+"""Time (ns) for which computed string currents are reused."""
+
+
+class EmulatedSolarCells:
+    """The n emulated solar strings and the converters that measure their currents.
+
+    Attributes:
+        parts: the converters.
+        dead: mask (n,) of the failed strings, which give no current.
+        frozen: whether a fault holds all currents constant.
+        gain: gain of all amplifiers relative to the nominal gain.
+        lamp: outward normal (3,), body axes, of the panel that a lamp on a bench illuminates; None in flight.
+    """
+
+    def __init__(
+        self,
+        world: OrbitingWorld,
+        model: SolarCellsModel,
+        wirings: Sequence[StringWiring],
+        now_ns: Callable[[], int],
+        generator: np.random.Generator,
+    ) -> None:
+        self.dead = np.zeros(len(wirings), dtype=bool)
+        self.frozen = False
+        self.gain = 1.0
+        self.lamp: FloatArray | None = None
+        self._world, self._model, self._now_ns, self._generator = world, model, now_ns, generator
+        self._strings = {(w.address, w.channel): (i, w.volt_per_ampere) for i, w in enumerate(wirings)}
+        self._currents: FloatArray = np.zeros(len(wirings))
+        self._measured_ns = -_FRESH_NS
+        self.parts = tuple(
+            EmulatedAds1115(address, now_ns, partial(self._voltage, address))
+            for address in sorted({wiring.address for wiring in wirings})
+        )
+
+    def _voltage(self, address: int, channel: int) -> float:
+        """Return the voltage (V) at the input of a converter."""
+        index, volt_per_ampere = self._strings.get((address, channel), (None, 0.0))
+        if index is None:
+            return 0.0
+        now_ns = self._now_ns()
+        if not self.frozen and now_ns - self._measured_ns >= _FRESH_NS:
+            self._measured_ns = now_ns
+            self._currents = self._light(now_ns)
+        return volt_per_ampere * float(np.where(self.dead, 0.0, self.gain * self._currents)[index])
+
+    def _light(self, now_ns: int) -> FloatArray:
+        if self.lamp is not None:
+            return self._model.in_lamplight(self.lamp, self._generator)
+        body = quaternion.attitude_matrix(self._world.motion(now_ns).quaternion)
+        around = self._world.surroundings()
+        sun = sun_position(utc_date(self._world))
+        return self._model.currents(np.array(around.position), sun, body, self._generator)

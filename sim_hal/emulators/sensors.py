@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.drivers.adis16470 import (
+from hal.drivers.sensor_unit import (
     ACCELERATION_STEP,
     DATA_CNTR,
     DEC_RATE,

@@ -24,7 +24,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from hal.drivers.vn100.protocol import Checksum, OutputLayout, Sentence, build, layout_of, parse
+from hal.drivers.vn100_protocol import Checksum, OutputLayout, Sentence, build, layout_of, parse
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, from_rotation_vector, multiply, normalise
 from sim_hal.clock import NEVER, SerialEnd

@@ -284,7 +284,7 @@ BINARY_FIELDS: Mapping[tuple[int, int], str] = {
     (4, 7): "linear_ned",
     (4, 8): "uncertainty",
 }
-"""Quantities by group bit and field bit, as in `hal.drivers.vn100.protocol.FIELDS`."""
+"""Quantities by group bit and field bit, as in `hal.drivers.vn100_protocol.FIELDS`."""
 
 
 @dataclass(frozen=True, slots=True)

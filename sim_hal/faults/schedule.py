@@ -18,8 +18,7 @@ from functools import partial
 from flight.schema.sections import Config
 from hal.interfaces.devices import COIL_NAMES
 from knightcube.errors import UsageError
-from sim_hal.faults.bench import Bench, FaultKind, Removal, Where
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, Bench, FaultKind, Removal, Where
 from sim_hal.settings import FaultEntry
 
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"

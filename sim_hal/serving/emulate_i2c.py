@@ -33,7 +33,7 @@ from types import FrameType
 import numpy as np
 
 from flight.schema import reader as configuration
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
 from sim_hal.assembly import assemble_coils

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, cast
 from flight.link.telemetry.log import FlightLog
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import LATE_NS
 from knightcube.astro.arrays import FloatArray, Image
@@ -38,7 +38,7 @@ from sim_hal.assembly import (
 from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.emulators.serial_line import PtyLine
-from sim_hal.faults.bench import Bench
+from sim_hal.faults.catalogue import Bench
 from sim_hal.faults.schedule import parse, put
 from sim_hal.serving.device_link import Inbox, pack
 from sim_hal.settings import Simulation, SkySection

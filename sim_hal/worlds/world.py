@@ -73,7 +73,7 @@ WORLDS = {
     "testbed": "sim_hal.worlds.testbed:make",
     "cage": "sim_hal.worlds.testbed:make_caged",
     "free_body": "sim_hal.worlds.free_body:make",
-    "bench": "sim_hal.worlds.bench:make",
+    "bench": "sim_hal.worlds.testbed:make_held",
 }
 
 

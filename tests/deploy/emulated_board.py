@@ -22,8 +22,8 @@ from typing import Any
 import msgspec
 
 from flight.schema import reader
-from hal.buses.clock import SystemClock
-from hal.buses.i2c_bus import device_file
+from hal.buses.linux_wires import device_file
+from hal.buses.system import SystemClock
 from sim_hal.serving.emulate_i2c import I2cServer, library
 from sim_hal.serving.server import DeviceServer
 from sim_hal.settings import Simulation

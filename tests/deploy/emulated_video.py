@@ -19,7 +19,7 @@ import numpy as np
 from flight.app.cli import main
 from flight.schema import reader
 from flight.schema.devices import Camera, V4l2Device, WideCamera
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.drivers import v4l2_camera as v4l2
 from sim_hal.rig import RemoteFrameSource
 from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob

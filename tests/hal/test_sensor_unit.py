@@ -12,10 +12,16 @@ import numpy as np
 import pytest
 
 from flight.schema.devices import axis_matrix
-from hal.buses.clock import SystemClock
 from hal.buses.linux_wires import LinuxSpiDevice
-from hal.drivers.adis16470 import Adis16470
-from hal.drivers.sensor_unit import SensorPart, SensorUnit, SensorUnitSettings, level_attitude, quaternion_of
+from hal.buses.system import SystemClock
+from hal.drivers.sensor_unit import (
+    Adis16470,
+    SensorPart,
+    SensorUnit,
+    SensorUnitSettings,
+    level_attitude,
+    quaternion_of,
+)
 from hal.interfaces.errors import NotResponding, Refused
 from knightcube.astro import quaternion
 from sim_hal.clock import SimClock
@@ -169,7 +175,7 @@ def test_the_spi_device_makes_the_calls_of_the_kernels_interface(
         calls.append((request, bytes(data)))
         return 0
 
-    monkeypatch.setattr("hal.buses.linux_wires.fcntl.ioctl", record)
+    monkeypatch.setattr("hal.buses.linux_wires.ioctl", record)
     opened = LinuxSpiDevice(str(device), 1_000_000, 3)
     assert opened.transfer([b"\x72\x00", b"\x00\x00"]) == [b"\0\0"] * 2
     opened.close()

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from hal.drivers.ads1115 import STEP, AdsSolarStrings, StringWiring, config_for
+from hal.drivers.current_monitors import STEP, AdsSolarStrings, StringWiring, conversion_of
 from hal.interfaces.errors import OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.vision.solar_cells import CoarseSunStatus, SolarStringModel, coarse_sun
 from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
-from sim_hal.emulators.solar_cells import EmulatedAds1115, EmulatedSolarCells, SolarCellsModel
+from sim_hal.emulators.power import EmulatedAds1115, EmulatedSolarCells, SolarCellsModel
 from sim_hal.settings import FreeBodySection, OrbitSection, TipOff
 from sim_hal.worlds.free_body import FreeBody
 
@@ -159,7 +159,7 @@ def test_the_words_are_those_of_the_data_sheet() -> None:
 
     The power-on value is 0x8583.
     """
-    assert [config_for(channel) for channel in range(4)] == [0xC583, 0xD583, 0xE583, 0xF583]
+    assert [conversion_of(channel) for channel in range(4)] == [0xC583, 0xD583, 0xE583, 0xF583]
     clock = SimClock()
     bus = EmulatedI2cBus([EmulatedAds1115(0x48, clock.now_ns, lambda channel: 0.5 * channel)])
     assert bus.read_i2c_block_data(0x48, 1, 2) == [0x85, 0x83]

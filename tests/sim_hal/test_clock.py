@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from sim_hal.clock import SimClock
 
 MS = 1_000_000

@@ -156,7 +156,7 @@ def test_the_supply_is_chopped_and_its_mean_over_whole_periods_is_the_sum_of_mag
 
 
 def test_a_single_conversion_of_the_chopped_current_is_off_by_up_to_18_percent() -> None:
-    """A conversion of 68.1 ms includes up to 4 pulses, and 3.4 on average (`hal.drivers.ina219`)."""
+    """A conversion of 68.1 ms includes up to 4 pulses, 3.4 on average (`hal.drivers.current_monitors`)."""
     rig = Rig()
     rig.coils.start()
     rig.command(0.05, 0.0, 0.0)

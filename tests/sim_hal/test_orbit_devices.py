@@ -27,7 +27,7 @@ from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.assembly import assemble, wide_model
 from sim_hal.clock import SimClock
 from sim_hal.emulation import EmulatedWires
-from sim_hal.emulators.solar_cells import SolarCellsModel
+from sim_hal.emulators.power import SolarCellsModel
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
 from sim_hal.settings import FaultEntry, SkySection

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, build
+from hal.drivers.vn100_protocol import FIELDS, AsciiLine, BinaryPacket, build
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.clock import NEVER
 from sim_hal.emulators.vn100 import SUPPORTED_FIELDS, Vn100EmulatorSettings

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hal.drivers.vn100.protocol import build
+from hal.drivers.vn100_protocol import build
 from sim_hal.emulators.vn100 import Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES
 from tests.hal.vn100.emulated_unit import Bench

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from hal.drivers.vn100.protocol import FIELDS
+from hal.drivers.vn100_protocol import FIELDS
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from sim_hal.emulators.vn100 import SUPPORTED_FIELDS
 from sim_hal.emulators.vn100_sensors import (

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.errors import UsageError
-from sim_hal.worlds.magnetic_field import DEGREE, TABLE
+from sim_hal.worlds.orbit import DEGREE, TABLE
 
 WHEEL_MEMBER = "ppigrf/IGRF14.shc"
 FIRST_EPOCH = 2000

@@ -25,7 +25,7 @@ from knightcube.astro.quaternion import (
     multiply,
 )
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from sim_hal.worlds import magnetic_field
+from sim_hal.worlds.orbit import magnetic_field, ring_current
 from tests.support.orbit_geometry import (
     Pass,
     in_field,
@@ -177,8 +177,8 @@ def _field(pass_: Pass, rng: np.random.Generator) -> FloatArray:
     for k, kick in enumerate(kicks):
         now = keep * now + kick
         walk[k] = now
-    core = magnetic_field.field(when, pass_.positions)
-    return np.asarray(core + magnetic_field.ring_current(when, disturbance) + IONOSPHERE * walk)
+    core = magnetic_field(when, pass_.positions)
+    return np.asarray(core + ring_current(when, disturbance) + IONOSPHERE * walk)
 
 
 def _in_fields(

@@ -58,9 +58,8 @@ from flight.link.telemetry.packets import CRC_BYTES
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse, peer_networks
 from flight.schema.sections import Link
-from hal.buses.clock import SystemClock
-from hal.buses.linux_process import ServiceManager
-from hal.buses.serial_port import PySerialPort
+from hal.buses.linux_wires import PySerialPort
+from hal.buses.system import ServiceManager, SystemClock
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import FlightError, UsageError
 

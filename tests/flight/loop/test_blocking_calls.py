@@ -16,20 +16,20 @@ from tests.support.blocking_calls import BlockingCalls
 
 _LOCK = "a lock that its holder releases without a call of the operating system"
 ALLOWED = {
-    "hal/buses/clock.py:SystemClock.sleep_until_ns": ("time.sleep", "waits for the next cycle, as intended"),
+    "hal/buses/system.py:SystemClock.sleep_until_ns": ("time.sleep", "waits for the next cycle, as intended"),
     "flight/link/commands.py:_identity": ("posix.lstat", "a file in /run, which is in memory"),
     "flight/loop/worker_processes.py:ProcessRunner.submit": ("posix.eventfd_write", "does not block"),
     "hal/guardian.py:GuardianLine.beat": ("_socket.socket.send", "MSG_DONTWAIT"),
     "hal/guardian.py:GuardianLine._receive": ("_socket.socket.recv", "MSG_DONTWAIT"),
-    "hal/buses/clock.py:ThreadTicker.kick": ("_thread.", _LOCK),
+    "hal/buses/system.py:ThreadTicker.kick": ("_thread.", _LOCK),
     "flight/link/telemetry/packets.py:Packer.pack": ("_thread.", _LOCK),
-    "hal/buses/serial_port.py:PySerialPort.receive": ("_thread.", _LOCK),
+    "hal/buses/linux_wires.py:PySerialPort.receive": ("_thread.", _LOCK),
     "hal/drivers/coils.py:CommandMailbox.put": ("_thread.", _LOCK),
     "hal/drivers/coils.py:CommandMailbox.withdraw": ("_thread.", _LOCK),
     "hal/drivers/coils.py:PwmTorqueCoils.command": ("_thread.", _LOCK),
     "hal/drivers/coils.py:PwmTorqueCoils.state": ("_thread.", _LOCK),
-    "hal/drivers/ina219.py:Ina219.error": ("_thread.", _LOCK),
-    "hal/drivers/ina219.py:Ina219.latest": ("_thread.", _LOCK),
+    "hal/drivers/current_monitors.py:Ina219.error": ("_thread.", _LOCK),
+    "hal/drivers/current_monitors.py:Ina219.latest": ("_thread.", _LOCK),
 }
 """Functions whose calls may block on the control thread, by the start of the call's name, with the reason."""
 
@@ -49,7 +49,7 @@ def test_the_control_thread_waits_nowhere_else() -> None:
                 [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=True
             )
     found = [tuple(one) for one in json.loads(done.stdout.splitlines()[-1])]
-    assert ("hal/buses/clock.py:SystemClock.sleep_until_ns", "time.sleep") in found, "nothing was watched"
+    assert ("hal/buses/system.py:SystemClock.sleep_until_ns", "time.sleep") in found, "nothing was watched"
     refused = [one for one in found if not one[1].startswith(ALLOWED.get(one[0], ("none",))[0])]
     assert refused == []
 

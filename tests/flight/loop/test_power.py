@@ -17,7 +17,7 @@ from flight.link.telemetry.definitions import POWER
 from flight.loop.power import PowerTask, Sheddable
 from flight.schema.devices import Battery, Power
 from flight.schema.sections import Modes
-from hal.drivers.ina219 import Ina219
+from hal.drivers.current_monitors import Ina219
 from knightcube.astro.arrays import FloatArray
 from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulators.coil_circuit import EmulatedIna219

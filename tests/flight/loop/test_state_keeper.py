@@ -30,7 +30,7 @@ from flight.loop.state import (
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from ground.telemetry import read_run
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
 from tests.flight.loop.disk import NO_SPACE, Disk

@@ -15,7 +15,7 @@ import pytest
 
 from flight.loop.executive import Worker
 from flight.loop.worker_processes import ProcessRunner
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from tests.support import process_watch
 from tests.support.process_watch import MIB
 

@@ -16,8 +16,7 @@ import pytest
 
 from flight.loop.executive import JobResult, JobRunner, LockStepRunner, Worker, WorkerChange, WorkerNews
 from flight.loop.worker_processes import BUDGET, STEADY_NS, Attempts, ProcessRunner
-from hal.buses.clock import SystemClock
-from hal.buses.linux_process import worker_cores
+from hal.buses.system import SystemClock, worker_cores
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from tests.flight.loop.odd_jobs import cores, die, double, fail, function, hang
@@ -196,8 +195,8 @@ _ORPHANED = """
 import sys, time
 from flight.loop.executive import Worker
 from flight.loop.worker_processes import ProcessRunner
-from hal.buses.clock import SystemClock
-from hal.buses.linux_process import worker_cores
+from hal.buses.system import SystemClock
+from hal.buses.system import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from tests.flight.loop.odd_jobs import hang
 runner = ProcessRunner(SystemClock(), [Worker("hang", hang, 0, 10**12)])

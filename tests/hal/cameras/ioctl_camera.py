@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from hal.drivers import v4l2_camera as v4l2
-from hal.drivers.pixel_formats import PIXEL_FORMATS, fourcc
+from hal.drivers.camera import PIXEL_FORMATS, fourcc
 
 MILLISECOND_NS = 1_000_000
 

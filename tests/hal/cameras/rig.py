@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.drivers import aravis_camera
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import ServedCamera

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import ServedCamera
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused

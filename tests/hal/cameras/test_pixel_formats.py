@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from hal.drivers.pixel_formats import PIXEL_FORMATS, PixelError
+from hal.drivers.camera import PIXEL_FORMATS, PixelError
 from hal.interfaces.errors import NotResponding, Refused
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.hal.cameras.rig import settled, video_rig

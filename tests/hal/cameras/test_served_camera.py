@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.drivers.camera import CameraCounts, FrameNumbers, ServedCamera
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding, OutOfRange

@@ -14,7 +14,7 @@ import pytest
 from flight.schema.devices import PixelName
 from flight.schema.reader import PIXEL_BITS
 from hal.drivers import v4l2_camera as v4l2
-from hal.drivers.pixel_formats import PIXEL_FORMATS, fourcc, fourcc_name
+from hal.drivers.camera import PIXEL_FORMATS, fourcc, fourcc_name
 
 # Values of linux/videodev2.h on x86-64.
 CODES = {

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from hal.buses.i2c_bus import LinuxI2cBus
+from hal.buses.linux_wires import LinuxI2cBus
 from tests.hal.coils.ioctl_wire import IoctlWire
 from tests.hal.coils.rig import THESIS, Rig, Wire
 from tests.manual_clock import ManualClock
@@ -39,5 +39,5 @@ def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iter
 def _replace_ioctl(monkeypatch: pytest.MonkeyPatch, wire: Wire) -> IoctlWire:
     kernel = IoctlWire(wire.bus)
     monkeypatch.setattr("smbus2.smbus2.ioctl", kernel)
-    monkeypatch.setattr("hal.buses.i2c_bus.ioctl", kernel)
+    monkeypatch.setattr("hal.buses.linux_wires.ioctl", kernel)
     return kernel

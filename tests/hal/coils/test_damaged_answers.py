@@ -9,10 +9,9 @@ from random import Random
 import numpy as np
 from hypothesis import given
 
-from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
-from hal.drivers.ina219 import Ina219
+from hal.drivers.current_monitors import AdsSolarStrings, Ina219, StringWiring
+from hal.drivers.gps import NAV_PVT, UbxParser, frame, reading_of, unpack_pvt
 from hal.drivers.pca9685 import Pca9685
-from hal.drivers.ublox import NAV_PVT, UbxParser, frame, reading_of, unpack_pvt
 from hal.interfaces.errors import DeviceError, OutOfRange
 from tests.hal.gps.fixes import PVT
 from tests.manual_clock import ManualClock

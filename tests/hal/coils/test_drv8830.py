@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hal.drivers.coils import CoilSettings, wirings
-from hal.drivers.drv8830 import Drv8830Bridges, Drv8830Coils, control_of, volts_of
+from hal.drivers.coils import CoilSettings, Drv8830Bridges, Drv8830Coils, control_of, volts_of, wirings
 from knightcube.astro.arrays import FloatArray
 from sim_hal.clock import SimClock
-from sim_hal.emulators.drv8830 import BridgeCircuit
+from sim_hal.emulators.coil_circuit import BridgeCircuit
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 
 SETTINGS = CoilSettings(

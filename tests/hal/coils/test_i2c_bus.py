@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.buses.i2c_bus import LinuxI2cBus, adapters
+from hal.buses.linux_wires import LinuxI2cBus, adapters
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 from tests.hal.coils.ioctl_wire import I2C_RETRIES, I2C_TIMEOUT, IoctlWire
 from tests.hal.coils.rig import INA, PCA, Rig
@@ -154,10 +154,10 @@ def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_el
 
 
 def test_a_missing_bus_says_which_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hal.buses.i2c_bus.adapters", lambda: [(1, "Synopsys DesignWare I2C adapter")])
+    monkeypatch.setattr("hal.buses.linux_wires.adapters", lambda: [(1, "Synopsys DesignWare I2C adapter")])
     with pytest.raises(NotResponding, match=r"/dev/i2c-97: .*i2c-1 \(Synopsys.*udev rule"):
         LinuxI2cBus(97)
-    monkeypatch.setattr("hal.buses.i2c_bus.adapters", list)
+    monkeypatch.setattr("hal.buses.linux_wires.adapters", list)
     with pytest.raises(NotResponding, match="modprobe i2c-dev"):
         LinuxI2cBus(97)
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from hal.drivers.ina219 import Ina219, config_for, range_for
+from hal.drivers.current_monitors import Ina219, config_for, range_for
 from hal.interfaces.devices import PowerMonitor
 from hal.interfaces.errors import OutOfRange
 from sim_hal.emulators.coil_circuit import EmulatedIna219

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from hal.drivers.coils import PwmTorqueCoils
-from hal.drivers.ina219 import Ina219
+from hal.drivers.current_monitors import Ina219
 from hal.drivers.pca9685 import Pca9685
 from tests.hal.coils.rig import INA, PCA, THESIS, Wire
 

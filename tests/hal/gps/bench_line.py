@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.drivers.ublox import UbloxReceiver
+from hal.drivers.gps import UbloxReceiver
 from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock, TimedSimulation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hal.drivers.ublox import Pvt
+from hal.drivers.gps import Pvt
 
 PVT = Pvt(
     date=(2026, 3, 20, 12, 34, 56),

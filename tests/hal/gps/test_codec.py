@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyubx2 import UBXMessage, UBXReader
 
-from hal.drivers.ublox import CFG_MSG, NAV_PVT, SYNC, UbxParser, checksum, frame, unpack_pvt
+from hal.drivers.gps import CFG_MSG, NAV_PVT, SYNC, UbxParser, checksum, frame, unpack_pvt
 from tests.hal.gps.fixes import PVT
 
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyubx2 import UBXReader
 
-from hal.drivers.ublox import (
+from hal.drivers.gps import (
     ACK_NAK,
     CFG_MSG,
     NAV_PVT,

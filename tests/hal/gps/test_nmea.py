@@ -9,7 +9,7 @@ from operator import xor
 import numpy as np
 import pytest
 
-from hal.drivers.nmea import NmeaReceiver
+from hal.drivers.gps import NmeaReceiver
 from hal.interfaces.devices import GpsReading
 from sim_hal.clock import SimClock
 

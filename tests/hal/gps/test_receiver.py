@@ -10,8 +10,8 @@ import pytest
 import serial
 from pyubx2 import UBXReader
 
-from hal.buses.clock import SystemClock
-from hal.drivers.ublox import CFG_MSG, NAV_PVT, Pvt, UbloxReceiver, frame, reading_of
+from hal.buses.system import SystemClock
+from hal.drivers.gps import CFG_MSG, NAV_PVT, Pvt, UbloxReceiver, frame, reading_of
 from hal.interfaces.errors import NotResponding, OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.earth.orbit_knowledge import GpsFix

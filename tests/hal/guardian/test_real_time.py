@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from flight.app import service as watchers
-from hal.buses import linux_process
+from hal.buses import system
 from hal.drivers.coils import DEVICE as COILS
 
 
@@ -19,8 +19,8 @@ def test_a_refusal_is_reported_with_its_cure(monkeypatch: pytest.MonkeyPatch) ->
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr(linux_process, "lock_memory", lambda: "locked memory refused (x): allow it with y")
-    obtained = linux_process.obtain([0], 50)
+    monkeypatch.setattr(system, "lock_memory", lambda: "locked memory refused (x): allow it with y")
+    obtained = system.obtain([0], 50)
     assert (obtained.priority, obtained.locked) == (0, False)
     assert str(obtained) == (
         "ordinary scheduling, memory not locked; SCHED_FIFO 50 refused (Operation not permitted): "
@@ -35,8 +35,8 @@ def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatc
         "sched_setscheduler",
         lambda thread, policy, value: asked.append((thread, policy, value.sched_priority)),
     )
-    monkeypatch.setattr(linux_process, "lock_memory", lambda: "")
-    assert str(linux_process.obtain([0, 77], 50)) == "SCHED_FIFO 50, memory locked"
+    monkeypatch.setattr(system, "lock_memory", lambda: "")
+    assert str(system.obtain([0, 77], 50)) == "SCHED_FIFO 50, memory locked"
     assert asked == [(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 50) for thread in (0, 77)]
 
 
@@ -46,8 +46,8 @@ def test_the_kernel_reports_locked_memory_or_the_refusal_is_explained() -> None:
     If the kernel refuses the lock, the refusal is explained.
     """
     script = (
-        "import mmap; from hal.buses import linux_process\n"
-        "said = linux_process.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"
+        "import mmap; from hal.buses import system\n"
+        "said = system.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"
         "status = open('/proc/self/status').read()\n"
         "field = lambda name: int(status.split(name)[1].split()[0])\n"
         "print(said or (field('VmLck:') > 1 << 20 and field('VmRSS:') < 100_000))"
@@ -63,7 +63,7 @@ def test_the_threads_beside_the_control_thread_are_served_next(monkeypatch: pyte
         asked[thread_id] = priority
         return ""
 
-    monkeypatch.setattr(linux_process, "prioritise", note)
+    monkeypatch.setattr(system, "prioritise", note)
     done = threading.Event()
     beside, coils = (threading.Thread(target=done.wait, name=name) for name in ("log", COILS))
     for thread in (beside, coils):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.buses.linux_process import ServiceManager
+from hal.buses.system import ServiceManager
 
 OWN = 4711
 

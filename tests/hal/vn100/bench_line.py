@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hal.drivers.vn100.driver import Vn100, Vn100Settings
+from hal.drivers.vn100 import Vn100, Vn100Settings
 from hal.interfaces.devices import ImuReading
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, attitude_map
 from sim_hal.clock import SimClock

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hal.drivers.vn100.protocol import AsciiLine, BinaryPacket, Sentence, StreamParser, build
+from hal.drivers.vn100_protocol import AsciiLine, BinaryPacket, Sentence, StreamParser, build
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES

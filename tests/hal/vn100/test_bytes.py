@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.drivers.vn100.protocol import (
+from hal.drivers.vn100_protocol import (
     AsciiLine,
     BinaryPacket,
     StreamParser,

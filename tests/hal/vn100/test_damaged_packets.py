@@ -10,8 +10,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.driver import OUTPUT_SET, Vn100
-from hal.drivers.vn100.protocol import BinaryPacket, StreamParser, layout_of
+from hal.drivers.vn100 import OUTPUT_SET, Vn100
+from hal.drivers.vn100_protocol import BinaryPacket, StreamParser, layout_of
 from tests.hal.vn100.bench_line import MISSION
 from tests.manual_clock import ManualClock
 from tests.support.damaged import chances, damage

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hal.drivers.vn100.driver import OUTPUT_SET, Question, Vn100, Vn100Settings
-from hal.drivers.vn100.protocol import build, layout_of
+from hal.drivers.vn100 import OUTPUT_SET, Question, Vn100, Vn100Settings
+from hal.drivers.vn100_protocol import build, layout_of
 from hal.interfaces.devices import ImuLink, ImuReading
 from hal.interfaces.errors import CorruptData, NotResponding, OutOfRange, Refused
 from knightcube.astro.quaternion import (

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.protocol import LONGEST_LINE, BinaryPacket, StreamParser, build, crc16, layout_of
+from hal.drivers.vn100_protocol import LONGEST_LINE, BinaryPacket, StreamParser, build, crc16, layout_of
 from tests.hal.vn100.bench_line import MISSION, BenchLine, bench_line
 
 INPUT = Path(__file__).resolve().parents[4] / "shared/data/inputs/vn-gnss.bin"

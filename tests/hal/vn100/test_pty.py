@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from flight.schema.sections import CONTROL_RATE_HZ
-from hal.buses import serial_port
-from hal.buses.clock import SystemClock
-from hal.buses.serial_port import PySerialPort
-from hal.drivers.vn100.driver import Vn100
+from hal.buses import linux_wires
+from hal.buses.linux_wires import PySerialPort
+from hal.buses.system import SystemClock
+from hal.drivers.vn100 import Vn100
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import CorruptData, NotResponding
 from knightcube.astro.quaternion import angle_about_axis_y
@@ -112,7 +112,7 @@ def test_an_open_port_cannot_be_opened_again_until_the_driver_closes_it() -> Non
 def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(serial_port, "_REOPEN_S", 0.005)
+    monkeypatch.setattr(linux_wires, "_REOPEN_S", 0.005)
     clock, name = SystemClock(), tmp_path / "imu"
     first, second = os.openpty(), os.openpty()
     name.symlink_to(os.ttyname(first[1]))
@@ -144,7 +144,7 @@ def test_a_port_that_is_unplugged_and_plugged_in_again_receives_and_sends(
 def test_data_that_nobody_receives_are_dropped_oldest_first_and_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(serial_port, "_PENDING_LIMIT", 10)
+    monkeypatch.setattr(linux_wires, "_PENDING_LIMIT", 10)
     near, far = os.openpty()
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
     port.close()
@@ -161,7 +161,7 @@ def test_data_that_nobody_receives_are_dropped_oldest_first_and_counted(
 
 
 def test_closing_ends_the_thread_that_waits_for_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_port, "_READ_TIMEOUT_S", 60.0)
+    monkeypatch.setattr(linux_wires, "_READ_TIMEOUT_S", 60.0)
     near, far = os.openpty()
     port = PySerialPort(os.ttyname(far), 115200, SystemClock())
     port.close()

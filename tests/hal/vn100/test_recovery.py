@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from hal.drivers.vn100.protocol import build
+from hal.drivers.vn100_protocol import build
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import NotResponding
 from sim_hal.emulators.serial_line import SOUND, LineFaults

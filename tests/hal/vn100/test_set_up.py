@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from hal.drivers.vn100.driver import BAUD_RATES, PASSING_ERRORS, Question, Vn100Settings, check, set_up
-from hal.drivers.vn100.protocol import Sentence
+from hal.drivers.vn100 import BAUD_RATES, PASSING_ERRORS, Question, Vn100Settings, check, set_up
+from hal.drivers.vn100_protocol import Sentence
 from hal.interfaces.errors import OutOfRange, Refused
 from tests.hal.vn100.bench_line import MISSION
 

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.driver import OUTPUT_SET
-from hal.drivers.vn100.protocol import (
+from hal.drivers.vn100 import OUTPUT_SET
+from hal.drivers.vn100_protocol import (
     LONGEST_LINE,
     AsciiLine,
     BinaryPacket,

@@ -14,7 +14,7 @@ from knightcube.vision import solar_cells
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
 from knightcube.vision.sun import cameras_by_sun
-from sim_hal.emulators.solar_cells import SolarCellsModel
+from sim_hal.emulators.power import SolarCellsModel
 from tests.sim_hal.earth_camera.scenes import pointing, random_direction
 
 STRINGS = SolarStringModel()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim_hal.faults.bench import Bench
+from sim_hal.faults.catalogue import Bench
 from sim_hal.rig import LockStep
 
 

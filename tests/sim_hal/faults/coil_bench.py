@@ -15,9 +15,9 @@ from flight.loop.coil_response import ResponseSettings
 from flight.schema import reader as configuration
 from flight.schema.testbed import TestbedConfig
 from hal.drivers.coils import PwmTorqueCoils
-from hal.drivers.ina219 import Ina219
+from hal.drivers.current_monitors import Ina219
 from hal.drivers.pca9685 import Pca9685
-from hal.drivers.vn100.driver import Vn100
+from hal.drivers.vn100 import Vn100
 from hal.interfaces.devices import ImuReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_about_axis_y

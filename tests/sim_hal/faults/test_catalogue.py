@@ -11,8 +11,7 @@ from hal.interfaces.errors import NotResponding
 from sim_hal.clock import NEVER, SimClock
 from sim_hal.emulators.coil_circuit import CoilCondition
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.faults.bench import FaultKind, Where
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, FaultKind, Where
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep
 from tests.sim_hal.faults.benches import bench_of

@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from sim_hal.faults.bench import Where
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, Where
 
 AXES = "xyz456"
 CHANCE, TURNS = "chance 0.5 1e-06..1", "period 0.5 0.05..3600 s; share 0.5 0.01..0.99"

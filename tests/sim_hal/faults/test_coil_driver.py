@@ -9,7 +9,7 @@ from flight.app.devices import coil_settings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.pca9685 import Pca9685
 from sim_hal.clock import SimClock
-from sim_hal.faults.bench import Bench
+from sim_hal.faults.catalogue import Bench
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import build_lockstep
 from tests.support.flights import demo_config, demo_world

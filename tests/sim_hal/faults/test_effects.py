@@ -13,8 +13,7 @@ from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.emulators.vn100_sensors import MessageData, Vn100Sample
-from sim_hal.faults.bench import Bench, all_of, hold, no_removal
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, Bench, all_of, hold, no_removal
 from sim_hal.rig import build_lockstep
 from tests.sim_hal.faults.benches import bench_of
 from tests.support.flights import demo_config, demo_world

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hal.buses.clock import SystemClock
-from hal.buses.serial_port import PySerialPort
+from hal.buses.linux_wires import PySerialPort
+from hal.buses.system import SystemClock
 from hal.interfaces.errors import NotResponding
 
 

@@ -10,8 +10,7 @@ from flight.app.cli import main
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
 from knightcube.errors import UsageError
-from sim_hal.faults.bench import FaultKind
-from sim_hal.faults.catalogue import CATALOGUE, listing
+from sim_hal.faults.catalogue import CATALOGUE, FaultKind, listing
 from sim_hal.faults.schedule import check, entries, parse, schedule, scheduled
 from sim_hal.settings import FaultEntry, Simulation
 from tests.support.flights import CONFIG, TEXT, demo_config

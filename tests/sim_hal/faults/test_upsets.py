@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from hal.drivers.ina219 import Ina219
+from hal.drivers.current_monitors import Ina219
 from hal.drivers.pca9685 import LED0_ON_L, MODE1, MODE2, PRE_SCALE
 from sim_hal.clock import SimClock
 from sim_hal.emulators.coil_circuit import CALIBRATION, CONFIG
-from sim_hal.faults.bench import Bench
+from sim_hal.faults.catalogue import Bench
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import build_lockstep
 from tests.hal.coils.rig import INA, Rig

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from flight.app.flight import fly
 from flight.app.run import RunRequest
-from hal.buses.i2c_bus import lock_bus
+from hal.buses.linux_wires import lock_bus
 from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack

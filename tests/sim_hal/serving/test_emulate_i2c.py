@@ -175,7 +175,7 @@ def test_the_flights_own_driver_reads_it(environment: Mapping[str, str]) -> None
     said = run(
         environment,
         """
-        from hal.buses.i2c_bus import LinuxI2cBus
+        from hal.buses.linux_wires import LinuxI2cBus
         bus = LinuxI2cBus(7)
         print(bus.read_i2c_block_data(0x45, 0, 2))
         """,
@@ -188,7 +188,7 @@ def test_a_bus_with_a_name_of_its_own_is_opened_by_this_name_only(environment: M
     named = {**environment, "KNIGHTCUBE_I2C_BUS": "/dev/knightcube-i2c", "KNIGHTCUBE_I2C": "/dev/i2c-1"}
     script = """
     import os
-    from hal.buses.i2c_bus import LinuxI2cBus
+    from hal.buses.linux_wires import LinuxI2cBus
     print(LinuxI2cBus("/dev/knightcube-i2c").read_i2c_block_data(0x45, 0, 2), os.path.exists("/dev/i2c-7"))
     """
     assert run(named, script) == "[57, 159] False\n"

@@ -17,7 +17,6 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, sunlit_share
 from sim_hal.settings import Disturbances, OrbitSection
-from sim_hal.worlds import magnetic_field
 from sim_hal.worlds.orbit import (
     RING_CURRENT,
     Environment,
@@ -27,6 +26,7 @@ from sim_hal.worlds.orbit import (
     elements,
     julian_date,
     log_density,
+    magnetic_field,
     misfit,
     propagate,
     sun_position,
@@ -338,7 +338,7 @@ def test_between_knots_position_velocity_field_and_sun_are_the_models() -> None:
     times = np.random.default_rng(5).uniform(20.0, 2980.0, 40)
     times.sort()
     states = propagate(elements(ORBIT, DATE), 3000.0).states_at(times)
-    fields = magnetic_field.field(DATE + times / DAY, states[:, :3])
+    fields = magnetic_field(DATE + times / DAY, states[:, :3])
     suns = sun_position(DATE + times / DAY) - states[:, :3]
     for time, state, field, away in zip(times, states, fields, suns, strict=True):
         around = environment.at(float(time))

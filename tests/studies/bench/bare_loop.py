@@ -18,7 +18,7 @@ import time
 from array import array
 from pathlib import Path
 
-from hal.buses import linux_process
+from hal.buses import system
 from tests.support.process_watch import stolen_ns
 
 _CLOCK_MONOTONIC = 1
@@ -52,7 +52,7 @@ def _serve(words: list[str]) -> None:
     noted: array[int] = array("q")
     stopped: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: stopped.append(number))
-    if priority and (refusal := linux_process.prioritise(0, priority)):
+    if priority and (refusal := system.prioritise(0, priority)):
         raise SystemExit(refusal)
     gc.disable()
     sys.stdout.write("looping\n")

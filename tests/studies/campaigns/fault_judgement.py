@@ -14,7 +14,7 @@ from flight.link.telemetry.packets import to_text
 from ground.campaigns.runner import Result
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
-from sim_hal.faults.bench import FaultKind
+from sim_hal.faults.catalogue import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.fault_table import COIL_JUDGED, REACTION, own_events, part_of
 from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, demo_world

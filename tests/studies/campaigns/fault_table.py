@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sim_hal.faults.bench import FaultKind
+from sim_hal.faults.catalogue import FaultKind
 
 _STARS = {"stars-refused", "streak-refused", "vision-failed"}
 

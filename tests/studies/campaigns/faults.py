@@ -21,8 +21,7 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
-from sim_hal.faults.bench import FaultKind, Where
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.fault_judgement import judge

@@ -24,7 +24,7 @@ from flight.loop.navigation import GPS_DELAY_NS
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
-from hal.drivers.ublox import (
+from hal.drivers.gps import (
     DATE_AND_TIME,
     FIX_OK,
     ROLLOVER_NS,
@@ -55,8 +55,7 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.estimation.free_filter import FilterEnvironment, FreeFilter, FreeMotion
 from sim_hal.clock import SimClock
-from sim_hal.worlds import magnetic_field
-from sim_hal.worlds.orbit import sun_position
+from sim_hal.worlds.orbit import magnetic_field, sun_position
 from tests.support.flights import CONFIG
 
 HONEST = 4.0
@@ -192,7 +191,7 @@ def _measured(receiver: Receiver, seconds: float, *, with_field: bool = True) ->
     """Return the field strength, T (NaN without `with_field`), and the visible fraction of the Sun's disc."""
     date = receiver.date(seconds)
     position = receiver.true.at(date).position
-    strength = float(np.linalg.norm(magnetic_field.field(date, position))) if with_field else math.nan
+    strength = float(np.linalg.norm(magnetic_field(date, position))) if with_field else math.nan
     return strength, float(sunlit_share(position, sun_position(terrestrial_time(date))))
 
 
@@ -339,7 +338,7 @@ def fly_month(case: Case) -> Result:
         position = true.at(date).position
         light = sun_position(terrestrial_time(date))
         share = float(sunlit_share(position, light))
-        off = found.field - magnetic_field.field(date, position)
+        off = found.field - magnetic_field(date, position)
         sigma = math.hypot(FIELD_ERROR, found.field_sigma)
         result["worst"] = max(result["worst"], place[1])
         result["sun_deg"] = max(result["sun_deg"], _angle_deg(sun, light - position))
@@ -395,7 +394,7 @@ def _followed(config: OrbitConfig, receiver: Receiver, rng: np.random.Generator)
     nothing, worst, end, eye = Pressures(np.zeros((1, 3)), np.zeros((1, 3))), 0.0, 0.0, np.eye(3)
     knots = np.arange(0.0, FOLLOWED + 11.0, 10.0)
     dates = [receiver.date(knot) for knot in knots]
-    fields = np.array([magnetic_field.field(date, receiver.true.at(date).position) for date in dates])
+    fields = np.array([magnetic_field(date, receiver.true.at(date).position) for date in dates])
     for second in range(4, FOLLOWED + 1, FILTER_STEP):
         if second % 60 == 0:
             known.fix(receiver.reading(second))

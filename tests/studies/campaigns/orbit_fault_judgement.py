@@ -15,7 +15,7 @@ from ground.report.signals import seconds
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray
 from knightcube.astro.quaternion import attitude_matrix
-from sim_hal.faults.bench import FaultKind
+from sim_hal.faults.catalogue import FaultKind
 from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY
 from tests.studies.campaigns.fault_table import OWN, own_events, part_of
 from tests.studies.campaigns.orbit_fault_flights import DURATION

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
-from sim_hal.faults.bench import FaultKind, Where
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.orbit_fault_flights import DURATION, MODES, config_for, world_for

@@ -41,7 +41,7 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, 
 from knightcube.vision.solar_cells import CoarseSun, SolarStringModel, coarse_sun
 from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
-from sim_hal.emulators.solar_cells import SolarCellsModel
+from sim_hal.emulators.power import SolarCellsModel
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, Report, begin
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
 from tests.support import orbit_world

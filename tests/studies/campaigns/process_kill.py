@@ -27,7 +27,7 @@ import numpy as np
 from flight.link import events
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from ground.telemetry import read_run
-from hal.buses import linux_process
+from hal.buses import system
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight
@@ -72,7 +72,7 @@ def run(case: Case) -> Result:
         stack.enter_context(answering("sim_hal", "serve", str(config), *words))
         for child in below(os.getpid()):
             if "sim_hal serve" in command(child):
-                linux_process.prioritise(child, _HARDWARE)
+                system.prioritise(child, _HARDWARE)
         bus = RemoteI2cBus(json.loads(facts.read_text(encoding="utf-8"))["socket"])
         stack.callback(bus.close)
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -121,9 +121,9 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
     children = flight.children()
     before = max(board.current() for _ in range(20))
     sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
-    linux_process.prioritise(0, _HARDWARE)
+    system.prioritise(0, _HARDWARE)
     zero_after, _ = watch_coils(board, flight.do(sent), before)
-    linux_process.relinquish()
+    system.relinquish()
     flight.process.kill()
     flight.process.wait()
     deadline = time.monotonic() + _GONE_S

@@ -24,7 +24,7 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
-from sim_hal.emulators.solar_cells import SolarCellsModel
+from sim_hal.emulators.power import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import sun_position
 from tests.studies.campaigns.detumble import SAMPLES_NS, hash_of

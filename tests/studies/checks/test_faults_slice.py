@@ -11,8 +11,7 @@ from flight.link.events import EVENTS, Reaction, Severity
 from flight.schema import reader as configuration
 from ground.campaigns.runner import Case
 from ground.telemetry import Run
-from sim_hal.faults.bench import FaultKind
-from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.catalogue import CATALOGUE, FaultKind
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
 from tests.support.flights import config_for, demo_world, event_names, fly

@@ -43,7 +43,7 @@ from ground.link.terminal import (
     report_of,
 )
 from ground.xtce import TELECOMMANDS
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from knightcube.errors import FlightError, UsageError
 from tests.flight.link.vaults import frame_with
 from tests.support.flights import CONFIG

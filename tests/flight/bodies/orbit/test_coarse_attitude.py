@@ -27,7 +27,7 @@ from knightcube.gnc.control.coil_map import CoilMap
 from knightcube.gnc.estimation.estimate import ATTITUDE, AttitudeMeasurement, Knowledge
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.vision.solar_cells import SolarStringModel
-from sim_hal.emulators.solar_cells import SolarCellsModel
+from sim_hal.emulators.power import SolarCellsModel
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])

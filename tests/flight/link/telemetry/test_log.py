@@ -13,7 +13,7 @@ import pytest
 
 from flight.link.telemetry.log import FlightLog, find_segments
 from ground.telemetry import scan
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.flight.link.telemetry.small_disk import content
@@ -149,7 +149,7 @@ from pathlib import Path
 from flight.link.telemetry.definitions import CYCLE_TIMING
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
-from hal.buses.clock import SystemClock
+from hal.buses.system import SystemClock
 
 clock, packer, cycle = SystemClock(), Packer(), 0
 log = FlightLog(Path(sys.argv[1]), clock=clock, segment_bytes=50_000, drain_period_ns=1_000_000)

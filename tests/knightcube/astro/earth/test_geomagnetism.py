@@ -9,7 +9,7 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro.earth import geomagnetism as believed
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, north_east_down
 from knightcube.errors import UsageError
-from sim_hal.worlds import magnetic_field as true
+from sim_hal.worlds import orbit as true
 from tests.support import build_igrf
 
 # WMM2025 test values of NOAA NCEI (WMM2025_TEST_VALUES.txt in the PyPI package AHRS 0.4.0). The columns are
@@ -63,7 +63,7 @@ def test_the_true_field_differs_from_the_published_one_as_two_models_do(row: tup
             (n * (1.0 - e2) + h) * np.sin(up),
         ]
     )
-    found = north_east_down(along, up) @ true.field_on_ground(julian_date(year), place)
+    found = north_east_down(along, up) @ true.magnetic_field_on_ground(julian_date(year), place)
     np.testing.assert_allclose(1e9 * found, published, atol=60.0)
 
 
@@ -73,7 +73,7 @@ def test_in_orbit_truth_and_belief_are_nanoteslas_apart() -> None:
     away = rng.standard_normal((60, 3))
     positions = 6.778e6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
     dates = julian_date(2025.01) + rng.uniform(0.0, 1780.0, 60)
-    truth = true.field(dates, positions)
+    truth = true.magnetic_field(dates, positions)
     belief = np.array([believed.field(d, p) for d, p in zip(dates.tolist(), positions, strict=True)])
     apart = 1e9 * np.linalg.norm(truth - belief, axis=-1)
     assert 1.0 < np.mean(apart) < 15.0
@@ -91,7 +91,7 @@ def test_the_true_field_has_no_sources_and_no_currents() -> None:
     slope = np.empty((3, 3))
     for axis in range(3):
         off = step * np.eye(3)[axis]
-        up, down = (true.field_on_ground(DATE, place + sign * off) for sign in (1.0, -1.0))
+        up, down = (true.magnetic_field_on_ground(DATE, place + sign * off) for sign in (1.0, -1.0))
         slope[axis] = (up - down) / (2.0 * step)
     size = np.abs(slope).max()
     assert abs(np.trace(slope)) < 1e-4 * size
@@ -100,9 +100,9 @@ def test_the_true_field_has_no_sources_and_no_currents() -> None:
 
 def test_many_places_give_what_each_gives_alone_and_the_poles_are_finite() -> None:
     places = np.array([[0.0, 0.0, 6.8e6], [1.0, 0.0, 6.8e6], [0.0, 0.0, -6.8e6], [6.8e6, 1e5, 0.0]])
-    together = true.field_on_ground(DATE, places)
+    together = true.magnetic_field_on_ground(DATE, places)
     for place, found in zip(places, together, strict=True):
-        np.testing.assert_array_equal(true.field_on_ground(DATE, place), found)
+        np.testing.assert_array_equal(true.magnetic_field_on_ground(DATE, place), found)
     np.testing.assert_allclose(together[0], together[1], atol=1e-11)
 
 
@@ -122,7 +122,7 @@ def test_years_and_places_that_no_model_knows_are_refused() -> None:
     with pytest.raises(believed.GeomagneticError, match="invalid position"):
         believed.field_on_ground_axes(2026.0, float("nan"), 0.0, 0.0)
     with pytest.raises(OutOfRange, match="year"):
-        true.field(julian_date(2046.0), np.array([7e6, 0.0, 0.0]))
+        true.magnetic_field(julian_date(2046.0), np.array([7e6, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize("year", [2030.5, 2031.0, 2033.0, 2036.0, 2040.0])
@@ -131,7 +131,7 @@ def test_the_extrapolated_field_is_within_its_standard_deviation(year: float) ->
     away = rng.standard_normal((60, 3))
     positions = 6.878e6 * away / np.linalg.norm(away, axis=-1, keepdims=True)
     date = julian_date(year)
-    truth = true.field(np.full(60, date), positions)
+    truth = true.magnetic_field(np.full(60, date), positions)
     belief = np.array([believed.field(date, position) for position in positions])
     sigma = believed.extrapolation_sigma(date)
     assert sigma == pytest.approx(2.5e-8 * (year - 2030.0), rel=1e-6)

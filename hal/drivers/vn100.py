@@ -25,7 +25,7 @@ from typing import Literal
 
 import numpy as np
 
-from hal.drivers.vn100.protocol import (
+from hal.drivers.vn100_protocol import (
     AsciiLine,
     BinaryPacket,
     OutputLayout,

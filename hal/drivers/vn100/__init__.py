@@ -1,1 +1,0 @@
-"""VectorNav VN-100 inertial unit: serial protocol and driver."""
