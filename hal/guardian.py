@@ -34,7 +34,6 @@ from pathlib import Path
 from typing import Protocol
 
 from hal.buses import system
-from hal.buses.system import SystemClock
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import ACTED, BEAT, BYE, FAILED, READY, CoilReach, GuardianNews
 
@@ -59,15 +58,11 @@ class Watch:
         """Whether the flight process has ended without a goodbye message."""
         self.outages = 0
         """Number of times that the heartbeats have stopped."""
+        self.due_ns = now_ns
+        """Time (ns) at which the next write of zero is due, unless a heartbeat arrives earlier."""
         self._beating = False
-        self._due_ns = now_ns
         self._zeroed = 0
         self._last_ns = now_ns
-
-    @property
-    def due_ns(self) -> int:
-        """Time (ns) at which the next write of zero is due, unless a heartbeat arrives earlier."""
-        return self._due_ns
 
     def over(self, now_ns: int) -> bool:
         """Return whether the guardian may end.
@@ -80,23 +75,23 @@ class Watch:
     def beat(self, now_ns: int) -> None:
         """Record a heartbeat."""
         self._beating = True
-        self._due_ns = now_ns + SILENCE_NS
+        self.due_ns = now_ns + SILENCE_NS
 
     def orphan(self, now_ns: int) -> None:
         """Record that the flight process ended without a goodbye, and schedule a write of zero for now."""
         self.orphaned = True
         self._zeroed = 0
-        self._due_ns = now_ns
+        self.due_ns = now_ns
         self._last_ns = now_ns + PATIENCE_NS
 
     def attempt(self, now_ns: int) -> bool:
         """Return whether a write of zero is due now, and if so, schedule the next write."""
-        if now_ns < self._due_ns:
+        if now_ns < self.due_ns:
             return False
         if self._beating:
             self._beating = False
             self.outages += 1
-        self._due_ns = now_ns + REPEAT_NS
+        self.due_ns = now_ns + REPEAT_NS
         return True
 
     def acknowledged(self) -> None:
@@ -123,8 +118,7 @@ class CoilSwitch:
 
     def __init__(self, opener: Callable[[str], ByteWriter], where: str, numbers: Sequence[int]) -> None:
         """Use I2C writes that consist of three `numbers` each: address, register and value."""
-        self._opener = opener
-        self._where = where
+        self._opener, self._where = opener, where
         self._writes = tuple(zip(numbers[::3], numbers[1::3], numbers[2::3], strict=True))
         self._bus: ByteWriter | None = None
 
@@ -153,9 +147,7 @@ class Guardian:
     """Guardian loop, which monitors the heartbeats until the flight process ends."""
 
     def __init__(self, flight: socket.socket, switch: CoilSwitch, now_ns: Callable[[], int]) -> None:
-        self._flight = flight
-        self._switch = switch
-        self._now_ns = now_ns
+        self._flight, self._switch, self._now_ns = flight, switch, now_ns
         self._watch = Watch(now_ns())
         self._reported = 0  # number of reported outages
         self._failing = False
@@ -217,19 +209,15 @@ def main(arguments: list[str]) -> int:
     switch = CoilSwitch(opened, where, [int(number, 0) for number in numbers])
     if not switch.off():
         sys.stderr.write(f"guardian: the coils' chip at {numbers[0]} on {where} does not answer\n")
-    _survive()
-    Guardian(flight, switch, SystemClock().now_ns).serve()
-    switch.close()
-    return 0
-
-
-def _survive() -> None:
-    """Request real-time priority, locked memory and protection from the OOM killer, ignoring refusals."""
+    # The guardian works without real-time priority, locked memory and protection from the OOM killer too.
     system.prioritise(0, PRIORITY)
     system.lock_memory()
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:
         score.write("-1000")
     os.chdir("/")
+    Guardian(flight, switch, system.SystemClock().now_ns).serve()
+    switch.close()
+    return 0
 
 
 DEVICE = "guardian"
@@ -239,11 +227,7 @@ _RETRY_NS = 1_000_000_000
 _END_TIMEOUT_S = 0.5
 
 
-_NEWS = {
-    READY: GuardianNews.READY,
-    ACTED: GuardianNews.ACTED,
-    FAILED: GuardianNews.FAILED,
-}
+_NEWS = {READY: GuardianNews.READY, ACTED: GuardianNews.ACTED, FAILED: GuardianNews.FAILED}
 
 
 class GuardianLine:
@@ -292,7 +276,10 @@ class GuardianLine:
         if self._lost and now_ns >= self._retry_ns:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
-            self._drop()
+            # The end of the killed guardian is not awaited.
+            self._process.kill()
+            self._ended.append(self._process)
+            self._line.close()
             # A failed start does not raise an error, because the start is retried later.
             with contextlib.suppress(NotResponding):
                 self._process, self._line = self._start()
@@ -320,12 +307,6 @@ class GuardianLine:
         if not words:
             self._lost = True
         return [_NEWS[word] for value in words if (word := bytes([value])) in _NEWS]
-
-    def _drop(self) -> None:
-        """Kill a lost guardian without waiting for its end."""
-        self._process.kill()
-        self._ended.append(self._process)
-        self._line.close()
 
     def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
         try:

@@ -69,9 +69,7 @@ class PySerialPort:
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
-        self._device = device
-        self._write_timeout = write_timeout
-        self._clock = clock
+        self._device, self._write_timeout, self._clock = device, write_timeout, clock
         self._pending: deque[tuple[int, bytes]] = deque()
         self._pending_bytes = 0
         self._lock = threading.Lock()
@@ -174,7 +172,14 @@ class PySerialPort:
                     self._open_again()
                 continue
             if data:
-                self._keep(self._clock.now_ns(), data)
+                arrival_ns = self._clock.now_ns()
+                with self._lock:
+                    self._pending.append((arrival_ns, data))
+                    self._pending_bytes += len(data)
+                    while self._pending_bytes > _PENDING_LIMIT:
+                        _, oldest = self._pending.popleft()
+                        self._pending_bytes -= len(oldest)
+                        self.lost_bytes += len(oldest)
 
     def _open_again(self) -> None:
         """Try to reopen the port until this succeeds or `close` is called.
@@ -192,15 +197,6 @@ class PySerialPort:
                 self._serial = port
             self._failure = ""
             return
-
-    def _keep(self, arrival_ns: int, data: bytes) -> None:
-        with self._lock:
-            self._pending.append((arrival_ns, data))
-            self._pending_bytes += len(data)
-            while self._pending_bytes > _PENDING_LIMIT:
-                _, oldest = self._pending.popleft()
-                self._pending_bytes -= len(oldest)
-                self.lost_bytes += len(oldest)
 
 
 def lock_bus(descriptor: int) -> None:

@@ -42,8 +42,7 @@ class ContainedJob:
         self.name = name
         self.error = ""
         self.served_ns = now_ns()
-        self._job = job
-        self._now_ns = now_ns
+        self._job, self._now_ns = job, now_ns
 
     def run(self) -> None:
         """Run the job once. Never raises."""

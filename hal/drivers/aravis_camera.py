@@ -73,8 +73,7 @@ class AravisCamera:
         """Store the settings without opening the camera or importing Aravis."""
         self.name = settings.name
         self.counts = CameraCounts()
-        self._settings = settings
-        self._clock = clock
+        self._settings, self._clock = settings, clock
         self._kind = PIXEL_KINDS[settings.pixel_format]
         self._numbers = FrameNumbers(_FRAME_IDS)
         self._last: int | None = None

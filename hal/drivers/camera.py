@@ -110,8 +110,7 @@ class ServedCamera:
         """
         self.name = device.name
         self.counts = device.counts
-        self._device = device
-        self._clock = clock
+        self._device, self._clock = device, clock
         self._lock = threading.Lock()
         self._asked: tuple[int, int] | None = None  # pending request: exposure and trigger time (ns)
         self._frame: Frame | None = None

@@ -187,32 +187,19 @@ def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
     return round(current / step), False
 
 
-def mean_current(counts: int, step: float) -> float:
-    """Return the mean current (A) of a signed PWM count, given the current `step` (A) of one count."""
-    return counts * step
-
-
 def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
     """Return the PWM counts of bridge inputs A and B for a signed count (Sease 2013, Table 5.2)."""
-    if counts > 0:
-        return _pulse(counts), FULL_OFF
-    if counts < 0:
-        return FULL_OFF, _pulse(-counts)
-    return FULL_OFF, FULL_OFF
+    pulse = FULL_ON if abs(counts) >= COUNTS else (0, abs(counts))
+    if counts == 0:
+        return FULL_OFF, FULL_OFF
+    return (pulse, FULL_OFF) if counts > 0 else (FULL_OFF, pulse)
 
 
-def brake() -> tuple[PwmCounts, PwmCounts]:
-    """Return the PWM counts of both bridge inputs for braking, so that the coil current is zero.
+BRAKED: tuple[PwmCounts, PwmCounts] = (FULL_ON, FULL_ON)
+"""PWM counts of both bridge inputs for braking, so that the coil current is zero.
 
-    While braking, both ends of the coil are at the supply voltage, even if one leg of the bridge is stuck
-    high.
-    """
-    return FULL_ON, FULL_ON
-
-
-def _pulse(counts: int) -> PwmCounts:
-    return FULL_ON if counts >= COUNTS else (0, counts)
-
+While braking, both ends of the coil are at the supply voltage, even if one leg of the bridge is stuck high.
+"""
 
 Counts = tuple[int, ...]
 """Signed PWM count of each coil, from -4096 to 4096."""
@@ -241,8 +228,7 @@ class CommandMailbox:
         self.command_ns = -1
         self.saturated = False
         self.stale = False
-        self._clock = clock
-        self._stale_ns = stale_ns
+        self._clock, self._stale_ns = clock, stale_ns
         self._wanted: Counts | None = None  # None requests zero
 
     def put(self, command: tuple[float, ...], counts: Counts, saturated: bool) -> None:
@@ -330,10 +316,7 @@ class CoilOutputs:
         self.failing = False
         self.faults = 0
         self.error = ""
-        self._pca = pca
-        self._clock = clock
-        self._settings = settings
-        self._lock = lock
+        self._pca, self._clock, self._settings, self._lock = pca, clock, settings, lock
         self._blocks = settings.blocks()
         self._retry_ns = round(settings.retry_wait * 1e9)
         self._check_ns = 0
@@ -375,7 +358,8 @@ class CoilOutputs:
 
     def write(self, counts: Counts, braked: Axes) -> None:
         """Write signed counts and brakes without retries. Raises DeviceError."""
-        self._write(counts, braked)
+        for first, block in self._channel_blocks(counts, braked):
+            self._pca.write_channels(first, block)
         self._record(counts, braked)
 
     def zero(self, braked: Axes) -> bool:
@@ -422,15 +406,11 @@ class CoilOutputs:
     def _postpone_check(self) -> None:
         self._check_ns = self._clock.now_ns() + _CHECK_PERIOD_NS
 
-    def _write(self, counts: Counts, braked: Axes) -> None:
-        for first, block in self._channel_blocks(counts, braked):
-            self._pca.write_channels(first, block)
-
     def _channel_blocks(self, counts: Counts, braked: Axes) -> list[tuple[int, list[PwmCounts]]]:
         """Return the first channel and the PWM counts of each block of consecutive channels."""
         pins: list[PwmCounts] = []
         for axis, value in enumerate(counts):
-            pins += brake() if axis in braked else inputs_for(value)
+            pins += BRAKED if axis in braked else inputs_for(value)
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _record(self, counts: Counts, braked: Axes) -> None:
@@ -449,8 +429,7 @@ class PwmTorqueCoils:
     """Driver of the torque coils. All methods are thread-safe."""
 
     def __init__(self, pca: PwmOutputs, clock: Clock, settings: CoilSettings) -> None:
-        self._clock = clock
-        self._settings = settings
+        self._clock, self._settings = clock, settings
         self._steps = tuple(current_step(coil.resistance, settings.supply_voltage) for coil in settings.coils)
         self._largest = tuple(
             largest_counts(step, min(settings.current_limit, coil.current_limit))
@@ -586,7 +565,7 @@ class PwmTorqueCoils:
             return OutOfRange(DEVICE, "number of currents", values.size, number, number, "")
         for axis, value in enumerate(values.tolist()):
             if not math.isfinite(value):
-                bound = mean_current(self._largest[axis], self._steps[axis])
+                bound = self._largest[axis] * self._steps[axis]
                 return OutOfRange(DEVICE, f"current of coil {COIL_NAMES[axis]}", value, -bound, bound, "A")
         return None
 
@@ -669,7 +648,7 @@ def _state_of(
     """
     return CoilState(
         command=np.array(command),
-        current=np.array([mean_current(*axis) for axis in zip(written, signed, strict=True)]),
+        current=np.array([counts * step for counts, step in zip(written, signed, strict=True)]),
         written_ns=written_ns,
         saturated=saturated,
         command_ns=command_ns,
@@ -729,8 +708,13 @@ class Drv8830Bridges:
 
     def is_configured(self) -> bool:
         """Return whether every chip has kept its output and reports no fault. Raises NotResponding."""
+        intact = True
         with self._lock:
-            return all([self._is_intact(index) for index in range(len(self._pins))])
+            for index, written in enumerate(self._written):
+                with answering(self.name):
+                    control, fault = self._bus.read_i2c_block_data(self._address + index, CONTROL, 2)
+                intact = intact and control == written and not fault & 1
+        return intact
 
     def holds(self, first: int, channels: Sequence[PwmCounts]) -> bool:
         """Return whether the outputs from channel `first` on were written last and are intact.
@@ -764,11 +748,6 @@ class Drv8830Bridges:
         """Stop the modulation."""
         if self._ticker is not None:
             self._ticker.stop()
-
-    def _is_intact(self, index: int) -> bool:
-        with answering(self.name):
-            control, fault = self._bus.read_i2c_block_data(self._address + index, CONTROL, 2)
-        return control == self._written[index] and not fault & 1
 
     def _modulate(self) -> None:
         """Write the next voltage step of every coil. The clock calls this method periodically."""

@@ -20,12 +20,48 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from hal.interfaces.devices import PowerReading, StringReading
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused, answering
-from hal.interfaces.wires import Clock, I2cBus
+from hal.interfaces.wires import Clock, I2cBus, Ticker
+
+_Reading = TypeVar("_Reading")
+
+
+class PolledMonitor(Generic[_Reading]):
+    """Monitor on an I2C bus that a periodic job of a subclass reads; the lock protects reading and error."""
+
+    _ticker: Ticker
+
+    def __init__(self, bus: I2cBus, clock: Clock) -> None:
+        self._bus, self._clock = bus, clock
+        self._lock = threading.Lock()
+        self._latest: _Reading | None = None
+        self._error = ""
+
+    def latest(self) -> _Reading | None:
+        """Return the newest reading, or None before the first reading."""
+        with self._lock:
+            return self._latest
+
+    def error(self) -> str:
+        """Return the text of the current failure, or an empty text while readings arrive."""
+        with self._lock:
+            return self._error
+
+    def close(self) -> None:
+        """Stop reading. Calling `close` again has no effect."""
+        self._ticker.stop()
+
+    def _word(self, name: str, address: int, register: int) -> int:
+        """Return the big-endian word in a register of the chip `name`. Raises NotResponding."""
+        with answering(name):
+            high, low = self._bus.read_i2c_block_data(address, register, 2)
+        return high << 8 | low
+
 
 CONFIG, SHUNT, BUS, POWER = 0x00, 0x01, 0x02, 0x03
 
@@ -65,7 +101,7 @@ def config_for(range_bits: int) -> int:
     return range_bits << 11 | AVERAGE_128 << 7 | AVERAGE_128 << 3 | CONTINUOUS
 
 
-class Ina219:
+class Ina219(PolledMonitor[PowerReading]):
     """Current monitor that a periodic job reads.
 
     The job also configures it at the start and after a brown-out.
@@ -99,35 +135,17 @@ class Ina219:
                 raise OutOfRange("ina219", quantity, value, 0.0, math.inf, unit)
         if averaged < 1:
             raise OutOfRange("ina219", "averaged conversions", averaged, 1, 100, "")
+        super().__init__(bus, clock)
         self.name = f"ina219 at 0x{address:02x}"
-        self._bus = bus
         self._address = address
-        self._clock = clock
         self._ohm = shunt_ohm
         self._range_bits = range_for(maximum_current, shunt_ohm)
         self._config = config_for(self._range_bits)
-        self._lock = threading.Lock()
         self._conversions: deque[tuple[float, float, bool]] = deque(maxlen=averaged)
-        self._latest: PowerReading | None = None
-        self._error = ""
         self._set_up_before = False
         self._flag_stays = 0
         self._conversion_ns = clock.now_ns()
         self._ticker = clock.ticker("ina219", period_ns, self._serve)
-
-    def latest(self) -> PowerReading | None:
-        """Return the newest reading, or None before the first reading."""
-        with self._lock:
-            return self._latest
-
-    def error(self) -> str:
-        """Return the text of the current failure, or an empty text while readings arrive."""
-        with self._lock:
-            return self._error
-
-    def close(self) -> None:
-        """Stop reading. Calling `close` again has no effect."""
-        self._ticker.stop()
 
     def _serve(self) -> None:
         try:
@@ -197,9 +215,7 @@ class Ina219:
             raise NotResponding(self.name, "had lost its set-up (brown-out?); set up again")
 
     def _read(self, register: int) -> int:
-        with answering(self.name):
-            high, low = self._bus.read_i2c_block_data(self._address, register, 2)
-        return high << 8 | low
+        return self._word(self.name, self._address, register)
 
 
 ADS1115_CONVERSION, ADS1115_CONFIG = 0x00, 0x01
@@ -241,16 +257,15 @@ class StringWiring:
     volt_per_ampere: float
 
 
-class AdsSolarStrings:
+class AdsSolarStrings(PolledMonitor[StringReading]):
     """Monitor of the solar cell strings, which implements `hal.interfaces.devices.SolarStrings`."""
 
     def __init__(
         self, bus: I2cBus, clock: Clock, wirings: Sequence[StringWiring], period_ns: int = 500_000_000
     ) -> None:
         """Measure all strings once per `period_ns`. Raises OutOfRange for an invalid period or wiring."""
+        super().__init__(bus, clock)
         self.name = "solar strings"
-        self._bus = bus
-        self._clock = clock
         self._wirings = tuple(wirings)
         self._parts = sorted({wiring.address for wiring in wirings})
         self._counts = dict.fromkeys(((w.address, w.channel) for w in wirings), 0)
@@ -266,25 +281,8 @@ class AdsSolarStrings:
         if step_ns < _SHORTEST_NS:
             shortest = _SHORTEST_NS * len(self._channels)
             raise OutOfRange(self.name, "period", period_ns * 1e-9, shortest * 1e-9, 60.0, "s")
-        self._lock = threading.Lock()
-        self._latest: StringReading | None = None
-        self._error = ""
         self._step = -1
         self._ticker = clock.ticker("solar strings", step_ns, self._serve)
-
-    def latest(self) -> StringReading | None:
-        """Return the newest reading, or None before the first reading."""
-        with self._lock:
-            return self._latest
-
-    def error(self) -> str:
-        """Return the text of the current failure, or an empty text while readings arrive."""
-        with self._lock:
-            return self._error
-
-    def close(self) -> None:
-        """Stop reading. Calling `close` again has no effect."""
-        self._ticker.stop()
 
     def _serve(self) -> None:
         try:
@@ -296,7 +294,7 @@ class AdsSolarStrings:
                 self._publish()
             word = conversion_of(self._channels[self._step])
             for address in self._parts:
-                with answering(_name(address)):
+                with answering(f"ads1115 at 0x{address:02x}"):
                     self._bus.write_i2c_block_data(address, ADS1115_CONFIG, [word >> 8, word & 0xFF])
         except DeviceError as error:
             # A reading contains all strings, so after a failure the measurement begins again at the first
@@ -306,12 +304,13 @@ class AdsSolarStrings:
                 self._error = str(error)
 
     def _collect(self, address: int, channel: int) -> None:
-        config = self._read(address, ADS1115_CONFIG)
+        name = f"ads1115 at 0x{address:02x}"
+        config = self._word(name, address, ADS1115_CONFIG)
         if config != conversion_of(channel):
             busy = config == conversion_of(channel) & ~START
             cause = "the conversion does not end" if busy else f"Config reads 0x{config:04x} (brown-out?)"
-            raise Refused(_name(address), cause)
-        word = self._read(address, ADS1115_CONVERSION)
+            raise Refused(name, cause)
+        word = self._word(name, address, ADS1115_CONVERSION)
         if (address, channel) in self._counts:
             self._counts[address, channel] = word - 0x10000 if word & 0x8000 else word
 
@@ -327,12 +326,3 @@ class AdsSolarStrings:
         with self._lock:
             self._latest = StringReading(self._clock.now_ns(), currents)
             self._error = ""
-
-    def _read(self, address: int, register: int) -> int:
-        with answering(_name(address)):
-            high, low = self._bus.read_i2c_block_data(address, register, 2)
-        return high << 8 | low
-
-
-def _name(address: int) -> str:
-    return f"ads1115 at 0x{address:02x}"

@@ -29,7 +29,6 @@ import math
 import re
 import struct
 from calendar import monthrange
-from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import reduce
@@ -107,33 +106,14 @@ class Pvt:
         north, east, _ = self.velocity
         ground = round((north * north + east * east) ** 0.5)
         return _PVT.pack(
-            time_of_week_ms,
-            *self.date,
-            self.valid,
+            time_of_week_ms, *self.date, self.valid,
             30,  # time accuracy, ns
-            self.nano,
-            self.fix,
-            self.flags,
-            0,
-            self.satellites,
-            self.longitude,
-            self.latitude,
-            self.height,
-            self.height,
-            self.horizontal,
-            self.vertical,
-            *self.velocity,
-            ground,
-            0,
-            self.speed_accuracy,
-            0,
+            self.nano, self.fix, self.flags, 0, self.satellites, self.longitude, self.latitude,
+            self.height, self.height, self.horizontal, self.vertical, *self.velocity, ground, 0,
+            self.speed_accuracy, 0,
             150,  # position dilution of precision, units of 0.01
-            self.flags3,
-            0,
-            0,
-            0,
-            0,
-        )
+            self.flags3, 0, 0, 0, 0,
+        )  # fmt: skip
 
 
 def unpack_pvt(payload: bytes) -> Pvt:
@@ -143,21 +123,9 @@ def unpack_pvt(payload: bytes) -> Pvt:
     (_, year, month, day, hour, minute, second, valid, _, nano, fix, flags, _, satellites) = values[:14]
     longitude, latitude, height, _, horizontal, vertical, north, east, down, _, _, accuracy = values[14:26]
     return Pvt(
-        date=(year, month, day, hour, minute, second),
-        nano=nano,
-        valid=valid,
-        fix=fix,
-        flags=flags,
-        satellites=satellites,
-        longitude=longitude,
-        latitude=latitude,
-        height=height,
-        horizontal=horizontal,
-        vertical=vertical,
-        velocity=(north, east, down),
-        speed_accuracy=accuracy,
-        flags3=0 if old else values[28],
-    )
+        (year, month, day, hour, minute, second), nano, valid, fix, flags, satellites, longitude, latitude,
+        height, horizontal, vertical, (north, east, down), accuracy, 0 if old else values[28],
+    )  # fmt: skip
 
 
 def checksum(body: bytes) -> bytes:
@@ -311,9 +279,7 @@ class UbloxReceiver:
         """
         if not 0.1 <= period_ns / SECOND_NS <= 60.0:
             raise OutOfRange(DEVICE, "period", period_ns / SECOND_NS, 0.1, 60.0, "s")
-        self._port = port
-        self._clock = clock
-        self._period_ns = period_ns
+        self._port, self._clock, self._period_ns = port, clock, period_ns
         self._earliest_ns = earliest_ns
         self._silence_ns = max(SILENCE_NS, 2 * period_ns)
         self._parser = UbxParser()
@@ -344,15 +310,13 @@ class UbloxReceiver:
             for kind, payload, behind in parser.feed(data):
                 self._arrivals_ns["frame"] = arrival_ns
                 sent_ns = arrival_ns - behind * _BITS * SECOND_NS // self._port.baud_rate
-                reading = self._reading(kind, payload, sent_ns)
-                if reading is not None:
-                    readings.append(reading)
+                readings.append(self._reading(kind, payload, sent_ns))
             if parser.sentences > sentences:
                 self._arrivals_ns["sentence"] = arrival_ns
         self._search_rate()
         if self._port.baud_rate == self._own_rate:
             self._set_up()
-        return readings
+        return [reading for reading in readings if reading is not None]
 
     def link(self) -> GpsLink:
         """Return the counters of the serial line."""
@@ -544,13 +508,12 @@ def reading_of(
             1024 weeks, and any other date outside the 1024 weeks that follow counts as impossible.
         length: length of the payload, bytes.
     """
-    limits = (
+    _require(
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),
         ("longitude", pvt.longitude * 1e-7, -180.0, 180.0, "deg"),
         ("height", pvt.height * 1e-3, -1e4, _HIGHEST, "m"),
         ("speed", 1e-3 * math.hypot(*pvt.velocity), 0.0, _FASTEST, "m/s"),
     )
-    _require(limits)
     position, axes = _position(pvt)
     timed = pvt.valid & DATE_AND_TIME == DATE_AND_TIME
     utc_ns, rolled_over = _utc_ns(pvt, earliest_ns) if timed else (0, False)
@@ -574,7 +537,7 @@ def reading_of(
     )
 
 
-def _require(limits: Iterable[tuple[str, float, float, float, str]]) -> None:
+def _require(*limits: tuple[str, float, float, float, str]) -> None:
     """Raise OutOfRange for the first value out of bounds among tuples (name, value, low, high, unit)."""
     for name, value, low, high, unit in limits:
         if not low <= value <= high:
@@ -584,25 +547,21 @@ def _require(limits: Iterable[tuple[str, float, float, float, str]]) -> None:
 def _utc_ns(pvt: Pvt, earliest_ns: int) -> tuple[int, bool]:
     """Return UTC (ns since 1970) and whether it was moved by 1024 weeks. Raises OutOfRange."""
     year, month, day, hour, minute, second = pvt.date
-    _require((("year", year, 1970, 2200, ""), ("month", month, 1, 12, "")))
+    _require(("year", year, 1970, 2200, ""), ("month", month, 1, 12, ""))
     _require(
-        (
-            ("day", day, 1, monthrange(year, month)[1], ""),
-            ("hour", hour, 0, 23, ""),
-            ("minute", minute, 0, 59, ""),
-            ("second", second, 0, 60, ""),
-        )
+        ("day", day, 1, monthrange(year, month)[1], ""),
+        ("hour", hour, 0, 23, ""),
+        ("minute", minute, 0, 59, ""),
+        ("second", second, 0, 60, ""),
     )
     # Second 60 is a leap second, which is converted to the first second of the next minute.
     whole = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC).timestamp()
     utc_ns = round(whole) * SECOND_NS + (second > 59) * SECOND_NS + pvt.nano
     if earliest_ns - ROLLOVER_NS <= utc_ns < earliest_ns:
         return utc_ns + ROLLOVER_NS, True
-    last_ns = earliest_ns + ROLLOVER_NS
-    if not earliest_ns <= utc_ns < last_ns:
-        first, last = (
-            datetime.fromtimestamp(limit // SECOND_NS, UTC).year for limit in (earliest_ns, last_ns)
-        )
+    limits_ns = earliest_ns, earliest_ns + ROLLOVER_NS
+    if not limits_ns[0] <= utc_ns < limits_ns[1]:
+        first, last = (datetime.fromtimestamp(limit // SECOND_NS, UTC).year for limit in limits_ns)
         raise OutOfRange(DEVICE, "year", year, first, last, "")
     return utc_ns, False
 
@@ -660,20 +619,17 @@ class NmeaReceiver:
                     self._bad += 1
                     continue
                 self._sentences += 1
-                reading = self._take(found[1].decode("ascii").split(","), arrival_ns, len(found[0]))
-                readings += [] if reading is None else [reading]
+                readings.append(self._take(found[1].decode("ascii").split(","), arrival_ns, len(found[0])))
             if len(self._buffer) - taken > _LONGEST:  # longer than any sentence
                 self._discarded += len(self._buffer) - taken
                 taken = len(self._buffer)
             self._buffer = self._buffer[taken:]
-        return readings
+        return [reading for reading in readings if reading is not None]
 
     def link(self) -> GpsLink:
         """Return the counters of the serial line."""
         return GpsLink(
             bytes_received=self._bytes,
-            frames=0,
-            long_frames=0,
             bad_checksum=self._bad,
             discarded_bytes=self._discarded,
             sentences=self._sentences,
@@ -681,9 +637,6 @@ class NmeaReceiver:
             unresolved=self._unresolved,
             no_fix=self._no_fix,
             rolled_over=self._rolled_over,
-            refused=0,
-            refusal="",
-            protocol=0.0,
             condition=self._condition,
             last_byte_ns=self._last_byte_ns,
         )

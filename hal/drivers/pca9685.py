@@ -83,9 +83,7 @@ class Pca9685:
     """
 
     def __init__(self, bus: I2cBus, address: int, clock: Clock) -> None:
-        self._bus = bus
-        self._address = address
-        self._clock = clock
+        self._bus, self._address, self._clock = bus, address, clock
         self._prescale = prescale_for(FREQUENCY_HZ)
         self.name = _name(address)
 

@@ -29,7 +29,6 @@ from dataclasses import dataclass
 from enum import Enum
 from fcntl import ioctl
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -69,40 +68,39 @@ EXPOSURE_AUTO, EXPOSURE_MANUAL = 0x009A_0901, 1
 EXPOSURE_ABSOLUTE, EXPOSURE_UNIT_NS = 0x009A_0902, 100_000
 
 
-def _words(names: str) -> list[tuple[str, type[ctypes.c_uint32]]]:
-    """Return ctypes definitions of unsigned 32-bit fields with the given names."""
-    return [(name, ctypes.c_uint32) for name in names.split()]
+_KINDS: dict[str, Any] = {
+    "I": ctypes.c_uint32, "i": ctypes.c_int32, "B": ctypes.c_uint8, "c": ctypes.c_char, "l": ctypes.c_long
+}  # fmt: skip
+
+
+def _fields(layout: str) -> list[tuple[str, Any]]:
+    """Return ctypes fields; a word `name:16c` is an array of a kind in `_KINDS`, a word `name` a c_uint32."""
+    fields: list[tuple[str, Any]] = []
+    for word in layout.split():
+        name, _, kind = word.partition(":")
+        basic = _KINDS[kind[-1:] or "I"]
+        fields.append((name, basic * int(kind[:-1]) if kind[:-1] else basic))
+    return fields
 
 
 class Capability(ctypes.Structure):
     """Structure v4l2_capability of the kernel."""
 
-    _fields_ = (
-        ("driver", ctypes.c_char * 16),
-        ("card", ctypes.c_char * 32),
-        ("bus_info", ctypes.c_char * 32),
-        *_words("version capabilities device_caps"),
-        ("reserved", ctypes.c_uint32 * 3),
-    )
+    _fields_ = _fields("driver:16c card:32c bus_info:32c version capabilities device_caps reserved:3I")
 
 
 class FormatDescription(ctypes.Structure):
     """Structure v4l2_fmtdesc of the kernel."""
 
-    _fields_ = (
-        *_words("index type flags"),
-        ("description", ctypes.c_char * 32),
-        *_words("pixelformat mbus_code"),
-        ("reserved", ctypes.c_uint32 * 3),
-    )
+    _fields_ = _fields("index type flags description:32c pixelformat mbus_code reserved:3I")
 
 
 class PixelFormat(ctypes.Structure):
     """Structure v4l2_pix_format of the kernel."""
 
-    _fields_ = (
-        *_words("width height pixelformat field bytesperline sizeimage colorspace priv flags"),
-        *_words("encoding quantization transfer"),
+    _fields_ = _fields(
+        "width height pixelformat field bytesperline sizeimage colorspace priv flags encoding quantization"
+        " transfer"
     )
 
 
@@ -120,28 +118,17 @@ class Format(ctypes.Structure):
 class RequestBuffers(ctypes.Structure):
     """Structure v4l2_requestbuffers of the kernel."""
 
-    _fields_ = (
-        *_words("count type memory capabilities"),
-        ("flags", ctypes.c_uint8),
-        ("reserved", ctypes.c_uint8 * 3),
-    )
+    _fields_ = _fields("count type memory capabilities flags:B reserved:3B")
 
 
 class TimeValue(ctypes.Structure):
     """Structure timeval of the kernel."""
 
-    _fields_ = (("seconds", ctypes.c_long), ("microseconds", ctypes.c_long))
+    _fields_ = _fields("seconds:l microseconds:l")
 
 
 class _TimeCode(ctypes.Structure):
-    _fields_ = (
-        *_words("type flags"),
-        ("frames", ctypes.c_uint8),
-        ("seconds", ctypes.c_uint8),
-        ("minutes", ctypes.c_uint8),
-        ("hours", ctypes.c_uint8),
-        ("userbits", ctypes.c_uint8 * 4),
-    )
+    _fields_ = _fields("type flags frames:B seconds:B minutes:B hours:B userbits:4B")
 
 
 class _BufferUnion(ctypes.Union):
@@ -152,52 +139,41 @@ class Buffer(ctypes.Structure):
     """Structure v4l2_buffer of the kernel."""
 
     _fields_ = (
-        *_words("index type bytesused flags field"),
+        *_fields("index type bytesused flags field"),
         ("timestamp", TimeValue),
         ("timecode", _TimeCode),
-        *_words("sequence memory"),
+        *_fields("sequence memory"),
         ("m", _BufferUnion),
-        *_words("length reserved2"),
-        ("request_fd", ctypes.c_int32),
+        *_fields("length reserved2 request_fd:i"),
     )
 
 
 class Fraction(ctypes.Structure):
     """Structure v4l2_fract of the kernel."""
 
-    _fields_ = (("numerator", ctypes.c_uint32), ("denominator", ctypes.c_uint32))
+    _fields_ = _fields("numerator denominator")
 
 
 class StreamParameters(ctypes.Structure):
     """Structure v4l2_streamparm of the kernel, for video capture."""
 
     _fields_ = (
-        *_words("type capability capturemode"),
+        *_fields("type capability capturemode"),
         ("timeperframe", Fraction),
-        *_words("extendedmode readbuffers"),
-        ("reserved", ctypes.c_uint8 * 176),
+        *_fields("extendedmode readbuffers reserved:176B"),
     )
 
 
 class ControlValue(ctypes.Structure):
     """Structure v4l2_control of the kernel."""
 
-    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
+    _fields_ = _fields("id value:i")
 
 
 class QueryControl(ctypes.Structure):
     """Structure v4l2_queryctrl of the kernel."""
 
-    _fields_ = (
-        *_words("id type"),
-        ("name", ctypes.c_char * 32),
-        ("minimum", ctypes.c_int32),
-        ("maximum", ctypes.c_int32),
-        ("step", ctypes.c_int32),
-        ("default_value", ctypes.c_int32),
-        ("flags", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32 * 2),
-    )
+    _fields_ = _fields("id type name:32c minimum:i maximum:i step:i default_value:i flags reserved:2I")
 
 
 def _request(direction: int, number: int, structure: type[ctypes.Structure] | type[ctypes.c_int]) -> int:
@@ -244,16 +220,6 @@ class PixelLayout:
 
 
 @dataclass(frozen=True, slots=True)
-class ControlRange:
-    """Name and value range of a camera control."""
-
-    name: str
-    minimum: int
-    maximum: int
-    step: int
-
-
-@dataclass(frozen=True, slots=True)
 class Filled:
     """Buffer with a received frame: index, used bytes, time stamp, sequence number and flags."""
 
@@ -272,14 +238,6 @@ class VideoDevice:
         self._descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
         self._maps: list[mmap.mmap] = []
         self._streaming = False
-
-    def __enter__(self) -> VideoDevice:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def capability(self) -> tuple[str, str, int]:
         """Return the driver name, the camera name and the capability bits of the device."""
@@ -308,24 +266,20 @@ class VideoDevice:
         self._ask(S_FMT, answer)
         return PixelLayout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
 
-    def set_interval(self, interval_ns: int) -> int:
-        """Request a frame interval (ns) and return the resulting interval, or 0 if it cannot be set."""
+    def set_interval(self, interval_ns: int) -> None:
+        """Request a frame interval (ns), if the device supports frame intervals."""
         answer = StreamParameters(type=VIDEO_CAPTURE)
         try:
             self._ask(G_PARM, answer)
-            if not answer.capability & CAP_TIME_PER_FRAME:
-                return 0
-            answer.timeperframe = Fraction(-(-interval_ns // _MICROSECOND_NS), 1_000_000)
-            self._ask(S_PARM, answer)
+            if answer.capability & CAP_TIME_PER_FRAME:
+                answer.timeperframe = Fraction(-(-interval_ns // _MICROSECOND_NS), 1_000_000)
+                self._ask(S_PARM, answer)
         except OSError as error:
-            if error.errno in {errno.ENOTTY, errno.EINVAL}:
-                return 0
-            raise
-        time = answer.timeperframe
-        return time.numerator * _SECOND_NS // time.denominator if time.denominator else 0
+            if error.errno not in {errno.ENOTTY, errno.EINVAL}:
+                raise
 
-    def control_range(self, control: int) -> ControlRange | None:
-        """Return the value range of a control, or None if the device does not have the control."""
+    def control_range(self, control: int) -> tuple[int, int] | None:
+        """Return the minimum and maximum of a control, or None if the device does not have the control."""
         answer = QueryControl(id=control)
         try:
             self._ask(QUERYCTRL, answer)
@@ -333,9 +287,7 @@ class VideoDevice:
             if error.errno in {errno.EINVAL, errno.ENOTTY}:
                 return None
             raise
-        if answer.flags & CONTROL_DISABLED:
-            return None
-        return ControlRange(_text(answer.name), answer.minimum, answer.maximum, max(answer.step, 1))
+        return None if answer.flags & CONTROL_DISABLED else (answer.minimum, answer.maximum)
 
     def set_control(self, control: int, value: int) -> int:
         """Set a control and return the resulting value of the control."""
@@ -468,9 +420,7 @@ class ExposureTiming:
     def __init__(self, settings: V4l2Settings, clock: Clock, counts: CameraCounts) -> None:
         """Use the camera's settings and clock, and count contradictory frames in `counts`."""
         self._name = settings.path
-        self._settings = settings
-        self._clock = clock
-        self._counts = counts
+        self._settings, self._clock, self._counts = settings, clock, counts
         self._arrival_stamps = False
         self._contradictions = 0
         self._absurd = 0  # number of consecutive frames with an impossible time stamp
@@ -478,7 +428,10 @@ class ExposureTiming:
 
     def begin(self, driver: str) -> None:
         """Reset the detection for a newly opened camera, given the name of its kernel driver."""
-        self._arrival_stamps = driver == "uvcvideo" and not _uvc_uses_device_clock()
+        uses_device_clock = False  # default of the kernel
+        with contextlib.suppress(OSError):
+            uses_device_clock = UVC_STAMPS.read_text(encoding="ascii").strip() not in {"0", "N"}
+        self._arrival_stamps = driver == "uvcvideo" and not uses_device_clock
         self._contradictions = self._absurd = self._stamp_ns = 0
 
     def start_of(self, filled: Filled, exposure_ns: int) -> int | None:
@@ -534,29 +487,6 @@ class ExposureTiming:
         return True
 
 
-def _uvc_uses_device_clock() -> bool:
-    try:
-        return UVC_STAMPS.read_text(encoding="ascii").strip() not in {"0", "N"}
-    except OSError:
-        return False  # default of the kernel
-
-
-def open_device(name: str) -> VideoDevice:
-    """Open a video device. Raises NotResponding or Refused with advice for the user."""
-    try:
-        return VideoDevice(name)
-    except FileNotFoundError as error:
-        raise NotResponding(
-            name,
-            "no such camera: is it plugged in, and does a udev rule give it this name "
-            "(deploy/99-knightcube.rules)? `v4l2-ctl --list-devices` lists the connected cameras",
-        ) from error
-    except PermissionError as error:
-        raise Refused(name, "no permission: add the user to the group video") from error
-    except OSError as error:
-        raise meaning(name, error, "opening it") from error
-
-
 def meaning(name: str, error: OSError, doing: str) -> DeviceError:
     """Return the DeviceError that corresponds to an errno of the kernel."""
     if error.errno in {errno.ENODEV, errno.ENXIO}:
@@ -566,14 +496,6 @@ def meaning(name: str, error: OSError, doing: str) -> DeviceError:
     if error.errno == errno.ENOTTY:
         return Refused(name, f"is not a V4L2 device (found {doing})")
     return NotResponding(name, f"failed while {doing}: {os.strerror(error.errno or errno.EIO)}")
-
-
-def identity(name: str, device: VideoDevice) -> tuple[str, str]:
-    """Return the driver name and the camera name. Raises Refused if the device cannot capture video."""
-    driver, card, can = device.capability()
-    if not (can & CAP_VIDEO_CAPTURE and can & CAP_STREAMING):
-        raise Refused(name, f"{card} ({driver}) cannot capture video: use its capture device")
-    return driver, card
 
 
 def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelLayout:
@@ -606,14 +528,14 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
     for control in (GAIN, ANALOGUE_GAIN):
         known = device.control_range(control)
         if known is not None:
-            if not known.minimum <= gain <= known.maximum:
-                raise OutOfRange(settings.path, "gain", gain, known.minimum, known.maximum, "")
+            if not known[0] <= gain <= known[1]:
+                raise OutOfRange(settings.path, "gain", gain, *known, "")
             device.set_control(control, gain)
             return
     raise Refused(settings.path, "has no adjustable gain: omit `gain`")
 
 
-def manual_exposures(name: str, device: VideoDevice, card: str) -> ControlRange:
+def manual_exposures(name: str, device: VideoDevice, card: str) -> tuple[int, int]:
     """Switch automatic exposure off and return the range of exposure times.
 
     Raises Refused if the camera has no control of the exposure time.
@@ -642,13 +564,12 @@ class V4l2Camera:
         """Store the settings without opening the device."""
         self.name = settings.path
         self.counts = CameraCounts()
-        self._settings = settings
-        self._clock = clock
+        self._settings, self._clock = settings, clock
         self._pixels = settings.pixels
         self._timing = ExposureTiming(settings, clock, self.counts)
         self._device: VideoDevice | None = None
         self._layout = PixelLayout(0, 0, "", 0)
-        self._exposures: ControlRange | None = None
+        self._exposures = 1, _EXPOSURE_LIMIT
         self._asked_steps = 0
         self._exposure_ns = 0  # exposure time reported by the camera
         self._numbers = FrameNumbers(_SEQUENCE_MODULUS)
@@ -661,7 +582,18 @@ class V4l2Camera:
     def open(self) -> None:
         """Open the device and start streaming. Raises NotResponding, Refused or OutOfRange with advice."""
         self.close()
-        self._device = open_device(self.name)
+        try:
+            self._device = VideoDevice(self.name)
+        except FileNotFoundError as error:
+            raise NotResponding(
+                self.name,
+                "no such camera: is it plugged in, and does a udev rule give it this name "
+                "(deploy/99-knightcube.rules)? `v4l2-ctl --list-devices` lists the connected cameras",
+            ) from error
+        except PermissionError as error:
+            raise Refused(self.name, "no permission: add the user to the group video") from error
+        except OSError as error:
+            raise meaning(self.name, error, "opening it") from error
         try:
             self._set_up(self._device)
         except OSError as error:
@@ -669,8 +601,7 @@ class V4l2Camera:
 
     def check(self, exposure_ns: int) -> None:
         """Raise OutOfRange for an exposure time (ns) that the camera does not support."""
-        known = self._exposures
-        low, high = (known.minimum, known.maximum) if known else (1, _EXPOSURE_LIMIT)
+        low, high = self._exposures
         if not low <= round(exposure_ns / EXPOSURE_UNIT_NS) <= high:
             unit = EXPOSURE_UNIT_NS * 1e-9
             raise OutOfRange(self.name, "exposure", exposure_ns * 1e-9, low * unit, high * unit, "s")
@@ -728,7 +659,9 @@ class V4l2Camera:
 
     def _set_up(self, device: VideoDevice) -> None:
         settings = self._settings
-        driver, card = identity(self.name, device)
+        driver, card, can = device.capability()
+        if not (can & CAP_VIDEO_CAPTURE and can & CAP_STREAMING):
+            raise Refused(self.name, f"{card} ({driver}) cannot capture video: use its capture device")
         self._timing.begin(driver)
         self._layout = set_format(device, settings, card)
         device.set_interval(settings.exposure_ns)
@@ -771,8 +704,12 @@ class V4l2Camera:
             interval_ns = filled.stamp_ns - before[1]
             if self._timing.contradicts(interval_ns, self._exposure_ns):
                 return None
-        pixels = self._pixels_of(device, filled)
-        if pixels is None:
+        layout = self._layout
+        data = device.data(filled.index, filled.used_bytes)
+        try:
+            pixels = self._pixels.image(data, layout.columns, layout.rows, layout.stride)
+        except PixelError:
+            self.counts.spoiled += 1
             return None
         return Frame(number, start_ns, self._exposure_ns, self._clock.now_ns(), pixels)
 
@@ -787,13 +724,3 @@ class V4l2Camera:
             self.counts.short += 1
             return None
         return self._timing.start_of(filled, self._exposure_ns)
-
-    def _pixels_of(self, device: VideoDevice, filled: Filled) -> npt.NDArray[Any] | None:
-        """Return the image in a buffer, or None if the data are damaged."""
-        layout = self._layout
-        data = device.data(filled.index, filled.used_bytes)
-        try:
-            return self._pixels.image(data, layout.columns, layout.rows, layout.stride)
-        except PixelError:
-            self.counts.spoiled += 1
-            return None

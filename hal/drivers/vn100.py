@@ -224,8 +224,7 @@ class Recovery:
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
         self.completed = 0
         self.refusal = ""
-        self._port = port
-        self._settings = settings
+        self._port, self._settings = port, settings
         self._own_rate = port.baud_rate
         self._others = [rate for rate in BAUD_RATES if rate != port.baud_rate]
         self._other = 0
@@ -442,8 +441,7 @@ class ReadingConverter:
         self._map[7:10, 7:10] = magnetometer @ settings.mounting * TESLA_PER_GAUSS
         self._map[10:, 10:] = settings.mounting
         self._field_offset = magnetometer @ settings.field_bias
-        self._byte_ns = byte_ns
-        self._on_reset = on_reset
+        self._byte_ns, self._on_reset = byte_ns, on_reset
         self._places: dict[bytes, _Places | None] = {}
         self._device_ns = 0
         self._period_ns = 1_000_000_000 // settings.rate_hz
@@ -629,9 +627,7 @@ class Vn100:
         """
         check(settings, port.baud_rate)
         self._unit_error = ""
-        self._port = port
-        self._clock = clock
-        self._settings = settings
+        self._port, self._clock, self._settings = port, clock, settings
         byte_ns = 10e9 / port.baud_rate
         self._parser = StreamParser(byte_ns, _LONGEST_PACKET)
         self._recovery = Recovery(port, settings)

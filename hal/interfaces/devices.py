@@ -131,21 +131,21 @@ class GpsLink:
         last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
     """
 
-    bytes_received: int
-    frames: int
-    long_frames: int
-    bad_checksum: int
-    discarded_bytes: int
-    sentences: int
-    out_of_range: int
-    unresolved: int
-    no_fix: int
-    rolled_over: int
-    refused: int
-    refusal: str
-    protocol: float
-    condition: str
-    last_byte_ns: int
+    bytes_received: int = 0
+    frames: int = 0
+    long_frames: int = 0
+    bad_checksum: int = 0
+    discarded_bytes: int = 0
+    sentences: int = 0
+    out_of_range: int = 0
+    unresolved: int = 0
+    no_fix: int = 0
+    rolled_over: int = 0
+    refused: int = 0
+    refusal: str = ""
+    protocol: float = 0.0
+    condition: str = ""
+    last_byte_ns: int = -1
 
 
 @dataclass(frozen=True, slots=True)

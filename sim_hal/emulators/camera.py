@@ -73,12 +73,8 @@ class EmulatedCamera:
         moving: Moving = no_objects,
     ) -> None:
         """Connect the camera. The last row of a rolling shutter has the delay `scan_ns`."""
-        self._motion = motion
-        self._expose = expose
-        self._now_ns = now_ns
-        self._readout_ns = readout_ns
-        self._mounting = mounting
-        self._scan_ns = scan_ns
+        self._motion, self._expose, self._now_ns = motion, expose, now_ns
+        self._readout_ns, self._mounting, self._scan_ns = readout_ns, mounting, scan_ns
         self._moving = moving
         self._sequence = 0
         self._exposure: _Exposure | None = None

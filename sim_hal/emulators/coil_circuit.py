@@ -181,9 +181,7 @@ class CoilCircuit:
             )
             for coil in truth.coils
         )
-        self._generator = generator
-        self._now_ns = now_ns
-        self._uncertainty = uncertainty
+        self._generator, self._now_ns, self._uncertainty = generator, now_ns, uncertainty
         self._bus_voltage = truth.supply_voltage if bus_voltage is None else bus_voltage
         self._supply_voltage = truth.supply_voltage
         count = len(self._coils)
@@ -292,8 +290,7 @@ class EmulatedIna219:
         shunt_ohm: float = 0.1,
     ) -> None:
         self.address = address
-        self._now_ns = now_ns
-        self._measure = measure
+        self._now_ns, self._measure = now_ns, measure
         self._ohm = shunt_ohm
         self.gain = 1.0
         self.frozen: dict[int, int] = {}

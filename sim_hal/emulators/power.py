@@ -274,8 +274,7 @@ class EmulatedAds1115:
 
     def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:
         self.address = address
-        self._now_ns = now_ns
-        self._measure = measure
+        self._now_ns, self._measure = now_ns, measure
         self.brown_out()
 
     def brown_out(self) -> None:

@@ -86,8 +86,7 @@ class Wire:
         """
         self.faults = SOUND
         self.lost_bytes = 0
-        self._rng = rng
-        self._capacity = capacity
+        self._rng, self._capacity = rng, capacity
         self._messages: deque[_Message] = deque()
         self._waiting = 0
         self._free_ns = -NEVER
@@ -182,8 +181,7 @@ class HostEnd:
     def __init__(self, line: EmulatedSerialLine, now_ns: Callable[[], int], baud_rate: int) -> None:
         self.baud_rate = baud_rate
         self.unplugged = False
-        self._line = line
-        self._now_ns = now_ns
+        self._line, self._now_ns = line, now_ns
 
     def receive(self) -> list[tuple[int, bytes]]:
         """Return the bytes that have arrived since the last call. Raises NotResponding."""

@@ -326,8 +326,7 @@ class AttitudeCommands:
 
     def __init__(self, registers: RegisterFile, gyro_bias: FloatArray) -> None:
         """Store the filter's estimate `gyro_bias` (3,), rad/s, sensor axes, which SGB and SFB save."""
-        self._registers = registers
-        self._gyro_bias = gyro_bias
+        self._registers, self._gyro_bias = registers, gyro_bias
         self._turn: FloatArray | None = None
         self.status = 0
 
@@ -551,9 +550,7 @@ class Vn100Emulator:
         """Connect a running unit at `now_ns`; the function `sense` returns the motion at a time."""
         self.registers = RegisterFile()
         self.alter: Callable[[Vn100Sample], Vn100Sample] | None = None
-        self._sense = sense
-        self._line = line
-        self._settings = settings
+        self._sense, self._line, self._settings = sense, line, settings
         bias = settings.gyro_bias
         self._sensors = Sensors(
             rng, settings.noise, settings.mounting, settings.reference, bias, settings.free_fall

@@ -123,8 +123,7 @@ class Sensors:
         the reference frame. `gyro_bias` (3,) is in rad/s. In `free_fall` the unit cannot measure the
         vertical, so its attitude drifts at random.
         """
-        self._rng = rng
-        self._profile = profile
+        self._rng, self._profile = rng, profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
         # The measured quaternion is bilinear in the true and the error quaternion, so a matrix product is
         # enough.

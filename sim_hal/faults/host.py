@@ -151,8 +151,7 @@ class _SteppedClock:
     """A clock whose UTC may jump, while its monotonic time is unchanged."""
 
     def __init__(self, clock: Clock, faults: ProcessFaults) -> None:
-        self._clock = clock
-        self._faults = faults
+        self._clock, self._faults = clock, faults
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._clock, name)
@@ -202,8 +201,7 @@ class _FaultyRunner:
     ) -> None:
         self._runner = runner
         self._specs = {spec.name: spec for spec in specs}
-        self._result = result
-        self._faults = faults
+        self._result, self._faults = result, faults
         self._modelled: dict[str, _ModelledOutcome] = {}
         self._late: list[tuple[int, Any]] = []
 

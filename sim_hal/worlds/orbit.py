@@ -381,9 +381,7 @@ class Environment:
     ) -> None:
         """Begin at a Julian date UTC; `multiples` scales ring current, diurnal bulge and random walks."""
         self._multiples = multiples = multiples or Disturbances()
-        self._elements = elements
-        self._julian_date = julian_date
-        self._generator = generator
+        self._elements, self._julian_date, self._generator = elements, julian_date, generator
         self._storm = multiples.ring_current * RING_CURRENT
         self._phases = generator.uniform(0.0, 2.0 * math.pi, 3)
         self._noise: FloatArray = generator.standard_normal(4)

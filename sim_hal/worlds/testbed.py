@@ -92,9 +92,7 @@ class Testbed:
         start_ns: int = 0,
     ) -> None:
         """Create the testbed with a body held at `angle` rad until its release with `release_rate` rad/s."""
-        self._model = model
-        self._currents = currents
-        self._release_rate = release_rate
+        self._model, self._currents, self._release_rate = model, currents, release_rate
         self._release_ns: int | None = None
         self._held = True
         self.time_ns = start_ns

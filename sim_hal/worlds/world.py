@@ -263,8 +263,7 @@ class TruthRecorder:
 
     def watch(self, world: World, description: Mapping[str, FloatArray] | None = None) -> None:
         """Set the world whose state is recorded, and the true description of its satellite, if known."""
-        self._world = world
-        self._description = description
+        self._world, self._description = world, description
 
     def begin(self, epoch_ns: int) -> None:
         """Begin recording at mission time zero, which is `epoch_ns`."""

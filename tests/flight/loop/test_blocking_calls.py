@@ -28,8 +28,8 @@ ALLOWED = {
     "hal/drivers/coils.py:CommandMailbox.withdraw": ("_thread.", _LOCK),
     "hal/drivers/coils.py:PwmTorqueCoils.command": ("_thread.", _LOCK),
     "hal/drivers/coils.py:PwmTorqueCoils.state": ("_thread.", _LOCK),
-    "hal/drivers/current_monitors.py:Ina219.error": ("_thread.", _LOCK),
-    "hal/drivers/current_monitors.py:Ina219.latest": ("_thread.", _LOCK),
+    "hal/drivers/current_monitors.py:PolledMonitor.error": ("_thread.", _LOCK),
+    "hal/drivers/current_monitors.py:PolledMonitor.latest": ("_thread.", _LOCK),
 }
 """Functions whose calls may block on the control thread, by the start of the call's name, with the reason."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ VIRTUAL = virtual_camera()
 @pytest.mark.skipif(VIRTUAL is None, reason="this kernel has no virtual camera: `modprobe vivid` makes one")
 def test_a_virtual_camera_of_the_kernel_delivers_frames_and_is_refused_for_its_missing_control() -> None:
     assert VIRTUAL is not None
-    with VideoDevice(VIRTUAL) as device:
+    with closing(VideoDevice(VIRTUAL)) as device:
         assert "GREY" in list(device.formats())
         layout = device.set_format(640, 360, "GREY")
         assert (layout.fourcc, layout.columns, layout.rows) == ("GREY", 640, 360)
@@ -67,7 +68,7 @@ def test_the_first_whole_exposure_after_the_trigger_is_taken(kernel: IoctlCamera
 def test_frames_that_lay_in_the_queue_are_not_the_triggered_one(
     kernel: IoctlCamera, clock: ManualClock
 ) -> None:
-    with VideoDevice(str(kernel.path)) as device:
+    with closing(VideoDevice(str(kernel.path))) as device:
         device.set_format(64, 48, "GREY")
         assert device.start(3) == 3
         # The driver dequeues no frame. Three old frames are in the queue, and later frames are lost.

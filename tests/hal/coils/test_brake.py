@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hal.drivers.coils import brake
+from hal.drivers.coils import BRAKED
 from hal.drivers.pca9685 import FULL_ON
 from hal.interfaces.devices import NO_AXES
 from hal.interfaces.errors import Refused
@@ -36,7 +36,7 @@ def test_a_leg_stuck_high_drives_its_coil_at_zero_and_a_brake_ends_it(
     rig.command(0.0, 0.0, 0.0)
     assert rig.currents() == pytest.approx([0.0, sign * FULL, 0.0])
     rig.coils.brake(Y)
-    assert brake() == (FULL_ON, FULL_ON)
+    assert BRAKED == (FULL_ON, FULL_ON)
     assert rig.currents() == [0.0, 0.0, 0.0]
     assert rig.coils.state().braked == Y
 

@@ -11,7 +11,6 @@ from hal.drivers.coils import (
     current_step,
     inputs_for,
     largest_counts,
-    mean_current,
 )
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON
 
@@ -45,12 +44,12 @@ def test_no_counts_are_ever_equal_and_both_inputs_are_never_driven_at_once() -> 
 def test_full_drive_is_the_thesis_maximum_current() -> None:
     """The largest current is 3.4 V / 23 ohm = 0.1478 A. The thesis states 0.148 A (ch. 5)."""
     assert largest_counts(STEP, 0.148) == 4096
-    assert mean_current(4096, STEP) == pytest.approx(3.4 / 23.0, rel=1e-15)
+    assert pytest.approx(3.4 / 23.0, rel=1e-15) == 4096 * STEP
 
 
 def test_a_lower_limit_is_never_exceeded_by_rounding() -> None:
     largest = largest_counts(STEP, 0.1)
-    assert mean_current(largest, STEP) <= 0.1 < mean_current(largest + 1, STEP)
+    assert largest * STEP <= 0.1 < (largest + 1) * STEP
 
 
 def test_a_limit_of_whole_counts_loses_none() -> None:
