@@ -180,14 +180,11 @@ class AravisCamera:
         self._set_exposure(camera, settings.exposure_ns)
         camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
         camera.set_trigger("Software")
-        self._start_stream(aravis, camera)
-
-    def _start_stream(self, aravis: Any, camera: Any) -> None:
         stream = camera.create_stream(None, None)
         if stream is None:
             raise NotResponding(self.name, "cannot open a stream: does another program use the camera?")
         payload = camera.get_payload()
-        for _ in range(self._settings.buffers):
+        for _ in range(settings.buffers):
             stream.push_buffer(aravis.Buffer.new_allocate(payload))
         self._lost = False
         camera.get_device().connect("control-lost", self._on_lost)

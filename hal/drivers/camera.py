@@ -168,8 +168,18 @@ class ServedCamera:
         """Periodic job: pass requests to the camera device and take frames from it."""
         if not self._open and not self._reopened():
             return
+        with self._lock:
+            asked, self._asked = self._asked, None
         try:
-            frame = self._advance()
+            if asked is not None:
+                exposure_ns, trigger_ns = asked
+                if self._deadline_ns is None:
+                    self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + PATIENCE_NS
+                self._device.expose(exposure_ns, trigger_ns)
+            frame = self._device.collect()
+            if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:
+                problem = "no frame arrived after the trigger: check the camera and its cable"
+                raise NotResponding(self.name, problem)
         except DeviceError as error:
             self._drop(error)
             return
@@ -179,21 +189,6 @@ class ServedCamera:
                 if self._asked is None:  # if there is a newer request, the frame is obsolete
                     self._frame = frame
                     self.counts.delivered += 1
-
-    def _advance(self) -> Frame | None:
-        with self._lock:
-            asked, self._asked = self._asked, None
-        if asked is not None:
-            exposure_ns, trigger_ns = asked
-            if self._deadline_ns is None:
-                self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + PATIENCE_NS
-            self._device.expose(exposure_ns, trigger_ns)
-        frame = self._device.collect()
-        if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:
-            raise NotResponding(
-                self.name, "no frame arrived after the trigger: check the camera and its cable"
-            )
-        return frame
 
     def _reopened(self) -> bool:
         """Try to open the camera if a retry is due, and return whether the camera was opened."""

@@ -1,17 +1,11 @@
-"""Driver of the PCA9685, an I2C chip with sixteen 12-bit PWM outputs (NXP data sheet).
-
-This module uses neither numpy nor threads, because the guardian process imports it to switch the coils off.
-"""
+"""Driver of the PCA9685, an I2C chip with sixteen 12-bit PWM outputs (NXP data sheet)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused, answering
-
-if TYPE_CHECKING:  # hal.interfaces.wires imports numpy, which the guardian must not load
-    from hal.interfaces.wires import Clock, I2cBus
+from hal.interfaces.wires import Clock, I2cBus
 
 MODE1 = 0x00
 MODE2 = 0x01
@@ -49,21 +43,6 @@ FULL_ON: PwmCounts = (COUNTS, 0)
 FULL_OFF: PwmCounts = (0, COUNTS)
 
 
-def switch_off(bus: I2cBus, address: int, tries: int = 3) -> None:
-    """Switch all outputs of the chip off, whatever the state of the chip.
-
-    One byte is written to the register ALL_LED_OFF_H, which works without any configuration of the chip.
-    Raises NotResponding after `tries` consecutive failures.
-    """
-    for left in reversed(range(tries)):
-        try:
-            bus.write_byte_data(address, ALL_LED_OFF_H, FULL)
-            return
-        except OSError as error:
-            if left == 0:
-                raise NotResponding(_name(address), f"could not be switched off: {error.strerror}") from error
-
-
 def prescale_for(frequency_hz: float) -> int:
     """Return the PRE_SCALE value of a PWM frequency f: round(25 MHz / (4096 f)) - 1.
 
@@ -85,7 +64,7 @@ class Pca9685:
     def __init__(self, bus: I2cBus, address: int, clock: Clock) -> None:
         self._bus, self._address, self._clock = bus, address, clock
         self._prescale = prescale_for(FREQUENCY_HZ)
-        self.name = _name(address)
+        self.name = f"pca9685 at 0x{address:02x}"
 
     def configure(self) -> None:
         """Configure the chip with all outputs off, and read the configuration back.
@@ -145,8 +124,14 @@ class Pca9685:
             self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))
 
     def all_off(self) -> None:
-        """Switch all outputs off. Raises NotResponding if the chip does not answer."""
-        switch_off(self._bus, self._address, tries=1)
+        """Switch all outputs off, whatever the state of the chip. Raises NotResponding if it does not answer.
+
+        One byte is written to the register ALL_LED_OFF_H, which works without any configuration of the chip.
+        """
+        try:
+            self._bus.write_byte_data(self._address, ALL_LED_OFF_H, FULL)
+        except OSError as error:
+            raise NotResponding(self.name, f"could not be switched off: {error.strerror}") from error
 
     def _set_up(self) -> list[tuple[str, int, int]]:
         # The RESTART bit only records that the chip was put to sleep with active channels, so it is ignored.
@@ -168,7 +153,3 @@ class Pca9685:
 def _values(counts: Sequence[PwmCounts]) -> list[int]:
     """Return the values of the four registers of each channel for the given counts."""
     return [byte for on, off in counts for byte in (on & 0xFF, on >> 8, off & 0xFF, off >> 8)]
-
-
-def _name(address: int) -> str:
-    return f"pca9685 at 0x{address:02x}"

@@ -236,17 +236,15 @@ def level_attitude(field: FloatArray, acceleration: FloatArray) -> FloatArray:
     quaternion is the identity.
     """
     size = float(np.linalg.norm(acceleration))
-    if size < _FREE_FALL:
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    y = -acceleration / size
-    z = -(field - float(field @ y) * y)
-    length = float(np.linalg.norm(z))
-    if length == 0.0:
-        return np.array([0.0, 0.0, 0.0, 1.0])
-    z = z / length
-    x = np.cross(y, z)
-    # The columns of the attitude matrix are the testbed's axes in body axes.
-    return quaternion_of(np.column_stack((x, y, z)))
+    if size >= _FREE_FALL:
+        y = -acceleration / size
+        z = -(field - float(field @ y) * y)
+        length = float(np.linalg.norm(z))
+        if length > 0.0:
+            z = z / length
+            # The columns of the attitude matrix are the testbed's axes in body axes.
+            return quaternion_of(np.column_stack((np.cross(y, z), y, z)))
+    return np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def quaternion_of(matrix: FloatArray) -> FloatArray:
@@ -308,7 +306,8 @@ class Adis16470:
 
     @decimation.setter
     def decimation(self, value: int) -> None:
-        self._write(DEC_RATE, value)
+        halves = (DEC_RATE, value & 0xFF), (DEC_RATE + 1, value >> 8)
+        self._device.transfer([bytes((0x80 | address, byte)) for address, byte in halves])
 
     @property
     def gyro(self) -> tuple[float, ...]:
@@ -332,7 +331,3 @@ class Adis16470:
         """Return the values of 16-bit registers, each in the frame after the register's request."""
         frames = self._device.transfer([bytes((register, 0)) for register in (*registers, 0)])
         return [int.from_bytes(frame, "big") for frame in frames[1:]]
-
-    def _write(self, register: int, value: int) -> None:
-        halves = (register, value & 0xFF), (register + 1, value >> 8)
-        self._device.transfer([bytes((0x80 | address, byte)) for address, byte in halves])

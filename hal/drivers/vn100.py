@@ -227,7 +227,6 @@ class Recovery:
         self._port, self._settings = port, settings
         self._own_rate = port.baud_rate
         self._others = [rate for rate in BAUD_RATES if rate != port.baud_rate]
-        self._other = 0
         self._reading_ns: int | None = None
         self._listening_since_ns: int | None = None
         self._packets = self._bytes = 0
@@ -308,15 +307,12 @@ class Recovery:
                 self._has_asked = received != self._bytes
                 self._begin(now_ns)
             else:
-                self._change_rate()
+                if self._port.baud_rate == self._own_rate:
+                    self._port.set_baud_rate(self._others[0])
+                    self._others.append(self._others.pop(0))
+                else:
+                    self._port.set_baud_rate(self._own_rate)
                 self._listen(now_ns, packets, received)
-
-    def _change_rate(self) -> None:
-        if self._port.baud_rate == self._own_rate:
-            self._port.set_baud_rate(self._others[self._other])
-            self._other = (self._other + 1) % len(self._others)
-        else:
-            self._port.set_baud_rate(self._own_rate)
 
     def _begin(self, now_ns: int) -> None:
         self._dialogue = self._whole_dialogue()
@@ -346,7 +342,13 @@ class Recovery:
                     raise Refused("vn100", f"{question.text()} was answered with {complaint[1]}")
                 again = True
         if again:
-            self._repeat(question, now_ns)
+            self._tries += 1
+            if self._tries < self._settings.tries:
+                self._ask(question, now_ns)
+                return
+            self._give_up()
+            if self._port.baud_rate != self._own_rate:
+                self._port.set_baud_rate(self._own_rate)
 
     def _accept(self, answer: tuple[str, ...], now_ns: int) -> None:
         assert self._dialogue is not None
@@ -361,15 +363,6 @@ class Recovery:
             self.refusal = ""
             # If no readings arrive, the recovery begins again after `_PATIENCE_NS`.
             self._reading_ns = now_ns
-
-    def _repeat(self, question: Question, now_ns: int) -> None:
-        self._tries += 1
-        if self._tries < self._settings.tries:
-            self._ask(question, now_ns)
-            return
-        self._give_up()
-        if self._port.baud_rate != self._own_rate:
-            self._port.set_baud_rate(self._own_rate)
 
     def _give_up(self) -> None:
         """Abort the configuration, so that the next step listens again."""
@@ -405,6 +398,9 @@ _SOURCES = (
 )
 _TIMES = ("common.time_startup", "time.time_startup")
 
+# Index of the device time in a packet's values (None if the packet contains no time), and slices of
+# quaternion, rate, magnetic field and acceleration.
+_Places = tuple[int | None, tuple[slice, slice, slice, slice]]
 # A sample contains device time (ns), quaternion, rate, magnetic field (gauss) and acceleration.
 _Sample = tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
@@ -554,14 +550,14 @@ class ReadingConverter:
             return None
         values: tuple[float, ...] = packet.values  # type: ignore[assignment]  # these fields are numbers
         device_ns = 0
-        if places.time is not None:
-            device_ns = int(values[places.time])
+        time, (q, rate, mag, accel) = places
+        if time is not None:
+            device_ns = int(values[time])
             if device_ns < self._device_ns:
                 self.resets += 1
                 self._on_reset()
             self._check_step(device_ns - self._device_ns)
             self._device_ns = device_ns
-        q, rate, mag, accel = places.sensors
         return device_ns, values[q], values[rate], values[mag], values[accel]
 
     def _check_step(self, step_ns: int) -> None:
@@ -584,19 +580,6 @@ class ReadingConverter:
         return 0, values.attitude, values.gyro, values.mag, values.accel
 
 
-@dataclass(frozen=True, slots=True)
-class _Places:
-    """Positions of the time and of the sensor values in the list of a packet's values.
-
-    Attributes:
-        time: index of the device time, or None if the packet contains no time.
-        sensors: slices of quaternion, rate, magnetic field and acceleration.
-    """
-
-    time: int | None
-    sensors: tuple[slice, slice, slice, slice]
-
-
 def _places(layout: OutputLayout) -> _Places | None:
     """Return the positions of a reading's values in a packet, or None if a sensor value is missing."""
     sensors: list[slice] = []
@@ -608,10 +591,8 @@ def _places(layout: OutputLayout) -> _Places | None:
     time = next((layout.places[name].start for name in _TIMES if name in layout.places), None)
     q, rate, mag, accel = sensors
     # The first three values of the field MagPres are the magnetic field.
-    return _Places(time, (q, rate, slice(mag.start, mag.start + 3), accel))
+    return time, (q, rate, slice(mag.start, mag.start + 3), accel)
 
-
-__all__ = ["OUTPUT_SET", "Vn100", "Vn100Settings"]
 
 _LONGEST_PACKET = 128  # maximum packet length (bytes), which limits the delay that a false header causes
 _POLL_STEP_NS = 1_000_000

@@ -169,20 +169,11 @@ HEADER_LENGTHS: tuple[int, ...] = tuple(header_length(byte) for byte in range(25
 Checksum = Literal["xor8", "crc16", "none"]
 
 ERRORS = {
-    0x01: "hard fault",
-    0x02: "serial buffer overflow",
-    0x03: "invalid checksum",
-    0x04: "invalid command",
-    0x05: "not enough parameters",
-    0x06: "too many parameters",
-    0x07: "invalid parameter",
-    0x08: "invalid register",
-    0x09: "unauthorized access",
-    0x0A: "watchdog reset",
-    0x0B: "output buffer overflow",
-    0x0C: "insufficient baud rate",
-    0xFF: "error buffer overflow",
-}
+    0x01: "hard fault", 0x02: "serial buffer overflow", 0x03: "invalid checksum", 0x04: "invalid command",
+    0x05: "not enough parameters", 0x06: "too many parameters", 0x07: "invalid parameter",
+    0x08: "invalid register", 0x09: "unauthorized access", 0x0A: "watchdog reset",
+    0x0B: "output buffer overflow", 0x0C: "insufficient baud rate", 0xFF: "error buffer overflow",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ import numpy as np
 from hal.drivers.coils import CLEAR, CONTROL, FAULT, CoilSettings, volts_of
 from hal.drivers.pca9685 import COUNTS
 from knightcube.astro.arrays import FloatArray
+from sim_hal.emulators.i2c_bus import Registers
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 
 Pulse = tuple[int, int]
@@ -323,8 +324,11 @@ class EmulatedIna219:
         if register in self.frozen:
             return self.frozen[register]
         self._convert()
-        current, power, overflow = self._products()
         shunt, volts = self._shown()
+        current = abs(shunt) * self._calibration // 4096
+        power = current * volts // 5000
+        overflow = current > 0x7FFF or power > 0xFFFF
+        current = -current if shunt < 0 else current
         bus = volts << 3 | (_READY if self._ready else 0) | (_OVERFLOW if overflow else 0)
         words = (self._config, shunt, bus, power, current, self._calibration)
         return words[register] & 0xFFFF if register < len(words) else 0
@@ -406,14 +410,6 @@ class EmulatedIna219:
         old = next((one for one in reversed(self._past) if one[0] <= until_ns), self._past[0])
         return old[1:]
 
-    def _products(self) -> tuple[int, int, bool]:
-        """Return the registers Current and Power, and whether one of the values overflows."""
-        shunt, volts = self._shown()
-        current = abs(shunt) * self._calibration // 4096
-        power = current * volts // 5000
-        overflow = current > 0x7FFF or power > 0xFFFF
-        return (-current if shunt < 0 else current), power, overflow
-
 
 def _digitised(steps: float, code: int, low: int, high: int) -> int:
     """Return the clipped register value of a voltage (12-bit steps), rounded to the ADC's resolution."""
@@ -421,35 +417,25 @@ def _digitised(steps: float, code: int, low: int, high: int) -> int:
     return min(high, max(low, round(steps / coarse) * coarse))
 
 
-class EmulatedDrv8830:
+class EmulatedDrv8830(Registers):
     """One bridge with its registers CONTROL and FAULT; the function `changed` is called after each change."""
 
     def __init__(self, address: int, changed: Callable[[], None]) -> None:
-        self.address = address
+        super().__init__(address)
         self.registers = [0, 0]
-        self._pointer = 0
         self._changed = changed
 
-    def answers(self, address: int) -> bool:
-        """Return whether the bridge acknowledges an address."""
-        return address == self.address
+    def store(self, register: int, value: int) -> None:
+        """Write CONTROL, or clear the faults."""
+        if register == CONTROL:
+            self.registers[CONTROL] = value
+            self._changed()
+        elif register == FAULT and value & CLEAR:
+            self.registers[FAULT] = 0
 
-    def write(self, address: int, data: bytes) -> None:
-        """Set the register pointer, and write registers."""
-        self._pointer = data[0]
-        for value in data[1:]:
-            if self._pointer == CONTROL:
-                self.registers[CONTROL] = value
-                self._changed()
-            elif self._pointer == FAULT and value & CLEAR:
-                self.registers[FAULT] = 0
-            self._pointer += 1
-
-    def read(self, count: int) -> bytes:
-        """Return register contents, beginning at the register pointer."""
-        return bytes((*self.registers, *bytes(count))[self._pointer : self._pointer + count]).ljust(
-            count, b"\0"
-        )
+    def load(self, register: int) -> int:
+        """Return a register's value."""
+        return self.registers[register] if register < len(self.registers) else 0
 
     def brown_out(self) -> None:
         """Interrupt the supply, which clears the registers."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import errno
 import operator
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -35,6 +36,42 @@ class I2cPart(Protocol):
 
     def read(self, count: int) -> bytes:
         """Return `count` bytes, beginning at the register pointer."""
+
+
+class Registers(ABC):
+    """A chip on the I2C bus with a register pointer that increments at each byte."""
+
+    def __init__(self, address: int) -> None:
+        self.address = address
+        self._pointer = 0
+
+    def answers(self, address: int) -> bool:
+        """Return whether the chip acknowledges an address."""
+        return address == self.address
+
+    def write(self, address: int, data: bytes) -> None:
+        """Set the register pointer, and write registers."""
+        self._pointer = data[0]
+        for value in data[1:]:
+            self.store(self._pointer, value)
+            self._pointer += 1
+
+    def read(self, count: int) -> bytes:
+        """Return registers from the pointer on."""
+        self.latch()
+        self._pointer += count
+        return bytes(self.load(register) for register in range(self._pointer - count, self._pointer))
+
+    def latch(self) -> None:  # noqa: B027 - a chip without measurements needs no method
+        """Store a new sample in the registers if one is due; called before registers are read."""
+
+    @abstractmethod
+    def store(self, register: int, value: int) -> None:
+        """Write a register."""
+
+    @abstractmethod
+    def load(self, register: int) -> int:
+        """Return a register's value."""
 
 
 @dataclass(frozen=True, slots=True)

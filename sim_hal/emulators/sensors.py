@@ -8,7 +8,6 @@ returns an `I2cPart` or an SPI device.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -28,6 +27,7 @@ from hal.drivers.sensor_unit import (
 )
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
+from sim_hal.emulators.i2c_bus import Registers
 from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
 
 _TURN = math.radians(1.0)
@@ -59,43 +59,6 @@ class Measurements:
         }[quantity]
         turned = self.to_sensor.get(quantity, np.eye(3)) @ true
         return np.asarray(turned + deviation * self.generator.standard_normal(3))
-
-
-class Registers(ABC):
-    """A chip on the I2C bus with a register pointer that increments at each byte."""
-
-    def __init__(self, address: int) -> None:
-        self.address = address
-        self._pointer = 0
-
-    def answers(self, address: int) -> bool:
-        """Return whether the chip acknowledges an address."""
-        return address == self.address
-
-    def write(self, address: int, data: bytes) -> None:
-        """Set the register pointer, and write registers."""
-        self._pointer = data[0]
-        for value in data[1:]:
-            self.store(self._pointer, value)
-            self._pointer += 1
-
-    def read(self, count: int) -> bytes:
-        """Return registers from the pointer on."""
-        self.latch()
-        self._pointer += count
-        return bytes(self.load(register) for register in range(self._pointer - count, self._pointer))
-
-    @abstractmethod
-    def latch(self) -> None:
-        """Store a new sample in the registers if one is due; called before registers are read."""
-
-    @abstractmethod
-    def store(self, register: int, value: int) -> None:
-        """Write a register."""
-
-    @abstractmethod
-    def load(self, register: int) -> int:
-        """Return a register's value."""
 
 
 class EmulatedLis3mdl(Registers):

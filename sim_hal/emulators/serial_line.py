@@ -157,6 +157,33 @@ class Wire:
         return data
 
 
+class DeviceEnd:
+    """The device's end of a line, which implements `sim_hal.clock.SerialEnd`.
+
+    Attributes:
+        baud_rate: baud rate of the device.
+        to_host, to_device: the wires of the two directions, each with its own faults.
+    """
+
+    def __init__(self, baud_rate: int, rng: np.random.Generator, host_rate: Callable[[], int]) -> None:
+        """Make the wires; the function `host_rate` returns the baud rate of the host's end."""
+        self.baud_rate = baud_rate
+        self.to_host, self.to_device = (Wire(generator) for generator in rng.spawn(2))
+        self._host_rate = host_rate
+
+    def write(self, data: bytes, now_ns: int) -> None:
+        """Send bytes to the host, beginning at `now_ns`."""
+        self.to_host.push(data, now_ns, self.baud_rate, self._host_rate())
+
+    def read(self, now_ns: int) -> bytes:
+        """Return the host's bytes that have arrived by `now_ns`."""
+        return b"".join(data for _, data in self.to_device.pull(now_ns))
+
+    def next_arrival_ns(self) -> int:
+        """Return the time at which the next bytes from the host arrive, or NEVER."""
+        return self.to_device.next_arrival_ns()
+
+
 class EmulatedSerialLine:
     """A serial line in memory with its two ends.
 
@@ -168,11 +195,9 @@ class EmulatedSerialLine:
 
     def __init__(self, now_ns: Callable[[], int], baud_rate: int, rng: np.random.Generator) -> None:
         """Store the host's clock, the baud rate of both ends, and the random generator of the faults."""
-        to_host_rng, to_device_rng = rng.spawn(2)
-        self.to_host = Wire(to_host_rng)
-        self.to_device = Wire(to_device_rng)
+        self.device = DeviceEnd(baud_rate, rng, lambda: self.host.baud_rate)
+        self.to_host, self.to_device = self.device.to_host, self.device.to_device
         self.host = HostEnd(self, now_ns, baud_rate)
-        self.device = DeviceEnd(self, baud_rate)
 
 
 class HostEnd:
@@ -206,26 +231,6 @@ class HostEnd:
             raise NotResponding("serial line", "the port is closed or unplugged")
 
 
-class DeviceEnd:
-    """The device's end of a line, which implements `sim_hal.clock.SerialEnd`."""
-
-    def __init__(self, line: EmulatedSerialLine, baud_rate: int) -> None:
-        self.baud_rate = baud_rate
-        self._line = line
-
-    def write(self, data: bytes, now_ns: int) -> None:
-        """Send bytes to the host, beginning at `now_ns`."""
-        self._line.to_host.push(data, now_ns, self.baud_rate, self._line.host.baud_rate)
-
-    def read(self, now_ns: int) -> bytes:
-        """Return the host's bytes that have arrived by `now_ns`."""
-        return b"".join(data for _, data in self._line.to_device.pull(now_ns))
-
-    def next_arrival_ns(self) -> int:
-        """Return the time at which the next bytes from the host arrive, or NEVER."""
-        return self._line.to_device.next_arrival_ns()
-
-
 _SPEEDS = {
     getattr(termios, f"B{rate}"): rate
     for rate in (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
@@ -234,25 +239,19 @@ _SPEEDS = {
 _CODES = {rate: code for code, rate in _SPEEDS.items()}
 
 
-class PtyLine:
-    """The device's end (a `SerialEnd`) of a line whose host end is a pseudo-terminal.
-
-    Attributes:
-        name: device file that the host opens.
-        baud_rate: baud rate of the device.
-        to_host, to_device: the wires of the two directions, each with its own faults.
-    """
+class PtyLine(DeviceEnd):
+    """The device's end of a line whose host end is a pseudo-terminal with the device file `name`."""
 
     def __init__(self, baud_rate: int, rng: np.random.Generator, link: Path | None = None) -> None:
         """Open the pseudo-terminal, and make `link` a symbolic link to its device. Raises OSError."""
-        self.baud_rate = baud_rate
-        to_host_rng, to_device_rng = rng.spawn(2)
-        self.to_host = Wire(to_host_rng)
-        self.to_device = Wire(to_device_rng)
+        super().__init__(baud_rate, rng, self._host_speed)
         # The client's side stays open, because reading from a pseudo-terminal without a client raises errors.
         self._near, self._far = os.openpty()
         tty.setraw(self._far)
-        self._set_speed(baud_rate)
+        if (code := _CODES.get(baud_rate)) is not None:
+            attributes = termios.tcgetattr(self._far)
+            attributes[4] = attributes[5] = code
+            termios.tcsetattr(self._far, termios.TCSANOW, attributes)
         os.set_blocking(self._near, False)
         self.name = os.ttyname(self._far)
         self._link = link
@@ -266,18 +265,6 @@ class PtyLine:
                 self.close()
                 raise
 
-    def write(self, data: bytes, now_ns: int) -> None:
-        """Send bytes to the host, beginning at `now_ns`."""
-        self.to_host.push(data, now_ns, self.baud_rate, self._host_speed())
-
-    def read(self, now_ns: int) -> bytes:
-        """Return the host's bytes that have arrived by `now_ns`."""
-        return b"".join(data for _, data in self.to_device.pull(now_ns))
-
-    def next_arrival_ns(self) -> int:
-        """Return the time at which the next bytes from the host arrive, or NEVER."""
-        return self.to_device.next_arrival_ns()
-
     def exchange(self, now_ns: int) -> None:
         """Read the host's bytes, and deliver the device's bytes that have arrived by `now_ns`."""
         try:
@@ -285,8 +272,7 @@ class PtyLine:
         except BlockingIOError:
             data = b""
         if data:
-            speed = self._host_speed()
-            self.to_device.push(data, now_ns, speed, self.baud_rate)
+            self.to_device.push(data, now_ns, self._host_speed(), self.baud_rate)
         for _, crossed in self.to_host.pull(now_ns):
             try:
                 os.write(self._near, crossed)
@@ -317,10 +303,3 @@ class PtyLine:
     def _host_speed(self) -> int:
         # A baud rate without a termios constant (128000) cannot be read back and is assumed to be correct.
         return _SPEEDS.get(termios.tcgetattr(self._far)[5], self.baud_rate)
-
-    def _set_speed(self, baud_rate: int) -> None:
-        code = _CODES.get(baud_rate)
-        if code is not None:
-            attributes = termios.tcgetattr(self._far)
-            attributes[4] = attributes[5] = code
-            termios.tcsetattr(self._far, termios.TCSANOW, attributes)

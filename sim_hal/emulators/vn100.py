@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -204,19 +204,8 @@ class BinaryOutput:
 
     def pack(self, now: MessageData) -> bytes:
         """Return the binary packet with the data of one sampling time."""
-        return self.layout.pack(now.values(_quantities(self.layout.fields)))
-
-
-@lru_cache(maxsize=64)
-def _quantities(fields: tuple[tuple[int, int], ...]) -> str:
-    """Return the names of the quantities in binary fields, each given by group bit and field bit."""
-    return " ".join(BINARY_FIELDS[key] for key in fields)
-
-
-@lru_cache(maxsize=64)
-def _windows(register: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the filter lengths of magnetometer, accelerometer and gyro in the fields of register 85."""
-    return tuple(int(text) for text in register[:3])
+        quantities = " ".join(BINARY_FIELDS[key] for key in self.layout.fields)
+        return self.layout.pack(now.values(quantities))
 
 
 def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
@@ -353,7 +342,11 @@ class AttitudeCommands:
             if command == "TAR":
                 self._set_heading(0.0, sample)
             else:
-                self._store_biases(everything=command == "SFB")
+                gyro = tuple(f"{value:+010.6f}" for value in self._gyro_bias.tolist())
+                self._registers.write(GYRO_STARTUP_BIAS, gyro)
+                kept = self._registers.read(FILTER_STARTUP_BIAS)[3:]
+                others = ("+00.000000",) * 4 if command == "SFB" else kept
+                self._registers.write(FILTER_STARTUP_BIAS, (*gyro, *others))
 
     def _set_heading(self, yaw: float, sample: Callable[[], Vn100Sample]) -> None:
         """Rotate the attitude about the vertical so that the present yaw becomes `yaw` (rad)."""
@@ -361,12 +354,6 @@ class AttitudeCommands:
             return
         change = from_rotation_vector(np.array([0.0, 0.0, yaw - math.radians(sample().yaw_pitch_roll[0])]))
         self._turn = change if self._turn is None else normalise(multiply(self._turn, change))
-
-    def _store_biases(self, everything: bool) -> None:
-        gyro = tuple(f"{value:+010.6f}" for value in self._gyro_bias.tolist())
-        self._registers.write(GYRO_STARTUP_BIAS, gyro)
-        kept = self._registers.read(FILTER_STARTUP_BIAS)[3:]
-        self._registers.write(FILTER_STARTUP_BIAS, (*gyro, *(("+00.000000",) * 4 if everything else kept)))
 
 
 def flag(fields: tuple[str, ...]) -> bool:
@@ -636,9 +623,6 @@ class Vn100Emulator:
     def _device_ns(self, now_ns: int) -> int:
         return self._uptime_ns + (now_ns - self._origin_ns) * self._clock_rate // _BILLION
 
-    def _tick_ns(self, tick: int) -> int:
-        return self._origin_ns - (self._uptime_ns - tick * TICK_NS) * _BILLION // self._clock_rate
-
     def _schedule(self, now_ns: int) -> None:
         if self._then is not None:
             self._due_ns = self._then[0]
@@ -648,7 +632,8 @@ class Vn100Emulator:
             self._due_ns = NEVER
         else:
             self._tick_due = tick
-            self._due_ns = self._tick_ns(tick)
+            since_ns = (self._uptime_ns - tick * TICK_NS) * _BILLION // self._clock_rate
+            self._due_ns = self._origin_ns - since_ns
 
     def _act(self, now_ns: int) -> None:
         if self._then is not None:
@@ -730,7 +715,8 @@ class Vn100Emulator:
                     raise UnitError(INVALID_PARAMETER)
                 self._line.write(output.pack(self._data_now(now_ns)), now_ns)
             case "WNV":
-                self._write_flash(now_ns, lambda end_ns: answer(at_ns=end_ns))
+                self.registers.save()
+                self._then = now_ns + self._settings.flash_ns, lambda end_ns: answer(at_ns=end_ns)
             case "RFS" | "RST":
                 answer()
                 if sentence.command == "RFS":
@@ -757,7 +743,8 @@ class Vn100Emulator:
     # Output.
 
     def _sample(self, now_ns: int) -> Vn100Sample:
-        windows = _windows(self.registers.values[85])
+        # The fields of register 85 are the filter lengths of magnetometer, accelerometer and gyro.
+        windows = tuple(map(int, self.registers.values[85][:3]))
         sample = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return sample if self.alter is None else self.alter(sample)
 
@@ -774,10 +761,6 @@ class Vn100Emulator:
         self._streams.build(self._device_ns(now_ns))
 
     # Power.
-
-    def _write_flash(self, now_ns: int, done: Callable[[int], None]) -> None:
-        self.registers.save()
-        self._then = now_ns + self._settings.flash_ns, done
 
     def _restart(self, now_ns: int) -> None:
         self._then = now_ns + self._settings.boot_ns, lambda end_ns: self._start(end_ns, 0)

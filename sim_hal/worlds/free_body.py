@@ -131,14 +131,8 @@ def _moved(state: State, slope: State, dt: float) -> State:
     q1, q2, q3, q4, w1, w2, w3 = state
     d1, d2, d3, d4, d5, d6, d7 = slope
     return (
-        q1 + dt * d1,
-        q2 + dt * d2,
-        q3 + dt * d3,
-        q4 + dt * d4,
-        w1 + dt * d5,
-        w2 + dt * d6,
-        w3 + dt * d7,
-    )
+        q1 + dt * d1, q2 + dt * d2, q3 + dt * d3, q4 + dt * d4, w1 + dt * d5, w2 + dt * d6, w3 + dt * d7
+    )  # fmt: skip
 
 
 def matrix(q1: float, q2: float, q3: float, q4: float) -> Matrix:
@@ -146,16 +140,10 @@ def matrix(q1: float, q2: float, q3: float, q4: float) -> Matrix:
     r11, r22, r33, r44 = q1 * q1, q2 * q2, q3 * q3, q4 * q4
     r12, r13, r14, r23, r24, r34 = q1 * q2, q1 * q3, q1 * q4, q2 * q3, q2 * q4, q3 * q4
     return (
-        r11 - r22 - r33 + r44,
-        2.0 * (r12 + r34),
-        2.0 * (r13 - r24),
-        2.0 * (r12 - r34),
-        r22 - r11 - r33 + r44,
-        2.0 * (r23 + r14),
-        2.0 * (r13 + r24),
-        2.0 * (r23 - r14),
-        r33 - r11 - r22 + r44,
-    )
+        r11 - r22 - r33 + r44, 2.0 * (r12 + r34), 2.0 * (r13 - r24),
+        2.0 * (r12 - r34), r22 - r11 - r33 + r44, 2.0 * (r23 + r14),
+        2.0 * (r13 + r24), 2.0 * (r23 - r14), r33 - r11 - r22 + r44,
+    )  # fmt: skip
 
 
 def turned(turn: Matrix, vector: Floats) -> Floats:

@@ -286,26 +286,12 @@ def _mean_shape(states: FloatArray) -> tuple[float, float, float]:
     return float(axes.mean()), float(np.linalg.norm(perigees.mean(axis=0))), float(tilts.mean())
 
 
-_PROFILE = np.array(
-    [
-        [150e3, 2.070e-9],
-        [200e3, 2.789e-10],
-        [250e3, 7.248e-11],
-        [300e3, 2.418e-11],
-        [350e3, 9.518e-12],
-        [400e3, 3.725e-12],
-        [450e3, 1.585e-12],
-        [500e3, 6.967e-13],
-        [600e3, 1.454e-13],
-        [700e3, 3.614e-14],
-        [800e3, 1.170e-14],
-        [900e3, 5.245e-15],
-        [1000e3, 3.019e-15],
-        [1500e3, 4.67e-16],
-        [2000e3, 7.23e-17],
-        [3000e3, 1.73e-18],
-    ]
-)
+_PROFILE = np.array([
+    [150e3, 2.070e-9], [200e3, 2.789e-10], [250e3, 7.248e-11], [300e3, 2.418e-11],
+    [350e3, 9.518e-12], [400e3, 3.725e-12], [450e3, 1.585e-12], [500e3, 6.967e-13],
+    [600e3, 1.454e-13], [700e3, 3.614e-14], [800e3, 1.170e-14], [900e3, 5.245e-15],
+    [1000e3, 3.019e-15], [1500e3, 4.67e-16], [2000e3, 7.23e-17], [3000e3, 1.73e-18],
+])  # fmt: skip
 """Heights (m) and air densities (kg/m^3) of the exponential profile [Vallado, table 8-4].
 
 Above 1,000 km, the values are extrapolated with the scale height at 1,000 km, 268 km.

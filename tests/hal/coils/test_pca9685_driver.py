@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from hal.drivers.pca9685 import FULL_OFF, FULL_ON, Pca9685, prescale_for, switch_off
+from hal.drivers.pca9685 import FULL_OFF, FULL_ON, Pca9685, prescale_for
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.pca9685 import EmulatedPca9685
@@ -171,28 +171,27 @@ def test_a_silent_chip_is_named_with_what_to_check(rig: Rig) -> None:
             action()
 
 
-def test_switch_off_works_in_every_state_of_the_chip(rig: Rig) -> None:
-    switch_off(rig.bus, PCA)  # SLEEP is set, as in the state after power-on
+def test_switching_off_works_in_every_state_of_the_chip(rig: Rig) -> None:
+    rig.pca.all_off()  # SLEEP is set, as in the state after power-on
     rig.pca.configure()
     rig.pca.write_channels(0, [FULL_ON] * 8)
     rig.pca.write_channels(8, [(0, 2000)] * 8)
     assert min(rig.duties) > 0.0
-    switch_off(rig.bus, PCA)
+    rig.pca.all_off()
     assert rig.duties == [0.0] * 16
 
 
-def test_switch_off_tries_again_and_then_says_so(rig: Rig) -> None:
+def test_a_failed_switch_off_is_reported(rig: Rig) -> None:
     rig.pca.configure()
     rig.pca.write_channels(0, [FULL_ON])
-    rig.wire.bus.nack(PCA, times=2)
-    switch_off(rig.bus, PCA)
-    assert rig.duties == [0.0] * 16
-    rig.wire.bus.nack(PCA, times=3)
+    rig.wire.bus.nack(PCA, times=1)
     with pytest.raises(NotResponding, match="could not be switched off"):
-        switch_off(rig.bus, PCA)
+        rig.pca.all_off()
+    rig.pca.all_off()
+    assert rig.duties == [0.0] * 16
 
 
 def test_the_guardian_imports_no_numpy() -> None:
     """The guardian, which switches the coils off, does not import numpy, so that it starts fast."""
-    code = "import sys, hal.drivers.pca9685, hal.buses.linux_wires; sys.exit('numpy' in sys.modules)"
+    code = "import sys, hal.guardian, hal.buses.smbus_byte; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=30).returncode == 0
