@@ -148,7 +148,10 @@ def assemble(
     orbit = OrbitDevices(
         emulated(replace(given, kind="gps", generator=receiver)),
         emulated(replace(given, kind="solar_strings", generator=currents)),
-        _horizon_cameras(config, section, world, now_ns, expose_wide or inline_wide),
+        tuple(
+            _horizon_camera(config, section, index, world, now_ns, expose_wide or inline_wide)
+            for index in range(len(config.wide_cameras))
+        ),
     )
     faults, power = FaultTimeline(), _power(given, camera)
     if truth is not None:
@@ -188,7 +191,7 @@ def _star_camera(
     expose: Expose | None,
 ) -> EmulatedCamera:
     assert config.camera is not None
-    make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
+    make = expose or StarRenderer(config.camera, section.sky, section.seed).expose
     if isinstance(world, OrbitingWorld) and not getattr(world, "held", False):
         from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
 
@@ -345,6 +348,12 @@ class StarRenderer:
         generator = np.random.default_rng([self._seed, sequence])
         return render(self._model, self._directions, self._magnitudes, times, attitudes, generator, tracks)
 
+    def expose(
+        self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
+    ) -> Future[Image]:
+        """Render a frame synchronously, for lock-step."""
+        return _finished(self.render(sequence, times, attitudes, tracks))
+
 
 @lru_cache(maxsize=2)
 def _stars(magnitude_limit: float, year: float) -> tuple[FloatArray, FloatArray]:
@@ -355,53 +364,28 @@ def _stars(magnitude_limit: float, year: float) -> tuple[FloatArray, FloatArray]
     return directions, catalogue.magnitude
 
 
-def inline_exposure(renderer: StarRenderer) -> Expose:
-    """Return an exposure function that renders synchronously, for lock-step."""
-
-    def expose(
-        sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
-    ) -> Future[Image]:
-        return _finished(renderer.render(sequence, times, attitudes, tracks))
-
-    return expose
-
-
 def _finished(image: Image) -> Future[Image]:
     future: Future[Image] = Future()
     future.set_result(image)
     return future
 
 
-def _horizon_cameras(
-    config: Config, section: Simulation, world: World, now_ns: Callable[[], int], expose: ExposeWide
-) -> tuple[EmulatedCamera, ...]:
-    """Return the horizon cameras. Raises ConfigError in a world without an orbit."""
-    misaligned = description_errors(config, section).horizon
-    return tuple(
-        _horizon_camera(
-            camera,
-            (section.seed, ORBIT_STREAM, index),
-            world,
-            now_ns,
-            expose,
-            misaligned[index] if len(misaligned) else np.zeros(3),
-        )
-        for index, camera in enumerate(config.wide_cameras)
-    )
-
-
 def _horizon_camera(
-    camera: WideCamera,
-    seed: tuple[int, ...],
+    config: Config,
+    section: Simulation,
+    index: int,
     world: World,
     now_ns: Callable[[], int],
     expose: ExposeWide,
-    misaligned: FloatArray,
 ) -> EmulatedCamera:
+    """Return a horizon camera. Raises ConfigError in a world without an orbit."""
     from sim_hal.earth_camera import EarthScene  # noqa: PLC0415 - see above
     from sim_hal.worlds.orbit import sun_position  # noqa: PLC0415 - see above
 
-    model, orbit = wide_model(camera, seed[-1]), orbiting(world, "wide_cameras")
+    camera, seed = config.wide_cameras[index], (section.seed, ORBIT_STREAM, index)
+    model, orbit = wide_model(camera, index), orbiting(world, "wide_cameras")
+    errors = description_errors(config, section).horizon
+    misaligned = from_rotation_vector(errors[index] if len(errors) else np.zeros(3))
 
     def exposed(sequence: int, _: FloatArray, attitudes: FloatArray, __: object) -> Future[Image]:
         scene = EarthScene(
@@ -412,7 +396,7 @@ def _horizon_camera(
         )
         return expose(model, scene, (*seed, sequence))
 
-    mounting = multiply(np.array(camera.mounting), from_rotation_vector(misaligned))
+    mounting = multiply(np.array(camera.mounting), misaligned)
     return EmulatedCamera(world.motion, exposed, now_ns, READOUT_NS, mounting)
 
 

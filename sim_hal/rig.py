@@ -44,7 +44,6 @@ from sim_hal.assembly import (
     assemble,
     emulated_camera,
     fault_generator,
-    inline_exposure,
     sky_objects,
 )
 from sim_hal.clock import SimClock, TimedSimulation
@@ -127,13 +126,8 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     def release(epoch_ns: int) -> None:
         served.release(epoch_ns, faults)
 
-    cameras = served.cameras
-    rig = Rig(
-        *(served.clock, served.wires, release, True, section.seed),
-        reach=reach,
-        cameras=cameras,
-        lateness=served.lateness,
-    )
+    given = served.clock, served.wires, release, True, section.seed
+    rig = Rig(*given, reach=reach, cameras=served.cameras, lateness=served.lateness)
     return with_host_faults(rig, section)
 
 
@@ -198,7 +192,7 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
         turned = from_rotation_vector(body_rate * ((time_ns - begun_ns) * 1e-9))
         return BodyMotion(time_ns, multiply(turned, held.quaternion), body_rate, zero, zero)
 
-    expose = inline_exposure(StarRenderer(camera, section.sky, section.seed))
+    expose = StarRenderer(camera, section.sky, section.seed).expose
     device = emulated_camera(camera, section.sky, motion, expose, clock.now_ns, objects)
     clock.attach(TimedSimulation(lambda _: None, [device]))
     return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))

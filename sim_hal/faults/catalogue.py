@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial, reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -331,9 +331,12 @@ def _on_line(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
 # Faults of the inertial unit and its magnetometer.
 
 
-def _unit_off(bench: Bench, *_: object) -> Removal:
-    bench.hardware.unit.switch_off()
-    return lambda: bench.hardware.unit.switch_on(bench.now_ns())
+def _without_power(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    device = bench.hardware.unit if fault.device == "imu" else bench.hardware.orbit.gps
+    if device is None:
+        return no_removal
+    device.switch_off()
+    return lambda: device.switch_on(bench.now_ns())
 
 
 def _unit_reset(bench: Bench, *_: object) -> Removal:
@@ -529,22 +532,18 @@ def _stuck_monitor(bench: Bench, *_: object) -> Removal:
     return monitor.frozen.clear
 
 
-def _silent_bus(bench: Bench, *_: object) -> Removal:
-    return bench.hardware.bus.nack(None, None)
-
-
-def _busy_bus(bench: Bench, *_: object) -> Removal:
-    return bench.hardware.bus.lose_arbitration(None)
-
-
 def _lossy_bus(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     return bench.hardware.bus.nack(
         None, times=None, chance=lambda: bench.generator.random() < given["chance"]
     )
 
 
-def _hanging_bus(bench: Bench, *_: object) -> Removal:
-    return bench.hardware.bus.hang(times=None)
+def _on_bus(name: str, *arguments: None) -> Begin:
+    """Return a fault that a method of the emulated bus begins."""
+    return lambda bench, *_: cast("Removal", getattr(bench.hardware.bus, name)(*arguments))
+
+
+_hanging_bus = _on_bus("hang", None)
 
 
 # Upsets.
@@ -643,14 +642,6 @@ def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[
     )
 
 
-def _gps_off(bench: Bench, *_: object) -> Removal:
-    gps = bench.hardware.orbit.gps
-    if gps is None:
-        return no_removal
-    gps.switch_off()
-    return lambda: gps.switch_on(bench.now_ns())
-
-
 def _false_position(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
     gps = bench.hardware.orbit.gps
     if gps is None:
@@ -731,7 +722,7 @@ _SECONDS = Parameter(180.0, -86_400.0, 86_400.0, "s")
 _STEP = Parameter(3600.0, -3.2e8, 3.2e8, "s")
 
 _ALL = (
-    _fault("imu: off", "no power; restarts from its saved settings afterwards", _unit_off),
+    _fault("imu: off", "no power; restarts from its saved settings afterwards", _without_power),
     _fault("imu: silent", "no byte arrives", _on_line, adds=True),
     _fault("imu: unplugged", "the serial port disappears", _unplugged),
     _fault("imu: stuck", "valid packets, constant values", _stuck_samples),
@@ -768,16 +759,16 @@ _ALL = (
     ),
     _fault("monitor: wrong", "measured values are multiplied by gain", _multiplied, {"gain": _gain(2.0)}),
     _upset("monitor: upset", _upset_monitor, _MONITOR, 16),
-    _fault("bus: off", "no part acknowledges", _silent_bus, adds=True),
+    _fault("bus: off", "no part acknowledges", _on_bus("nack", None, None), adds=True),
     _fault(
         "bus: nack", "no acknowledge, with this probability", _lossy_bus, {"chance": _chance(0.5)}, adds=True
     ),
-    _fault("bus: arbitration", "another master always wins", _busy_bus, adds=True),
+    _fault("bus: arbitration", "another master always wins", _on_bus("lose_arbitration", None), adds=True),
     _fault("bus: hang", "the clock line is held low", _hanging_bus, adds=True),
     _fault("bus: intermittent", _LOW_AT_TIMES, intermittently(_hanging_bus), _turns(), adds=True),
     *(fault for axis in COIL_NAMES for fault in _coil_faults(axis)),
     *_frame_faults("camera"),
-    _fault("gps: off", "no power; afterwards configuration and satellites are lost", _gps_off),
+    _fault("gps: off", "no power; afterwards configuration and satellites are lost", _without_power),
     _fault("gps: silent", "no byte arrives", _on_line, adds=True),
     _fault("gps: no-fix", "no satellite is received", _held("blind", lambda *_: True, False)),
     _fault("gps: stuck", "the same epoch repeatedly", _frozen),

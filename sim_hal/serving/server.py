@@ -168,7 +168,10 @@ class DeviceServer:
             )
             for key, _ in self._selector.select(max(0, due_ns - self._clock.now_ns()) * 1e-9):
                 if key.fileobj is self._listener:
-                    self._accept()
+                    line, _ = self._listener.accept()
+                    self._served_anybody = True
+                    self._connections[line.fileno()] = _DeviceClient(line)
+                    self._selector.register(line, selectors.EVENT_READ)
                 elif key.fd in self._connections:
                     self._serve_client(self._connections[key.fd])
                 elif key.data is not None:
@@ -209,12 +212,6 @@ class DeviceServer:
     ) -> Future[Image]:
         assert self._pool is not None
         return self._pool.submit(render_wide, model, scene, seed)
-
-    def _accept(self) -> None:
-        line, _ = self._listener.accept()
-        self._served_anybody = True
-        self._connections[line.fileno()] = _DeviceClient(line)
-        self._selector.register(line, selectors.EVENT_READ)
 
     def _serve_client(self, connection: _DeviceClient) -> None:
         requests = connection.requests()
