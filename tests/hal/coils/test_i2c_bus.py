@@ -106,7 +106,7 @@ def test_no_descriptor_leaks_when_opening_fails() -> None:
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(5):
         with pytest.raises(NotResponding, match="not a usable I2C bus"):
-            LinuxI2cBus("/dev/null")  # the real kernel reports that this file is no I2C adapter
+            LinuxI2cBus("/dev/null")  # the real kernel reports that this file is not an I2C adapter
     assert len(os.listdir("/proc/self/fd")) == before
 
 

@@ -317,7 +317,7 @@ def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
     silent = Vn100(bench.line.host, bench.clock, replace(MISSION, configure=False))
     bench = replace(bench, driver=silent)
     bench.line.host.send(build("RST"))
-    assert len(bench.run(3.0)) <= 1  # the VN-100 boots and sends only VNYMR lines, which are no readings
+    assert len(bench.run(3.0)) <= 1  # the VN-100 boots and sends only VNYMR lines, which are not readings
     assert silent.link().last_byte_ns > bench.clock.now_ns() - 50_000_000
     silent_to_unit = bench.unit.registers.read(6)
     assert silent_to_unit == ("14",)
