@@ -61,13 +61,9 @@ def magnetic_field_on_ground(
 def apparent_sun(date: float, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, float]:
     """Return the apparent direction (3,) of the Sun in ICRS axes, and its distance, m.
 
-    For an observer in a low orbit, the parallax of the Sun is 9". The Earth's orbital motion causes an
-    aberration of 20.5", and the satellite's motion an aberration of 5".
-
-    Args:
-        date: Julian date UTC.
-        position: (3,) geocentric position of the observer in ICRS axes, m.
-        velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
+    The date is a Julian date UTC, and the geocentric position (3,), m, and velocity (3,), m/s, of the
+    observer are in ICRS axes. For an observer in a low orbit, the parallax of the Sun is 9". The Earth's
+    orbital motion causes an aberration of 20.5", and the satellite's motion an aberration of 5".
     """
     earth, earth_velocity = earth_from_sun(float(terrestrial_time(date)))
     towards = -earth - position

@@ -155,12 +155,9 @@ NED_TO_TESTBED: FloatArray = np.array([0.5, -0.5, -0.5, 0.5])
 def attitude_map(mounting: FloatArray, reference: FloatArray) -> FloatArray:
     """Return the matrix M (4, 4) that converts an inertial unit's attitude to the body attitude.
 
-    The quaternion q (4,) of the inertial unit rotates NED into sensor axes. The product M q = mounting q
-    conj(reference) rotates the mission's reference frame into body axes.
-
-    Args:
-        mounting: (4,) quaternion that rotates sensor axes into body axes.
-        reference: (4,) quaternion that rotates NED into the mission's reference frame.
+    The quaternion q (4,) of the inertial unit rotates NED into sensor axes, and `mounting` rotates sensor
+    axes into body axes. The quaternion `reference` rotates NED into the mission's reference frame. The
+    product M q = mounting q conj(reference) rotates the mission's reference frame into body axes.
     """
     return np.asarray(multiply(multiply(mounting, np.eye(4)), conjugate(reference)).T)
 

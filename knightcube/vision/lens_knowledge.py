@@ -165,15 +165,9 @@ def step(
 ) -> FitStep:
     """Return lens and attitudes after one Gauss-Newton step.
 
-    Args:
-        frames: the frames.
-        fit: lens parameters and attitudes before the step.
-        weights: weights (n,) of the squared residuals of the stars, for each frame.
-        prior: prior information (9,) on each lens parameter, as inverse variances, or an information matrix.
-        expected: prior means (9,) of the lens parameters.
-
-    Raises CalibrationError if a frame does not determine its attitude, or if the data do not determine the
-    lens.
+    The squared residuals of the stars of each frame have the `weights` (n,). The prior means `expected` (9,)
+    of the lens parameters have the inverse variances `prior` (9,), or an information matrix. Raises
+    CalibrationError if a frame does not determine its attitude, or if the data do not determine the lens.
     """
     information, gradient = np.zeros((len(fit.parameters),) * 2), np.zeros(len(fit.parameters))
     prior = np.diag(prior) if prior.ndim == 1 else prior
@@ -393,12 +387,8 @@ class LensKnowledge:
     ) -> LensKnowledge:
         """Return the lens parameters of a camera as configured, before its first frame.
 
-        Args:
-            camera: the configured camera.
-            accuracy: standard deviations of the configured camera.
-            scale_error: largest relative error of the focal length.
-            line_time: configured line time of the shutter, s, or None if unknown.
-            psf_sigma: configured standard deviation of the point spread function, px.
+        The largest relative error of the focal length is `scale_error`. The line time of the shutter, s, may
+        be unknown, and `psf_sigma` is the standard deviation of the point spread function, px.
         """
         lens = Lens.of(camera)
         line_sigma = accuracy.line_time

@@ -120,15 +120,10 @@ class CoarseSun:
 
 
 def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArray | None = None) -> CoarseSun:
-    """Return the Sun direction in body axes from the currents of the solar strings.
+    """Return the Sun direction in body axes from the currents (n,) of the solar strings, A.
 
-    Args:
-        currents: currents (n,) of the strings, A.
-        strings: the strings.
-        nadir: unit vector (3,) to nadir in body axes, if known; an error of ten degrees has little effect.
-
-    Raises:
-        ValueError: if the currents are not n finite numbers.
+    An error of ten degrees of the nadir direction (3,), body axes, has little effect. Raises ValueError if
+    the currents are not n finite numbers.
     """
     currents = np.asarray(currents, dtype=float)
     if currents.shape != strings.peaks.shape or not np.all(np.isfinite(currents)):

@@ -449,14 +449,11 @@ class VectorObservation:
 
 
 def field_observation(field: FloatArray, reference: FloatArray, covariance: FloatArray) -> VectorObservation:
-    """Return the direction observation of a measured magnetic field.
+    """Return the direction observation of a measured magnetic field (3,), body axes, T.
 
-    Raises AttitudeError for a field so weak that the error of its direction exceeds one radian.
-
-    Args:
-        field: (3,) measured magnetic field in body axes, T.
-        reference: (3,) magnetic field of the model in inertial axes, T.
-        covariance: (3, 3) covariance of the measured field, including the magnetometer bias, T^2.
+    The covariance (3, 3), T^2, includes the magnetometer bias. The field `reference` (3,), T, is that of the
+    model in inertial axes. Raises AttitudeError for a field so weak that the error of its direction exceeds
+    one radian.
     """
     strength = float(np.linalg.norm(reference))
     if not float(np.sqrt(np.trace(covariance))) < strength:

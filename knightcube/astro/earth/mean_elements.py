@@ -76,14 +76,10 @@ def fit_elements(
 ) -> FittedElements:
     """Return two-line elements, whose epoch is the first date, for measured positions.
 
+    The Julian dates UTC (n,) are ascending. Positions (n, 3), m, and velocities (n, 3), m/s, are geocentric
+    and in ICRS axes. Without velocities, the first two dates must be less than half a revolution apart.
     Raises UsageError if fewer than four positions are given (fewer than two with velocities), if the
     positions are not in order of time, or if no elements fit.
-
-    Args:
-        dates: (n,) Julian dates UTC, ascending; without velocities, the first two are less than half a
-            revolution apart.
-        positions: (n, 3) geocentric positions in ICRS axes, m.
-        velocities: (n, 3) geocentric velocities in ICRS axes, m/s.
     """
     least = 4 if velocities is None else 2
     if len(dates) < least:

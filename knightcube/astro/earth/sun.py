@@ -69,13 +69,9 @@ Shadow = Literal["conical", "cylindrical"]
 def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conical") -> FloatArray:
     """Return the visible fraction (...) of the Sun's disc, which is 1 in sunlight and 0 in the Earth's umbra.
 
-    The "conical" shadow model computes the overlap of the discs of Sun and Earth (Montenbruck & Gill 2000,
-    section 3.4.2). The "cylindrical" model returns 0 or 1 (Sease, eq. 2.15, corrected).
-
-    Args:
-        position: (..., 3) geocentric positions of the observer, m.
-        sun: (..., 3) geocentric positions of the Sun, m.
-        shadow: shadow model, "conical" or "cylindrical".
+    The positions of the observer and of the Sun (..., 3), m, are geocentric. The "conical" shadow model
+    computes the overlap of the discs of Sun and Earth (Montenbruck & Gill 2000, section 3.4.2). The
+    "cylindrical" model returns 0 or 1 (Sease, eq. 2.15, corrected).
     """
     position, sun = np.asarray(position, dtype=float), np.asarray(sun, dtype=float)
     distance = np.linalg.norm(position, axis=-1)

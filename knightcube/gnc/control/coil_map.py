@@ -132,15 +132,12 @@ class CoilMap:
         return len(self.current_limits) > 3
 
     def working(self, used: BoolArray, assumed: float = 0.5) -> CoilMap:
-        """Return the map of the working coils, with the limits and the heating power of these coils.
+        """Return the map of the coils `used` (n,), with the limits and the heating power of these coils.
 
-        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed. To
-        produce the same torque without a dipole moment along the normal, the allocation adds a dipole moment
-        along the magnetic field, which causes no torque. Raises UsageError if all working coils are parallel.
-
-        Args:
-            used: flags (n,), true for the working coils.
-            assumed: dipole moment of the assumed coil, as a fraction of that of the weakest coil.
+        If the axes of the working coils lie in a plane, a coil along the normal of the plane is assumed, with
+        the dipole moment `assumed` as a fraction of that of the weakest coil. To produce the same torque
+        without a dipole moment along the normal, the allocation adds a dipole moment along the magnetic
+        field, which causes no torque. Raises UsageError if all working coils are parallel.
         """
         if used.all():
             return self

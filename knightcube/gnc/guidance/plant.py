@@ -39,12 +39,10 @@ from knightcube.errors import UsageError
 
 
 def supply_power(current: FloatArray, voltage: float) -> FloatArray:
-    """Return the power V |I|, W, that coils take from the supply.
+    """Return the power V |I|, W, that coils take from the supply for mean currents over a PWM period, A.
 
-    Args:
-        current: mean coil currents over a PWM period, as an array of any shape, A.
-        voltage: V. With the voltage across a driven coil (`coils.supply_voltage`), the result is the power at
-            the coils. With the bus voltage before the H-bridge, the result is the power taken from the bus.
+    With the voltage across a driven coil (`coils.supply_voltage`), the result is the power at the coils. With
+    the bus voltage before the H-bridge, the result is the power taken from the bus.
     """
     return np.asarray(voltage * np.abs(current))
 

@@ -189,12 +189,9 @@ def log10_chance(
 ) -> float:
     """Return log10 of an upper bound on the expected number of limbs that fit equally well by chance.
 
-    Args:
-        limb: length of the limb in the image, and its crossings with scan lines.
-        residuals: distances from the fitted limb of the k edges that belong to the limb (k,), px.
-        others: distances of all other edges from the limb (m,), px.
-        camera: camera that took the image.
-        unknowns: number of fitted parameters, 2 for nadir alone and 3 for nadir and altitude.
+    The distances from the fitted limb, px, are `residuals` (k,) for the edges that belong to the limb, and
+    `others` (m,) for all other edges. The number of fitted parameters `unknowns` is 2 for nadir alone and 3
+    for nadir and altitude.
     """
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)

@@ -300,13 +300,9 @@ def shared_error(
 ) -> FloatArray:
     """Return the covariance (5, 5) of a fit's parameters due to errors common to the rays of a group.
 
-    Args:
-        fit: the fitted limb, whose covariance assumes independent errors of the rays.
-        rays: the fitted rays (n, 3).
-        sigma: standard deviations of the rays (n,), rad.
-        prior: the prior of the fit.
-        groups: index of the group to which each ray belongs (n,).
-        error: standard deviation of the common error of the rays of each group (groups,), rad.
+    The covariance of the fit assumes independent errors of the rays (n, 3) with the standard deviations
+    `sigma` (n,), rad. Each ray belongs to one of the `groups` (n,), whose common errors have the standard
+    deviations `error` (groups,), rad.
     """
     _, gradients = limb_gradients(fit.view, rays)
     weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
@@ -479,11 +475,9 @@ def fit_profiles(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the limb positions on n scan lines, px, their standard deviations, px, and a mask of valid fits.
 
-    Args:
-        profiles: brightness along n scan lines (n, m), or NaN for missing samples.
-        steps: positions of the samples relative to the edge (n, m), px, positive towards the bright side.
-        metres: decrease of the tangent height per pixel on each scan line (n,), m.
-        blur: standard deviation of the blur on each scan line (n,), m.
+    The profiles (n, m) contain the brightness, or NaN for missing samples, at the positions `steps` (n, m),
+    px, relative to the edge, positive towards the bright side. The tangent height decreases by `metres` (n,),
+    m, per pixel, and the blur (n,), m, is a standard deviation.
     """
     usable = np.isfinite(profiles) & (steps >= _OUTSIDE) & (steps <= _INSIDE)
     light = np.where(usable, profiles, 0.0)

@@ -237,15 +237,10 @@ def refine(
 ) -> Refinement | None:
     """Return the attitude and scale that best transform `reference` directions into `observed` directions.
 
-    Returns None if the stars do not determine attitude and scale, or if the fit diverges.
-
-    Args:
-        observed: observed unit vectors to the stars (n, 3), camera frame, at scale 1.
-        reference: unit vectors to the same stars from the catalogue (n, 3), ICRS.
-        sigma: standard deviation of each observed direction (n,), rad, at scale 1.
-        matrix: initial attitude matrix (3, 3), ICRS to camera.
-        scale: initial scale, or the fixed scale.
-        free_scale: whether the scale is fitted.
+    The unit vectors `observed` (n, 3), camera frame, and their standard deviations `sigma` (n,), rad, are
+    given at scale 1. The unit vectors `reference` (n, 3) are ICRS. The fit starts from the attitude matrix
+    (3, 3) and the scale, which is fixed unless `free_scale` is true. Returns None if the stars do not
+    determine attitude and scale, or if the fit diverges.
     """
     settled, matrix, scale, covariance, squares = _refined(
         np.ascontiguousarray(observed),

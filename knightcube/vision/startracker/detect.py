@@ -387,19 +387,11 @@ def measure_near(
 ) -> Detections:
     """Return the stars near predicted positions, the brightest first.
 
-    Only windows around the predictions are read. A prediction gives a star only if a peak within the search
-    radius exceeds the threshold. A peak near several predictions is assigned to the nearest prediction.
-
-    Args:
-        pixels: counts of the frame (rows, columns).
-        predicted: predicted positions (m, 2), px; positions outside the frame are ignored.
-        settings: detection settings, or None for the defaults.
-        trail: displacement of each star during the exposure (m, 2), px, of at most a few pixels, or None for
-            no displacement.
-
-    Raises:
-        ValueError: unless pixels and predictions are finite real numbers and the frame has at least 16 x 16
-            pixels.
+    Only windows around the predictions (m, 2), px, are read; predictions outside the frame are ignored. A
+    prediction gives a star only if a peak within the search radius exceeds the threshold. A peak near several
+    predictions is assigned to the nearest prediction. During the exposure, each star moves by `trail` (m, 2),
+    px, at most a few pixels. Raises ValueError unless pixels and predictions are finite real numbers and the
+    frame has at least 16 x 16 pixels.
     """
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)

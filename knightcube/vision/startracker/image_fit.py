@@ -116,15 +116,9 @@ def fit_in_image(
 ) -> ImageFit:
     """Return the attitude that maps the star directions `reference` to the image positions `points`.
 
-    Args:
-        points: measured positions of the stars (n, 2), px.
-        covariance: covariances of the positions (n, 2, 2), px^2.
-        reference: unit vectors to the stars from the catalogue (n, 3).
-        camera: camera model.
-        start: approximate attitude quaternion (4,) from reference to camera axes.
-        unknowns: parameters that are fitted together with the attitude.
-
-    Raises AttitudeError if the stars do not determine the parameters.
+    The positions (n, 2), px, have the covariances (n, 2, 2). The unit vectors (n, 3) are those of the
+    catalogue. The fit starts from the quaternion `start` (4,), reference to camera axes, and fits the
+    `unknowns` together with the attitude. Raises AttitudeError if the stars do not determine the parameters.
     """
     # The array `slopes` (n, 3, 2) contains the derivatives of the directions with respect to the positions.
     moved = [

@@ -209,19 +209,13 @@ def measure_noise(
     noise: FloatArray,
     gain: float | None,
 ) -> NoiseModel:
-    """Return the noise model from the residuals of a fit of stars; a given gain is kept.
+    """Return the noise model from the residuals of a fit of stars; a given gain (e/count) is kept.
 
-    The squared residual minus the squared sky noise is modelled as a sum of non-negative multiples of light
-    and light^2, found by least squares. Each squared residual is weighted with the reciprocal of its
-    variance, which is computed for normally distributed residuals.
-
-    Args:
-        residual: residuals of the fit (n, k, k), counts.
-        variance: assumed variances of the residuals (n, k, k), counts^2; infinite for unused pixels.
-        leverage: fraction of the variance of each residual that the fit has absorbed (n, k, k).
-        light: fitted counts of the stars (n, k, k).
-        noise: standard deviation of a background pixel in each window (n,), counts.
-        gain: electrons per count, if known.
+    The residuals (n, k, k), counts, have the assumed variances (n, k, k), which are infinite for unused
+    pixels. The fit has absorbed the fraction `leverage` (n, k, k) of each variance, and `light` (n, k, k) is
+    the fitted counts. The squared residual minus the squared sky noise (n,) is modelled as a sum of
+    non-negative multiples of light and light^2, found by least squares. Each squared residual is weighted
+    with the reciprocal of its variance, which is computed for normally distributed residuals.
     """
     used = np.isfinite(variance) & (light > 0.5 * noise[:, None, None]) & (leverage < 0.8)
     given = 0.0 if gain is None else 1.0 / gain
@@ -393,16 +387,10 @@ def fit(
     free_width: bool,
     steps: int = 4,
 ) -> PsfFit:
-    """Return the fits of the stars in `windows`.
+    """Return the fits of the stars in `windows` after `steps` Gauss-Newton steps.
 
-    Args:
-        windows: windows around the stars.
-        offset: initial positions relative to the middle of the window (n, 2), px.
-        flux: initial fluxes (n,), counts.
-        width: initial standard deviations of the Gaussians (n,), px.
-        noise: noise model of the pixels.
-        free_width: whether the width of each star is fitted.
-        steps: number of Gauss-Newton steps.
+    The initial positions `offset` (n, 2), px, are relative to the middle of the window, the initial fluxes
+    (n,) are in counts, and the initial widths (n,) are standard deviations of the Gaussians, px.
     """
     values = np.concatenate([offset, flux[:, None], np.zeros((len(flux), 1)), width[:, None]], axis=1)
     shift, share = zip(*path(windows.trail), strict=True)

@@ -191,13 +191,9 @@ def verify(
 ) -> StarMatch:
     """Return the identification of the whole field, or NO_MATCH if the candidate may be a chance match.
 
-    Args:
-        field: observed points of the frame.
-        sky: index of the guide stars.
-        matrix: attitude matrix of the candidate (3, 3), ICRS to camera, accurate enough for stars to match.
-        scale: image scale of the candidate attitude.
-        searched: fraction of all attitudes that the search for the candidate covered; 1 for lost in space.
-        settings: settings of the verification.
+    The candidate has an attitude matrix (3, 3), ICRS to camera, accurate enough for stars to match, and an
+    image scale. The search for the candidate covered the fraction `searched` of all attitudes, 1 for lost in
+    space.
     """
     return verify_first(field, sky, matrix[None], np.array([scale]), searched, settings)
 

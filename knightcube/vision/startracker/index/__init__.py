@@ -320,15 +320,12 @@ def reach(direction: FloatArray, rank: int, farthest: float, least: float = 0.0)
 
 
 def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, few: int) -> TriangleIndex:
-    """Return the index of the triangles of stars.
+    """Return the index of the triangles of stars, whose unit vectors (n, 3) begin with the brightest star.
 
-    Args:
-        direction: unit vectors to the stars (n, 3), the brightest first.
-        sizes: limits (b + 1,) of the b bands in which triangles are sorted by their longest side, as chords.
-        ranks: limit for each band (b,). A star is a corner of triangles of a band only if fewer brighter
-            stars than this limit are closer to the star than the triangle's longest side.
-        few: number of stars per circle. The sky is covered by circles with the radii `sizes`, and the
-            triangles of the `few` brightest stars of each circle are added.
+    Triangles are sorted by their longest side into b bands with the limits `sizes` (b + 1,), which are
+    chords. A star is a corner of triangles of a band only if fewer brighter stars than the limit `ranks` (b,)
+    of the band are closer to the star than the triangle's longest side. The sky is also covered by circles
+    with the radii `sizes`, and the triangles of the `few` brightest stars of each circle are added.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
