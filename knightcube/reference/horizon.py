@@ -7,20 +7,18 @@ change from 0 to 1 is the edge of the horizon.
 Circle fit (Meller et al., section 3.2.1): The centre and radius of the horizon circle are computed by a
 pseudo-inverse. The method assumes that the image has no distortion and that the horizon is a circle on the
 flat detector, which is valid near the optical axis only. Meller et al. do not state from which side the image
-is scanned; this implementation scans from the darkest border. Meller et al. do not state how to compute nadir
-from the circle in the image of one camera. This implementation assumes that the point of the circle closest
-to the optical axis lies on the limb. Nadir is on the line from the closest point of the circle to its centre,
-at the Earth's angular radius from the point. The lens distortion is removed before the circle fit. The circle
-fit does not distinguish between limb and terminator.
+is scanned (here from the darkest border), nor how to compute nadir from the circle in the image of one
+camera. This implementation removes the lens distortion before the fit, and assumes that the point of the
+circle closest to the optical axis lies on the limb. Nadir is on the line from this point to the centre, at
+the Earth's angular radius from the point. The circle fit does not distinguish between limb and terminator.
 
 Graphic Method (Meller et al., section 3.2.2 and Fig. 10): The limb is a circle in the horizon plane, whose
 distance below the satellite follows from the altitude. The plane through the centre column of a camera image
 contains the body's z axis and intersects the horizon plane in a line. The lines of two cameras intersect in a
-point Z on the body's z axis. The vector from the intersection point Z to the centre of the horizon circle
-gives the angle between the z axis and nadir. Meller et al. do not state the image scale (px/km) of the
-Graphic Method. This implementation uses an image scale equal to the distance of the circle's centre below the
-optical axis (px), divided by the distance of the horizon plane below the satellite (km). The chosen image
-scale is exact for tilts about an optical axis, and exact to first order for other tilts of level cameras.
+point Z on the z axis. The vector from Z to the centre of the horizon circle gives the angle between the z
+axis and nadir. Meller et al. do not state the image scale (px/km). Here it is the distance of the circle's
+centre below the optical axis (px), divided by the distance of the horizon plane below the satellite (km),
+which is exact for tilts about an optical axis, and exact to first order for other tilts of level cameras.
 
 Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from direction Q to
 direction P, the shortest rotation from Q to P rotates the old nadir direction to the new nadir direction. A

@@ -1,17 +1,15 @@
 """Tables for the classical methods of star identification: pairs, triangles and grid patterns of guide stars.
 
 Pair table (Michalski, sections 3.3.1 and 3.3.4, eq. 49-61): A pair consists of two star indices and the angle
-between the stars. The angle of a pair is stored as float32, with a rounding error of at most 0.003" for
-angles below 0.5 rad. Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range
-without a binary search (Mortari & Neta, K-vector range searching techniques, 2000). A k-vector approximates
-the sorted keys by a straight line. The k-vector contains, for evenly spaced values on the straight line, the
-number of keys below each value. The cell (interval) of the k-vector that contains a value follows from the
-inverse of the straight line, so that two look-ups give the beginning and end of a range of keys. Ranges of
-keys are half-open (low <= key < high). Equation 61 of Michalski also returns some keys just outside the
-range. This implementation returns exactly the keys of the range, because it compares the keys in the two
-boundary cells. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in the original paper, so that
-the straight line ends above the largest key. The margin 2.22e-16 in equation 56 of Michalski is replaced by a
-margin proportional to the magnitude of the keys.
+between the stars, stored as float32 with a rounding error of at most 0.003" for angles below 0.5 rad. Pairs
+are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary search
+(Mortari & Neta, K-vector range searching techniques, 2000). A k-vector approximates the sorted keys by a
+straight line, and contains, for evenly spaced values on the line, the number of keys below each value. Two
+look-ups then give the beginning and end of a range of keys, which is half-open (low <= key < high). Equation
+61 of Michalski also returns some keys just outside the range; this implementation compares the keys in the
+two boundary cells. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in the original paper, so
+that the straight line ends above the largest key. The margin 2.22e-16 in equation 56 of Michalski is replaced
+by a margin proportional to the magnitude of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
 triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
@@ -25,9 +23,8 @@ into one frame, sorted by area with a k-vector. The corners of a triangle are or
 opposite side, so that matching triangles also have matching corners.
 
 Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells that the
-neighbouring stars occupy. The star is the origin of a tangent plane, and the nearest neighbour outside a
-buffer radius defines the +x axis. Each further neighbouring star within the pattern radius occupies one cell
-of the grid.
+neighbouring stars within the pattern radius occupy on the tangent plane. The nearest neighbour outside a
+buffer radius defines the +x axis.
 
 Each table is built at its first use, so that only the tables of the methods in use need memory.
 """

@@ -2,17 +2,16 @@
 
 The solar strings determine which camera is read first. If no camera finds the Sun, the Sun direction is
 computed from the solar strings. The nadir direction is fitted to the limbs in all images at once. If no image
-shows a limb, the Earth may fill one camera while the others are dark. The brightness of all images gives a
-coarse nadir direction if no image shows a limb. The modules of the estimators are imported at their first
-use, because the control process does not need them.
+shows a limb, the brightness of all images gives a coarse nadir direction, because the Earth may fill one
+camera while the others are dark. The modules of the estimators are imported at their first use, because the
+control process does not need them.
 
 The spacecraft's own structure is masked in the images. A mask is configured (polygons or an image file), or
-is estimated from successive frames. While the limb moves over the image, the brightness of each pixel of the
-scene changes repeatedly, whereas the brightness of the structure stays constant. `StructureMap` compares the
-mean brightness of square blocks of pixels with that in the last counted frame. A frame is counted if a
-quarter of its blocks have changed. A block that did not change in `_QUIET_FRAMES` successive counted frames
-shows structure. A block whose brightness changes is at once removed from the mask, so that a wrong mask does
-not hide a limb.
+is estimated from successive frames. While the limb moves over the image, the brightness of the scene changes
+repeatedly, whereas that of the structure stays constant. `StructureMap` compares the mean brightness of
+square blocks of pixels with that in the last counted frame. A frame is counted if a quarter of its blocks
+have changed. A block that did not change in `_QUIET_FRAMES` successive counted frames shows structure. A
+block whose brightness changes is at once removed from the mask, so that a wrong mask does not hide a limb.
 """
 
 from __future__ import annotations

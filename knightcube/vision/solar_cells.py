@@ -1,13 +1,12 @@
 """Sun direction and attitude from the currents of solar cells (Meller et al., chapter 2).
 
 A solar string is a series connection of solar cells on one face of the body, so that all its cells carry the
-same current. The current of a string is proportional to the cosine of the angle between the Sun and the
-string's normal, and zero if the Sun is behind the string. The Earth also illuminates the solar strings, with
-at most a third of the intensity of the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of
-the light from the half of the sky that is centred on nadir e. Light from the Earth causes correlated errors
-of the strings. The correlation of the errors can be computed if nadir is known; otherwise the mean
-correlation over all nadir directions is used. The covariance of the Sun direction includes the correlated
-errors that light from the Earth causes.
+same current. The current is proportional to the cosine of the angle between the Sun and the string's normal,
+and zero if the Sun is behind the string. The Earth also illuminates the strings, with at most a third of the
+intensity of the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light from the half
+of the sky that is centred on nadir e. This light causes correlated errors of the strings, which the
+covariance of the Sun direction includes. The correlation can be computed if nadir is known; otherwise its
+mean over all nadir directions is used.
 
 The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if one
 string fails, in whatever way. The magnetic field does not determine the rotation about the field direction.

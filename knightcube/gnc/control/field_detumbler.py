@@ -1,47 +1,46 @@
 """Detumbling of a free satellite with the magnetometer, and with gyro and attitude if available.
 
-The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first
-until the field of the coils has decayed, then to measure the field. The driven phase between two pauses is
-short while the estimated rate is uncertain, for example with the magnetometer alone. The filter
-`knightcube.gnc.estimation.field_rate` uses the samples in these pauses to estimate all components of the body
-rate and the rotation of the field in inertial axes. A gyro sample shows the rate along the field immediately.
-The momentum plan uses a predicted field. If the orbit is known, the field is predicted along the orbit.
-Without a known attitude, the predicted field is rotated so that its direction and its change agree with the
-measured field. Without a known orbit, the measured field is assumed to continue to rotate at the present
-rate. In an orbit near the equator, however, the field's direction only oscillates by some 20 deg. In contrast
-to B-dot control, this detumbler also removes a spin along the field as soon as the field has rotated. The
-coils stay off until `TRUSTED` consecutive samples agree with the prediction of the filter and the standard
-deviation of the rate across the field is below `BOUNDED`. While the coils stay off, samples outside the
-pauses are used as well. The coils are switched off again if no sample was accepted for `SILENT_PERIODS`
+The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, until
+their field has decayed and the field is measured. The driven phase between two pauses is short while the
+estimated rate is uncertain. The filter `knightcube.gnc.estimation.field_rate` uses the samples in these
+pauses to estimate all components of the body rate and the rotation of the field in inertial axes. A gyro
+sample shows the rate along the field immediately.
+
+The momentum plan uses a predicted field: along the orbit, if it is known, and rotated so that direction and
+change agree with the measured field if the attitude is unknown. Without a known orbit, the measured field is
+assumed to continue to rotate at the present rate. In an orbit near the equator, however, the field's
+direction only oscillates by some 20 deg. In contrast to B-dot control, this detumbler also removes a spin
+along the field as soon as the field has rotated. The coils stay off until `TRUSTED` consecutive samples, also
+from outside the pauses, agree with the prediction of the filter and the standard deviation of the rate across
+the field is below `BOUNDED`. The coils are switched off again if no sample was accepted for `SILENT_PERIODS`
 periods, because a restarted sensor may give only unusable fields.
 
-The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
-momentum h obeys h' = m x B, where m is the dipole moment and B the field. The equation h' = m x B contains
-neither inertia nor attitude. By Pontryagin's principle, the dipole moment of minimum time has the maximum
-magnitude L and the direction of -B x y, where the costate y is a constant vector. The momentum can be reduced
-to at most r within the time T if and only if every vector y satisfies the inequality
+The plan stops the body in the minimum time with the predicted field. In inertial axes the angular momentum h
+obeys h' = m x B, where m is the dipole moment and B the field, with neither inertia nor attitude. By
+Pontryagin's principle, the dipole moment of minimum time has the maximum magnitude L and the direction of -B
+x y, where the costate y is a constant vector. The momentum can be reduced to at most r within the time T if
+and only if every vector y satisfies the inequality
 
     h . y <= L (integral of |B x y| over the time T) + r |y|.
 
 The minimum time is the smallest T for which every vector y satisfies this inequality, and the planned costate
-is the vector y for which both sides are equal. For the planned costate y, A(y) y is parallel to h, where A is
-the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. The planned costate is found by iteratively
-reweighted least squares: in each iteration, the matrix A is computed with the last costate, and the next
-costate is computed from A. Momentum along the field can be removed only after the field has rotated. The
-minimum-time plan may first add momentum across the field, which is removed later. The plan leaves a residual
-momentum r, because the removal of the last momentum along a slowly rotating field would take most of the
-time.
+is the vector y for which both sides are equal. For this costate, A(y) y is parallel to h, where A is the
+integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. It is found by iteratively reweighted least squares: in
+each iteration, A is computed with the last costate, and the next costate from A. Momentum along the field can
+be removed only after the field has rotated, so the plan may first add momentum across the field. The plan
+leaves a residual momentum r, because the removal of the last momentum along a slowly rotating field would
+take most of the time.
 
 If a body spins along the field, the minimum-time plan first accelerates the body about an axis across the
-field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy.
-If the rate or the energy has reached its upper bound, the commanded dipole moment does not increase it. If
-the bounds equal the initial values, detumbling takes longer, because a spin along the field is then stopped
-only after the field has rotated by a right angle.
+field. The settings `gentle` and `spin_up` therefore give upper bounds of the rate and of the kinetic energy,
+at which the commanded dipole moment does not increase them. If the bounds equal the initial values,
+detumbling takes longer, because a spin along the field is then stopped only after the field has rotated by a
+right angle.
 
 The magnetometer alone shows the rate along the field only after the field has rotated. Until all components
-of the rate are known, the coils therefore do no positive work. The work of the coils depends on the rate
-across the field, but neither on the rate along the field nor on the inertia tensor. Without a torque, the
-rate of a body with unequal moments of inertia changes, but its kinetic energy does not.
+of the rate are known, the coils therefore do no positive work. The work depends on the rate across the field,
+but neither on the rate along the field nor on the inertia tensor. Without a torque, the rate of a body with
+unequal moments of inertia changes, but its kinetic energy does not.
 """
 
 from __future__ import annotations

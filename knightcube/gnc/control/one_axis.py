@@ -1,37 +1,34 @@
 """Control about one axis with a linear-quadratic tracker, and excitation manoeuvres that identify the plant.
 
 The tracker applies feedback linearisation to the attitude error and then a linear-quadratic regulator (Sease
-2013, eqs. (5.16) to (5.32)). The error is e = sin(theta_p - theta) (Sease, eq. (5.21)), where theta_p is the
-angle of the path and theta the angle of the body. The derivatives of the error (Sease, eqs. (5.24) to (5.27),
+2013, eqs. (5.16) to (5.32)). The error is e = sin(d), d = theta_p - theta (Sease, eq. (5.21)), where theta_p
+is the angle of the path and theta the angle of the body. Its derivatives (Sease, eqs. (5.24) to (5.27),
 corrected) are
 
     e'  = cos(d) (theta_p' - w)
-    e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
+    e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2.
 
-The regulator demands e'' = v = -K (e', e), with the gain K from the Riccati equation. The expression for the
-second derivative e'' is solved for the angular acceleration w', and the plant model converts w' into the
-current.
+The regulator demands e'' = -K (e', e), with the gain K from the Riccati equation. The expression for e'' is
+solved for the angular acceleration w', and the plant model converts w' into the current.
 
 The tracker extends the controller of Sease's thesis by two features, which the option `as_in_thesis` switches
 off. The first feature is a feedforward of the estimated disturbance, so that a constant torque causes no
-offset. The disturbance estimator integrates the acceleration that the plant model did not predict. Integrator
-windup cannot occur, because the disturbance estimator uses the limited current. The second feature limits the
-rate at which an angle error is reduced, so that the coil can decelerate the body in time and the angle does
-not overshoot. Small errors are reduced at the rate s e with s = K_e / K_e', and errors above A / s^2 at the
-rate sqrt(2 A |e| - (A / s)^2), where A is the available deceleration. The rate limit is that of the proximate
-time-optimal servomechanism (Workman 1987), but with a continuous slope.
+offset. The estimator integrates the acceleration that the plant model did not predict, without windup,
+because it uses the limited current. The second feature limits the rate at which an angle error is reduced, so
+that the coil can decelerate the body in time and the angle does not overshoot. Small errors are reduced at
+the rate s e with s = K_e / K_e', and errors above A / s^2 at the rate sqrt(2 A |e| - (A / s)^2), where A is
+the available deceleration. The rate limit is that of the proximate time-optimal servomechanism (Workman
+1987), but with a continuous slope.
 
 The error e = sin(d) is monotonic in d only up to 90 degrees. The angle error d is therefore clamped to
-`largest_error`. With the clamped angle error, the demanded acceleration stays bounded and does not decrease
-for larger errors.
+`largest_error`, so that the demanded acceleration stays bounded and does not decrease for larger errors.
 
-The excitation manoeuvres do not follow a path. Before the first manoeuvre, the tracker brings the body to
-rest. Long and short current pulses rotate the body away from rest and back, and the torque constant and the
-delay are identified from the response. Further pulses displace the body, which then oscillates with the coils
-off, and stiffness and damping are identified from the oscillation. All pulses are repeated with the opposite
-sign. Between manoeuvres the tracker brings the body to rest again. The tracker also replaces a manoeuvre if
-the body could otherwise not be stopped within the allowed angle. If the tracker cannot bring the body to
-rest, the current stays zero.
+The excitation manoeuvres do not follow a path. Long and short current pulses rotate the body away from rest
+and back, and the torque constant and the delay are identified from the response. Further pulses displace the
+body, which then oscillates with the coils off, and stiffness and damping are identified from the oscillation.
+All pulses are repeated with the opposite sign. Before and between manoeuvres, the tracker brings the body to
+rest. The tracker also replaces a manoeuvre if the body could otherwise not be stopped within the allowed
+angle. If it cannot bring the body to rest, the current stays zero.
 """
 
 from __future__ import annotations

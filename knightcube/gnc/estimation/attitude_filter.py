@@ -1,27 +1,24 @@
 """A multiplicative extended Kalman filter of attitude, rate and biases that accepts late measurements.
 
 The filter applies each measurement at the time for which the measurement is valid. If a measurement arrives
-late, it is inserted at its measurement time, and all later measurements are applied again. These later
-measurements are applied either in a single call, or a few in each call while the filter continues without the
-late measurement (module `replay`). The rate from a streaked image is the mean rate during the exposure. The
-filter therefore stores the attitude at the start of an exposure until the exposure ends. The filter can also
-estimate the age of the inertial unit's samples (module `mekf`). For a body that hangs on the testbed's
-thread, the filter uses only the component of each measurement about the thread. The torsion and the damping
-of the thread are either known or estimated by the filter. The filter can distinguish the thread's torques
-from the estimated disturbance, because only the thread's torques depend on the angle and the rate.
+late, it is inserted at its time, and all later measurements are applied again, either in a single call, or a
+few in each call while the filter continues without the late measurement (module `replay`). The rate from a
+streaked image is the mean rate during the exposure, so the filter stores the attitude at the start of an
+exposure until the exposure ends. The filter can also estimate the age of the inertial unit's samples (module
+`mekf`). For a body that hangs on the testbed's thread, the filter uses only the component of each measurement
+about the thread. The torsion and the damping of the thread are either known or estimated by the filter. The
+filter can distinguish the thread's torques from the estimated disturbance, because only the thread's torques
+depend on the angle and the rate.
 
 The class `CommandCheck` compares the gyro samples with the commands to check whether the coils carry the
-commanded currents. While a coil is broken, the model predicts an acceleration that does not occur. With a
-broken coil, the innovations of the gyro become inconsistent with their covariance within a few samples. While
-the coils work, the innovations of the gyro remain consistent with their covariance. If the innovations are
-inconsistent, the filter treats the coil currents as unknown and follows the gyro. The coil currents of the
-last half second before the detection are also treated as unknown. A change of the rate that no coil current
-can cause is not evidence of wrong coil currents, because the gyro may be faulty. The commands are trusted
-again when the rate follows the commands. The model z = b + g c is fitted to the gyro samples z of the last
-second, where c is the change of the rate that the commands should cause. The commands are confirmed if the
-response g is well determined and is 1 within its uncertainty, and if the residuals are white. While the coils
-are not driven, the response is not determined, so the commands cannot become trusted again. If the gyro is
-noisier than assumed, the check increases its limits and does not raise an alarm.
+commanded currents. With a broken coil, the innovations of the gyro become inconsistent with their covariance
+within a few samples. The filter then treats the coil currents, also those of the last half second, as unknown
+and follows the gyro. A change of the rate that no coil current can cause is not evidence of wrong coil
+currents, because the gyro may be faulty. The commands are trusted again when the rate follows the commands.
+The model z = b + g c is fitted to the gyro samples z of the last second, where c is the change of the rate
+that the commands should cause. The commands are confirmed if the response g is well determined and is 1
+within its uncertainty, and if the residuals are white. While the coils are not driven, the response is not
+determined. If the gyro is noisier than assumed, the check increases its limits and does not raise an alarm.
 """
 
 from __future__ import annotations

@@ -1,38 +1,29 @@
 """The navigation filter of a free satellite whose mass properties and sensor errors are not exactly known.
 
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
-gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. The
-filter of the module `attitude_filter` replays each late sample at its time. Here, a late attitude is
-propagated to the present with the present rate, whose error is included in the innovation. This is accurate
-for some seconds if the body rotates slowly enough for star images.
+gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. In
+contrast to `attitude_filter`, which replays each late sample at its time, a late attitude is propagated to
+the present with the present rate, whose error is included in the innovation. This is accurate for some
+seconds if the body rotates slowly enough for star images. Besides attitude and rate, the error state (see
+`error_state`) contains these blocks:
 
-Besides attitude and rate, the error state (see `error_state`) contains blocks for the errors of the
-satellite's description.
-
-The block `inertia` contains the errors of the inertia tensor, relative to the trace. Euler's equation is
-linear in the errors of the inertia tensor. In a tumble about more than one axis, the ratios of the moments of
-inertia and the principal axes are observable (Psiaki 2005, JGCD 28(4)). The common scale of the inertia is
-observable only relative to the dipole moment of the coils.
-
-The block `coils` is the matrix of gain errors and misalignments of the coils. The estimated dipole is the
-commanded dipole plus this matrix times the commanded dipole. The blocks `gyro_matrix` and `field_matrix` are
-the scale factor errors and misalignments of gyro and magnetometer (Pittelkau 2001, JGCD 24(6)).
-
-The block `camera` is the misalignment of the star camera. The attitude of the star camera is known more
-accurately than that of the body, whose uncertainty includes the misalignment of the camera. The block
-`horizon` is the misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
-horizon cameras are used, so this block is a Gauss-Markov process with a long correlation time.
-
-The block `coil_variation` is the relative variation of the dipole along each body axis, for example because
-the supply voltage varies. It is a Gauss-Markov process with a correlation time of tens of seconds.
-
-Further blocks are the biases of gyro and magnetometer, the residual dipole in shadow, its increase in
-sunlight, and the components of the disturbance torques of `knightcube.astro.earth.disturbance`.
-
-The block `field_error` is the error of the field model. The error of the field model is correlated over
-minutes, and is modelled as a Gauss-Markov process of first order in body axes. While the attitude is known
-accurately, the standard deviation of the field model's error is estimated by expectation maximisation
-(Dempster, Laird & Rubin 1977), from the square and the variance of the estimated error.
+- `inertia`: errors of the inertia tensor, relative to the trace, in which Euler's equation is linear. In a
+  tumble about more than one axis, the ratios of the moments of inertia and the principal axes are observable
+  (Psiaki 2005, JGCD 28(4)). The common scale is observable only relative to the dipole moment of the coils.
+- `coils`: matrix of gain errors and misalignments of the coils. The estimated dipole is the commanded dipole
+  plus this matrix times the commanded dipole.
+- `gyro_matrix`, `field_matrix`: scale factor errors and misalignments of gyro and magnetometer (Pittelkau
+  2001, JGCD 24(6)).
+- `camera`: misalignment of the star camera, whose attitude is known more accurately than that of the body.
+- `horizon`: misalignment of the horizon cameras that measure Sun and nadir. When the body rotates, other
+  cameras are used, so this block is a Gauss-Markov process with a long correlation time.
+- `coil_variation`: relative variation of the dipole along each body axis, for example because the supply
+  voltage varies, as a Gauss-Markov process with a correlation time of tens of seconds.
+- `field_error`: error of the field model, correlated over minutes, as a Gauss-Markov process of first order
+  in body axes. While the attitude is known accurately, its standard deviation is estimated by expectation
+  maximisation (Dempster, Laird & Rubin 1977), from the square and the variance of the estimated error.
+- Biases of gyro and magnetometer, the residual dipole in shadow, its increase in sunlight, and the components
+  of the disturbance torques of `knightcube.astro.earth.disturbance`.
 """
 
 from __future__ import annotations

@@ -1,21 +1,19 @@
 """The correction of a multiplicative extended Kalman filter by one measurement.
 
 The attitude error is a small rotation about the body axes (Lefferts, Markley and Shuster 1982). Each
-correction applies the estimated error to the quaternion and then rotates the covariance to the corrected
-axes. This step is the reset of Markley and Crassidis 2014, section 6.2.4. The rate is a state of the filter
-that is propagated by Euler's equation, because the plant model predicts the rate more accurately than the
-gyro measures it. Past attitudes that later measurements need are appended to the state (stochastic cloning,
-Roumeliotis and Burdick 2002).
+correction applies the estimated error to the quaternion and then rotates the covariance to the corrected axes
+(the reset of Markley and Crassidis 2014, section 6.2.4). The rate is a state of the filter that is propagated
+by Euler's equation, because the plant model predicts the rate more accurately than the gyro measures it. Past
+attitudes that later measurements need are appended to the state (stochastic cloning, Roumeliotis and Burdick
+2002).
 
-The filter estimates the age that the inertial unit's samples have at their time stamps. A sample is older
-than its time stamp because of the delays of the serial line, the driver's buffer and the filters inside the
-inertial unit. Between sample and time stamp, the attitude changes by rate times age, and the rate changes by
-acceleration times age. The innovations of the inertial unit's samples therefore depend on the age of the
-samples. Only attitude samples correct the estimated age. Rate samples do not correct the age, because the
-acceleration is mostly caused by the coils, which respond to the noise of earlier samples. An estimate of the
-age from rate samples would be a closed-loop identification and would drift with the noise while the attitude
-is held. A rate sample therefore treats the age as a considered parameter (Schmidt 1966): its variance and
-correlations enter the gains of all other states.
+The filter estimates the age that the inertial unit's samples have at their time stamps, because of the delays
+of the serial line, the driver's buffer and the filters inside the inertial unit. Between sample and time
+stamp, the attitude changes by rate times age, and the rate changes by acceleration times age. Only attitude
+samples correct the estimated age. The acceleration is mostly caused by the coils, which respond to the noise
+of earlier samples. An estimate of the age from rate samples would be a closed-loop identification and would
+drift with the noise while the attitude is held. A rate sample therefore treats the age as a considered
+parameter (Schmidt 1966): its variance and correlations enter the gains of all other states.
 """
 
 from __future__ import annotations

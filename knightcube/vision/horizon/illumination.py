@@ -2,22 +2,18 @@
 
 If the assumed view of the Earth is correct, the whole image agrees with it: sky and night side are dark, and
 the sunlit limb has edges along its entire length. A view that was fitted to the terminator instead of the
-limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish the limb from
-the terminator.
+limb does not agree with the image. Meller et al., section 3.3, do not state how to distinguish the two.
 
 If no image shows a limb, the Earth fills the field of one camera and the other cameras are dark (Meller et
-al., section 4.1). If the Earth fills the field of one camera, `coarse_nadir` tries nadir directions that
-cover the sphere. For each trial nadir, `coarse_nadir` predicts that the samples on the sunlit part of the
-Earth's disc are bright. The coarse nadir is the mean of the trial directions, weighted by their likelihood
-given the samples, and the covariance of the nadir is the spread of the weighted directions. If the direction
-of the Sun is unknown, any sample on the Earth's disc may be dark, because it may be on the night side.
-
-The function `why_not_space` tests whether the dark side of an assumed limb looks like space.
+al., section 4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere, and predicts for
+each that the samples on the sunlit part of the Earth's disc are bright. The coarse nadir is the mean of the
+trial directions, weighted by their likelihood, and the covariance is their spread. If the direction of the
+Sun is unknown, any sample on the Earth's disc may be dark, because it may be on the night side.
 
 The function `why_false` compares an image with the view from a known attitude. An image contradicts the
-attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be. An
-image contradicts the attitude if its camera has failed, is blinded, is mounted upside down or sends random
-data. The comparison excludes samples near the limb, in the twilight zone and near the Sun.
+attitude if it is mostly dark where sunlit ground must be, or mostly bright where only sky or night can be,
+because its camera has failed, is blinded, is mounted upside down or sends random data. The comparison
+excludes samples near the limb, in the twilight zone and near the Sun.
 """
 
 from __future__ import annotations

@@ -1,19 +1,17 @@
 """Initial guess of a horizon: the cone with which most edges agree, and the camera's rotation about nadir.
 
 All rays u to the limb of a sphere make the same angle rho with the nadir n. The limb therefore satisfies the
-equation u.g = 1, which is linear in g = n / cos rho (Christian & Robinson 2016). If the angle rho is known,
-two rays to the limb determine the nadir up to two solutions. If the angle rho is unknown, three rays to the
-limb determine rho and the nadir. Every pair of edges gives a trial cone, or every triple if the altitude is
-unknown. If there are too many pairs or triples of edges, an evenly spaced selection is used. An edge agrees
-with a cone if the edge lies near the cone and the bright side of the edge is towards nadir. The edges of the
-best cone are removed and the search is repeated, so that the terminator, a coast or a band of clouds gives a
-separate cone. The search for cones is a sample consensus (Fischler & Bolles 1981) without random selection.
+equation u.g = 1, which is linear in g = n / cos rho (Christian & Robinson 2016). Two rays to the limb
+determine the nadir up to two solutions if rho is known, and three rays determine rho and the nadir. Every
+pair of edges gives a trial cone, or every triple if the altitude is unknown, or an evenly spaced selection of
+them. An edge agrees with a cone if it lies near the cone and its bright side is towards nadir. The edges of
+the best cone are removed and the search is repeated, so that the terminator, a coast or a band of clouds
+gives a separate cone. The search is a sample consensus (Fischler & Bolles 1981) without random selection.
 
-A horizon does not determine the rotation about nadir. The rotation about nadir is needed because the Earth's
-flattening depends on the direction of the pole, and the illumination depends on the direction of the Sun. The
-rotation about nadir is derived from a rough attitude, the coarse direction of the Sun or the magnetic field.
-The angle between nadir and each known direction is also known, so that a nadir at a different angle is
-rejected.
+A horizon does not determine the rotation about nadir, which is needed because the Earth's flattening depends
+on the direction of the pole, and the illumination on the direction of the Sun. The rotation is derived from a
+rough attitude, the coarse direction of the Sun or the magnetic field. The angle between nadir and each known
+direction is also known, so that a nadir at a different angle is rejected.
 """
 
 from __future__ import annotations

@@ -7,16 +7,14 @@
 `find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
 the edges of each cone. Each fitted limb is tested against the number of edges expected by chance, the width
 of the atmosphere's brightness profile, the darkness of space, the brightness of the whole image, the coarse
-sensors and the rough attitude. If exactly one limb passes all tests, this limb gives the nadir. If several
-limbs pass all tests, the image is ambiguous. If no limb passes all tests, the image is refused, and the
-result contains the reason.
+sensors and the rough attitude. If exactly one limb passes all tests, it gives the nadir. Otherwise the image
+is ambiguous or refused, and the result contains the reason.
 
 The function `nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four
 cameras). The nadirs found by different cameras must agree. An image that gave no nadir, or several nadirs, is
 searched again with the nadir of the other cameras as prior knowledge. One common limb is fitted to the limb
-points of all images. The apparent limb is at an unknown height above the ground, so every limb is displaced
-outwards. An unknown limb height displaces the nadir only if the images show one side of the limb but not the
-opposite side.
+points of all images. Its unknown height above the ground displaces the nadir only if the images show one side
+of the limb but not the opposite side.
 """
 
 from __future__ import annotations

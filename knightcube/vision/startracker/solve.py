@@ -1,8 +1,8 @@
 """Attitude of a frame from its stars, in steps that `knightcube.vision.frame_job` selects.
 
-If the stars are points, the package `detection` measures their positions. If the stars are streaks, their
-fitted positions at mid-exposure are used instead. Identification first searches near a prior attitude, if
-there is one, and then in the whole sky. The resulting attitude is that at mid-exposure.
+If the stars are points, the module `detect` measures their positions. If the stars are streaks, their fitted
+positions at mid-exposure are used instead. Identification first searches near a prior attitude, if there is
+one, and then in the whole sky. The resulting attitude is that at mid-exposure.
 
 During an exposure at a constant rate, the middle of a streak is the position of the star at mid-exposure.
 During an exposure of length T, an angular acceleration a displaces the centroid of a point by a T^2 / 24, and

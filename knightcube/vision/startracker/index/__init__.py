@@ -3,32 +3,28 @@
 The file begins with a header, which contains 8 magic bytes that identify the kind of table, the version
 (uint32), the CRC-32 of everything after the header (uint32), and the length of the table of contents
 (uint32). The table of contents is in JSON format and is followed by the columns, which are little-endian and
-begin at multiples of 64 bytes. The same columns always give a file with the same bytes.
+begin at multiples of 64 bytes. The command `python -m knightcube.vision.startracker.index.build` builds the
+index. The same stars and settings give a file with the same bytes.
 
 Guide stars are the catalogue stars as a given lens resolves them (Michalski, section 3.3). Proper motion is
 applied up to the epoch of observation. Stars that an image cannot resolve are merged into one star at their
-centroid, with their combined magnitude. Aberration is not included in the index, because it depends on the
-velocity of the camera; it is applied to the matched directions on board.
+centroid, with their combined magnitude. Aberration depends on the velocity of the camera; it is applied to
+the matched directions on board.
 
 The index contains only triangles of stars that are bright relative to the size of the triangle. The distance
 from a star to the `rank`-th nearest of all brighter stars is called the reach of the star. The index contains
 a triangle if its longest side is at most the reach of each of its three stars. Each star of the triangle is
-then one of the `rank` brightest stars in the circle around the star with the longest side as radius. The
-index does not depend on the field of view. About the same number of triangles of the brightest stars is found
-in frames of any field of view. Dense regions of the sky do not have more triangles than sparse regions,
-because the stars of dense regions have a shorter reach. Near a cluster of bright stars, the reach of all
-stars is so short that there would be too few triangles. The sky is therefore also covered by circles of
-several radii, and the triangles of the `few` brightest stars of each circle are added to the index.
+then one of the `rank` brightest stars in the circle around the star with the longest side as radius. About
+the same number of triangles of the brightest stars is therefore found in frames of any field of view, and in
+dense as in sparse regions of the sky. Near a cluster of bright stars, the reach of all stars is so short that
+there would be too few triangles. The sky is therefore also covered by circles of several radii, and the
+triangles of the `few` brightest stars of each circle are added to the index.
 
-The sides of a triangle are chords of the unit sphere. The key of a triangle consists of three parts. The
-first part of a key is the orientation (left or right) of the triangle's corners, ordered by the lengths of
-the opposite sides. The second part of a key is the ratios of the shortest and of the middle side to the
-longest side, rounded down to cells of width `CELL`. The third part of a key is the length of the longest
+The sides of a triangle are chords of the unit sphere. The key of a triangle consists of the orientation (left
+or right) of its corners, ordered by the lengths of the opposite sides, of the ratios of the shortest and of
+the middle side to the longest side, rounded down to cells of width `CELL`, and of the length of the longest
 side. In the sorted list of keys, the triangles with the same first and second part and with a longest side
 between two limits are contiguous.
-
-`python -m knightcube.vision.startracker.index.build` builds the index. The same stars and settings give a
-file with the same bytes.
 """
 
 from __future__ import annotations
