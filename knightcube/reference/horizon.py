@@ -52,14 +52,6 @@ def high_average(lines: Image) -> FloatArray:
     return np.asarray(np.sum(values * high, axis=1) / np.sum(high, axis=1))
 
 
-def binarised(lines: Image, high: FloatArray) -> BoolArray:
-    """Return scan lines (n, m), each divided by its average high intensity `high` and rounded to 0 or 1.
-
-    Source: Meller et al., section 3.1, step 1.
-    """
-    return np.asarray(lines >= 0.5 * np.asarray(high)[:, None])
-
-
 def first_edges(binary: BoolArray) -> IntArray:
     """Return the index (n,) of the first change from 0 to 1 in each binary line (n, m), or -1 without one."""
     rises = binary[:, 1:] & ~binary[:, :-1]
@@ -68,7 +60,8 @@ def first_edges(binary: BoolArray) -> IntArray:
 
 def horizon_points(lines: Image) -> IntArray:
     """Return the edge positions (n,) in scan lines (n, m), or -1 for a line without an edge."""
-    return first_edges(run_filtered(binarised(lines, high_average(lines)), RUN))
+    # Each line is divided by its average high intensity and rounded (Meller et al., section 3.1, step 1).
+    return first_edges(run_filtered(lines >= 0.5 * high_average(lines)[:, None], RUN))
 
 
 class NoCircleError(FlightError):

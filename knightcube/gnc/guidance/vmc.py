@@ -427,7 +427,7 @@ def _assemble(
     Raises PlanningError if the path is not finite.
     """
     energy, supplied = (program.spent(trial, cost) for cost in PathCost)
-    peak = float(np.abs(program.ratios(trial)[0]).max()) * program.current_limit
+    peak = float(np.abs(program.ratios(trial)[0]).max()) * program.plant.current_limit
     node_q2 = program.family.nodes(trial.parameters, trial.horizon)
     if not (math.isfinite(energy) and math.isfinite(peak) and np.isfinite(node_q2).all()):
         raise PlanningError("the optimiser returned a path that is not finite")

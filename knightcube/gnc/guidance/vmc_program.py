@@ -22,7 +22,7 @@ until no limit is exceeded (the exchange method of semi-infinite programming).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import nlopt
@@ -150,15 +150,6 @@ class PathFamily:
         """The number of free path control parameters, N - 4."""
         return int(self.basis.shape[1])
 
-    @property
-    def farthest_end(self) -> float:
-        """The larger absolute value of q2 at the two ends of the paths."""
-        return float(np.abs(self.still[[0, -1]]).max())
-
-    def remixed(self, mixing: FloatArray) -> PathFamily:
-        """Return the same paths with parameters y_new, where y_old = `mixing` (N - 4, N - 4) @ y_new."""
-        return PathFamily(self.grid, self.still, self.drift, self.basis @ mixing)
-
     def nodes(self, parameters: FloatArray, horizon: float) -> FloatArray:
         """Return the values q2 (N,) of a path on the nodes."""
         return np.asarray(self.still + horizon * self.drift + self.basis @ parameters)
@@ -260,41 +251,31 @@ class PathProgram:
         family: paths between the two states, with parameters whitened about the initial guess of the given
             duration.
         evaluations: number of evaluations of the cost, over all solutions.
+        bang_power: power R Imax^2 of the coil at the current limit, W.
     """
 
     def __init__(
         self, plant: SingleAxisPlant, family: PathFamily, q2_limit: float, horizon: float, cost: PathCost
     ) -> None:
-        self._plant = plant
-        self._cost = cost
+        self.plant, self._cost = plant, cost
         # The ends of the path are given, so the margin to the limit of q2 is smaller if an end is close to
         # the limit.
-        self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
+        self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * float(np.abs(family.still[[0, -1]]).max()))
         # Intermediate paths of the optimiser may exceed |q2| = 0.707, at which the computed current is
         # infinite. A value of q2 above the limit is clamped, so that the current stays finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * family.grid.cost_weights
-        self._bang = plant.resistance * plant.current_limit**2
+        self.bang_power = plant.resistance * plant.current_limit**2
         # The family is rescaled so that the energy has a unit Gauss-Newton Hessian. SLSQP starts with a unit
         # matrix as Hessian, so the first step from the initial guess (prey path) is the Gauss-Newton step.
         observed = family.observed(family.grid.cost)
         prey = observed.trajectory(np.zeros(family.size), horizon)
         _, slopes = self._current(prey, horizon)
-        root_weights = np.sqrt(2.0 * self._plant.resistance * horizon * self._weights)
+        root_weights = np.sqrt(2.0 * self.plant.resistance * horizon * self._weights)
         jacobian = root_weights[:, None] * _contract(slopes, observed.basis)
-        self.family = family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
+        self.family = replace(family, basis=family.basis @ np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
         self._cost_points = self.family.observed(family.grid.cost)
         self.evaluations = 0
-
-    @property
-    def current_limit(self) -> float:
-        """The plant's current limit, A."""
-        return self._plant.current_limit
-
-    @property
-    def bang_power(self) -> float:
-        """Power R Imax^2 of the coil at the current limit, W."""
-        return self._bang
 
     def prey(self, horizon: float) -> Trial:
         """Return the initial guess of `horizon` s, for which all path control parameters are one."""
@@ -304,7 +285,7 @@ class PathProgram:
         """Return currents (m,), and their derivatives (3, m) with respect to q2, dq2/ds and d2q2/ds2."""
         q2 = trajectory[0]
         held = np.minimum(np.maximum(q2, -self._q2_cap), self._q2_cap)
-        current, *slopes = current_and_slopes(self._plant, held, trajectory[1], trajectory[2])
+        current, *slopes = current_and_slopes(self.plant, held, trajectory[1], trajectory[2])
         stacked = np.array(slopes)
         stacked[0] *= held == q2
         stacked *= time_scale(horizon)
@@ -318,7 +299,7 @@ class PathProgram:
         points, horizon = self._cost_points, trial.horizon
         trajectory = points.trajectory(trial.parameters, horizon)
         current, slopes = self._current(trajectory, horizon)
-        power, by_current = self._cost.smooth(self._plant, current)
+        power, by_current = self._cost.smooth(self.plant, current)
         energy = horizon * float(self._weights @ power)
         pull = (horizon * self._weights * by_current) * slopes
         gradient = pull.ravel() @ points.basis.reshape(-1, points.basis.shape[2])
@@ -328,7 +309,7 @@ class PathProgram:
     def spent(self, trial: Trial, cost: PathCost) -> float:
         """Return the integral of a power along a path, J."""
         trajectory = self._cost_points.trajectory(trial.parameters, trial.horizon)
-        power = cost.power(self._plant, self._current(trajectory, trial.horizon)[0])
+        power = cost.power(self.plant, self._current(trajectory, trial.horizon)[0])
         return trial.horizon * float(self._weights @ power)
 
     def excess(
@@ -340,8 +321,8 @@ class PathProgram:
         """
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
-        value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
-        slopes /= self._plant.current_limit
+        value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self.plant.current_limit)
+        slopes /= self.plant.current_limit
         slopes[:, limits.is_q2] = np.array([[1.0 / self._q2_limit], [0.0], [0.0]])
         slopes *= limits.sign
         aged = np.sum(slopes * points.aging(trajectory, trial.horizon), axis=0)
@@ -352,7 +333,7 @@ class PathProgram:
         nodes = self.family.nodes(trial.parameters, trial.horizon)
         trajectory = time_scale(trial.horizon) * (self.family.grid.dense.matrices @ nodes)
         current, _ = self._current(trajectory, trial.horizon)
-        return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
+        return np.stack([current / self.plant.current_limit, trajectory[0] / self._q2_limit])
 
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
         """Return the path that differs by `apart` (N,), on the nodes, from the initial guess."""
@@ -401,7 +382,7 @@ class PathProgram:
 
     def _energy_tolerance(self, horizon: float) -> float:
         """Return the tolerance of the energy (J): 1e-8 of the energy at the largest current."""
-        return 1e-8 * self._bang * horizon
+        return 1e-8 * self.bang_power * horizon
 
     def _minimise(
         self, start: Trial, limits: ImposedLimits | None, free: FreeHorizon | None

@@ -25,7 +25,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices
+from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices, cross_matrix
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.quaternion import from_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -297,7 +297,7 @@ def _refined_numpy(
         if longest < _SETTLED:
             break
     # The residuals after the last step are computed from the linearised equations.
-    left = rows[:, 3:6] + rows[:, :3] @ _cross_matrix(step[:3]).T
+    left = rows[:, 3:6] + rows[:, :3] @ cross_matrix(step[:3]).T
     if free_scale:
         left += step[3] * rows[:, 6:]
     return True, matrix, scale, covariance, np.einsum("ij,ij->i", left, left)
@@ -467,19 +467,13 @@ def _summed_cross(gram: list[list[float]], at: int) -> list[float]:
     return [gram[1][at + 2] - gram[2][at + 1], gram[2][at] - gram[0][at + 2], gram[0][at + 1] - gram[1][at]]
 
 
-def _cross_matrix(vector: FloatArray) -> FloatArray:
-    """Return the matrix [v x] (3, 3) of a vector v (3,), for which [v x] p is the cross product v x p."""
-    x, y, z = vector.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
     """Return the attitude matrix (3, 3) after a rotation `turn` (3,), rad, about the camera axes."""
     x, y, z = turn.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     first = math.sin(angle) / angle if angle > 0.0 else 1.0
     second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2 if angle > 0.0 else 0.5
-    cross = _cross_matrix(turn)
+    cross = cross_matrix(turn)
     return np.asarray(matrix - (first * cross - second * (cross @ cross)) @ matrix)
 
 

@@ -669,7 +669,11 @@ def _search(
             found.append(finds)
         most = round(share * settings.verified)
         if found:
-            matrices, scales, tried = _candidates(observed, sky, TriangleMatches.of(found), tried, most)
+            direction, whole = np.ascontiguousarray(observed.direction), TriangleMatches.of(found)
+            matches = whole.observed, whole.star, whole.scale, whole.code
+            matrices, scales, tried = _choose(
+                direction, sky.stars.direction, *matches, tried, most, *observed.scale
+            )
             answer = verify_first(observed, sky, matrices, scales, searched, settings.verification)
             if answer.status is MatchStatus.IDENTIFIED:
                 return answer
@@ -680,27 +684,6 @@ def _search(
 
 
 _Chosen = tuple[FloatArray, FloatArray, IntArray]
-
-
-def _candidates(
-    observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: IntArray, most: int
-) -> _Chosen:
-    """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
-
-    A match is omitted if two of its pairs of an observed star and a guide star are among the pairs `tried`
-    (k, 2). The third returned value is the array `tried`, extended by the pairs of the new candidates.
-    """
-    return _choose(
-        np.ascontiguousarray(observed.direction),
-        sky.stars.direction,
-        finds.observed,
-        finds.star,
-        finds.scale,
-        finds.code,
-        tried,
-        most,
-        *observed.scale,
-    )
 
 
 def _choose_numpy(
@@ -715,7 +698,11 @@ def _choose_numpy(
     lowest: float,
     highest: float,
 ) -> _Chosen:
-    """Return matrices and scales of the candidates, and the extended list of tried pairs."""
+    """Return attitude matrices (c, 3, 3) and scales (c,) of the matches with the most votes.
+
+    A match is omitted if two of its pairs of an observed star and a guide star are among the pairs `tried`
+    (k, 2). The third returned value is the array `tried`, extended by the pairs of the new candidates.
+    """
     votes = _votes(code)
     # There may be a hundred thousand matches, so only the matches with the most votes are sorted.
     count = min(_RANKED * most, len(votes))

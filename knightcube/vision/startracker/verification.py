@@ -329,6 +329,7 @@ def _expected_numpy(
     return np.asarray(near[inside][:count])
 
 
+@loop_helper
 def _most_expected(observed: int) -> int:
     """Return the maximum number of expected stars for a number of observed stars."""
     return int(1.3 * observed) + 8
@@ -513,7 +514,7 @@ def _first_match(
 ) -> _Found:
     given, observed = len(expected) > 0, len(direction)
     seen, nearest, squared = np.empty((observed, 3)), np.empty(observed, dtype=np.int64), np.empty(observed)
-    most, widest, tangent = _most_stars(observed), gates.max(), direction[:, 0] / direction[:, 2]
+    most, widest, tangent = _most_expected(observed), gates.max(), direction[:, 0] / direction[:, 2]
     order = np.argsort(tangent, kind="mergesort")
     tangent = tangent[order]
     for number in range(len(scales)):
@@ -556,11 +557,6 @@ def _within(squared: FloatArray, nearest: IntArray, gate: float) -> tuple[IntArr
             best[count], star[count] = k, nearest[k]
             count += 1
     return best, star
-
-
-@loop_helper
-def _most_stars(observed: int) -> int:
-    return int(1.3 * observed) + 8
 
 
 @loop_helper

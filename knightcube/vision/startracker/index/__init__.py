@@ -80,7 +80,10 @@ class TableKind:
 
 def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> None:
     """Write a table of `columns` and metadata (`facts`) to the file `path`, in one atomic operation."""
-    little = {name: _little(column) for name, column in columns.items()}
+    little = {
+        name: np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("<"))
+        for name, column in columns.items()
+    }
     contents: dict[str, Any] = {"facts": facts, "columns": {}}
     offset = 0
     for name, column in little.items():
@@ -130,10 +133,6 @@ def _columns(mapped: mmap.mmap, begin: int) -> tuple[Columns, Facts]:
     if any(column.dtype.hasobject for column in columns.values()):
         raise TypeError("a column does not contain numbers")
     return columns, {str(name): float(fact) for name, fact in contents["facts"].items()}
-
-
-def _little(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    return np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("<"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
