@@ -38,13 +38,7 @@ from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant
 
 @dataclass(frozen=True, slots=True)
 class PidSettings:
-    """PID gains.
-
-    Attributes:
-        proportional: gain on the angle error, 1/s^2.
-        integral: gain on the integral of the angle error, 1/s^3.
-        derivative: gain on the rate error, 1/s.
-    """
+    """PID gains on the angle error, 1/s^2, on its integral, 1/s^3, and on the rate error, 1/s."""
 
     proportional: float
     integral: float

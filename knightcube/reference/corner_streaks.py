@@ -85,10 +85,6 @@ DETECTOR_NAMES: tuple[DetectorName, ...] = tuple(_OF_DETECTOR)
 
 @dataclass(frozen=True, slots=True)
 class StreakResult(FrameMotion):
-    """Body rate from star streaks by corner detectors.
-
-    Attributes:
-        sigma: (found,) expected error of the endpoints of each streak, px.
-    """
+    """Body rate from star streaks, with the expected error `sigma` of each streak's endpoints, px."""
 
     sigma: FloatArray = field(default_factory=no_rows())

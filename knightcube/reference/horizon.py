@@ -180,9 +180,7 @@ class GraphicMethodError(FlightError):
 class LevelCamera:
     """Camera whose boresight is perpendicular to the body z axis, and whose y axis is parallel to it.
 
-    Attributes:
-        right: (2,) components along body x and y of the camera's x axis, as a unit vector.
-        axis: position (x, y) of the optical axis in the image, px.
+    The unit vector `right` (2,) is the camera's x axis along body x and y. The optical axis is at (x, y) px.
     """
 
     right: FloatArray

@@ -62,10 +62,7 @@ class KnownAttitude:
 class SeparateAttitudes:
     """The attitudes of one update: from cameras, from magnetometer, fused, and filtered with the gyros.
 
-    Attributes:
-        cameras, magnetometer, fused, filtered: attitudes from the cameras, from the magnetometer, from both,
-            and from the filter.
-        bias: estimated gyro bias (3,), rad/s.
+    The estimated gyro bias is `bias` (3,), rad/s.
     """
 
     cameras: KnownAttitude

@@ -195,12 +195,9 @@ def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Candidates of an identification: patterns of observed stars that match patterns of guide stars.
+    """Candidates of an identification: indices of observed stars, and of the guide stars assigned to them.
 
-    Attributes:
-        observed: (k, m) indices of at least two observed stars for each of the k candidates. The first two
-            stars of a candidate define the attitude.
-        star: (k, m) indices of the assigned guide stars.
+    Both arrays are (k, m) for k candidates of at least two stars, of which the first two define the attitude.
     """
 
     observed: IntArray
@@ -544,11 +541,9 @@ def propose_grids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMotion:
-    """Measured motion of the observed points in a field.
+    """Time derivatives (n, 3) of the directions of observed points in the camera frame, 1/s.
 
-    Attributes:
-        velocity: (n, 3) time derivatives of the directions in the camera frame, 1/s.
-        sigma: (n,) standard deviations of the velocities per axis, 1/s.
+    The standard deviations (n,) of these velocities are per axis.
     """
 
     velocity: FloatArray
@@ -557,12 +552,9 @@ class StarMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreviousAttitude:
-    """Previous attitude of the camera and its uncertainty.
+    """Attitude quaternion (4,), from ICRS to the camera frame, `elapsed` s ago.
 
-    Attributes:
-        attitude: (4,) quaternion from ICRS to the camera frame.
-        sigma: standard deviation about each axis, including the drift since the previous attitude, rad.
-        elapsed: time since the previous attitude, s.
+    The standard deviation `sigma` about each axis, rad, includes the drift since then.
     """
 
     attitude: FloatArray
@@ -578,12 +570,9 @@ class PreviousAttitude:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedRate:
-    """Body rate with which most observed points agree.
+    """Body rate (3,) in camera axes, rad/s, with its covariance (3, 3), that most observed points share.
 
-    Attributes:
-        rate: (3,) body rate in camera axes, rad/s.
-        covariance: (3, 3) covariance of the rate, rad^2/s^2.
-        shares: (n,) flags of the points whose motion agrees with the rate.
+    The flags `shares` (n,) mark the points whose motion agrees with the rate.
     """
 
     rate: FloatArray
@@ -683,13 +672,10 @@ DEFAULT_METHOD = "default"
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """Method of star identification.
+    """Method of star identification, with its publication.
 
-    Attributes:
-        identify: function that identifies the stars of a field by comparison with the guide star tables of
-            the sky. The methods other than the default method raise FieldUnknown if the image scale is too
-            uncertain.
-        source: publication of the method.
+    The function identifies the stars of a field by comparison with the guide star tables of the sky. The
+    methods other than the default method raise FieldUnknown if the image scale is too uncertain.
     """
 
     identify: Callable[[StarField, KnownSky], StarMatch]

@@ -217,13 +217,7 @@ def cosine_sigma(cosine: FloatArray, one: FloatArray, other: FloatArray) -> Floa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleShape:
-    """Shape parameters of t triangles, with standard deviations.
-
-    Attributes:
-        area: (t,) areas of the triangles, sr.
-        moment: (t,) polar moments about the centroids, rad^4.
-        sigma_area, sigma_moment: (t,) standard deviations of the areas (sr) and polar moments (rad^4).
-    """
+    """Areas (t,), sr, and polar moments (t,), rad^4, of t triangles, with their standard deviations."""
 
     area: FloatArray
     moment: FloatArray
@@ -363,13 +357,7 @@ MeasuredShape = Callable[[FloatArray, FloatArray], TriangleShape]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleTable:
-    """Table of guide star triangles, sorted by area.
-
-    Attributes:
-        corner: (t, 3) indices of the guide stars at the corners.
-        area: k-vector of the areas (t,) of the triangles.
-        moment: (t,) polar moments of the triangles.
-    """
+    """Guide stars at the corners (t, 3) of triangles, sorted by area, and their polar moments (t,)."""
 
     corner: npt.NDArray[np.unsignedinteger[npt.NBitBase]]
     area: KVector

@@ -305,12 +305,10 @@ def _rms(frames: Sequence[MatchedFrame], lens: Lens, used: Sequence[BoolArray]) 
 
 @dataclass(frozen=True, slots=True)
 class OmittedTerm:
-    """A lens term that the stars do not determine.
+    """A lens term that the stars do not determine: last fitted values and their standard deviations.
 
-    Attributes:
-        values: last fitted values: one for k1 and k2, or x and y for the centre.
-        sigmas: standard deviations of the fitted values.
-        assumed: values of the lens term in the calibrated lens, instead of the fitted values.
+    The calibrated lens has the values `assumed` instead. There is one value for k1 and k2, and x and y for
+    the centre.
     """
 
     values: tuple[float, ...]
@@ -445,11 +443,9 @@ def calibrate_one_lens(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationImage:
-    """One image of a lens calibration.
+    """One image of a lens calibration: its solution, and the reason for excluding it if it was solved.
 
-    Attributes:
-        solution: identified stars and attitude of the image, or the reason why it is not solved.
-        excluded: reason for excluding a solved image. For an image that is used, `excluded` is empty.
+    For an image that is used, `excluded` is empty.
     """
 
     solution: FrameSolution

@@ -107,11 +107,8 @@ class LensFit:
 class FitStep:
     """Result of one Gauss-Newton step of the calibration.
 
-    Attributes:
-        fit: lens parameters and attitudes after the step.
-        decrease: decrease of chi-square that the linear model predicts.
-        information: information matrix (9, 9) of the lens parameters from the stars, after elimination of the
-            attitudes.
+    The linear model predicts the `decrease` of chi-square. The information matrix (9, 9) of the lens
+    parameters comes from the stars, after elimination of the attitudes.
     """
 
     fit: LensFit

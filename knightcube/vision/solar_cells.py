@@ -225,13 +225,10 @@ class KnownDirections:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StringFix:
-    """An attitude from the magnetic field and the solar strings.
+    """An attitude (4,), inertial to body axes, from the magnetic field and the solar strings.
 
-    Attributes:
-        quaternion: attitude (4,) from inertial to body axes.
-        covariance: covariance (3, 3) of the attitude error in body axes, rad^2.
-        axis: unit vector (3,) along the magnetic field in body axes.
-        about: standard deviation of the rotation about the field direction, rad.
+    The covariance (3, 3), rad^2, is in body axes. The standard deviation of the rotation about the field
+    direction `axis` (3,), body axes, is `about`, rad.
     """
 
     quaternion: FloatArray
@@ -243,9 +240,7 @@ class StringFix:
 class FieldAndStrings:
     """Attitude estimator that keeps track of the possible rotations about the magnetic field.
 
-    Attributes:
-        wrong: description of a fault that the last reading shows. The description is empty if the last
-            reading shows no fault.
+    The text `wrong` describes a fault that the last reading shows, or is empty.
     """
 
     def __init__(self, strings: SolarStringModel) -> None:

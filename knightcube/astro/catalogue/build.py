@@ -39,14 +39,9 @@ Source = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class AddedStar:
-    """Bright star that Hipparcos lists without a position.
+    """Bright star that Hipparcos lists without a position, which is at epoch J1991.25, deg.
 
-    Attributes:
-        hip: Hipparcos number.
-        magnitude: Johnson V magnitude.
-        right_ascension: right ascension at epoch J1991.25, deg.
-        declination: declination at epoch J1991.25, deg.
-        proper_motion: mu_alpha cos(delta) and mu_delta, mas/yr.
+    The magnitude is Johnson V, and the proper motion is mu_alpha cos(delta) and mu_delta, mas/yr.
     """
 
     hip: int

@@ -62,13 +62,7 @@ _YEARS = 1957, 2056
 
 @dataclass(frozen=True, slots=True)
 class NamedElements:
-    """Two-line elements of a named satellite.
-
-    Attributes:
-        name: name of the satellite, which may be empty.
-        number: satellite number.
-        lines: the two lines.
-    """
+    """Satellite number and two-line elements of a satellite with a name, which may be empty."""
 
     name: str
     number: int

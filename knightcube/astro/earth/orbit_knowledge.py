@@ -40,13 +40,9 @@ class OrbitError(FlightError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrbitState:
-    """Position and velocity of the satellite at a given time.
+    """Geocentric position (3,), m, and velocity (3,), m/s, of the satellite, ICRS, at a Julian date UTC.
 
-    Attributes:
-        julian_date: Julian date UTC.
-        position: (3,) geocentric position in ICRS axes, m.
-        velocity: (3,) geocentric velocity in ICRS axes, m/s.
-        sigma: standard deviation of the position per axis, m.
+    The standard deviation of the position per axis is `sigma`, m.
     """
 
     julian_date: float

@@ -153,11 +153,9 @@ class SlewStart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunningSlew:
-    """A slew that the body follows while the remaining part is replanned.
+    """A slew, as last planned, that the body follows while the remaining part is replanned.
 
-    Attributes:
-        path: path of the slew as last planned.
-        since: time (s) from the start of `path` to the job's time `origin_ns`.
+    The job's time `origin_ns` is `since` s after the start of the path.
     """
 
     path: SlewPath

@@ -35,12 +35,10 @@ LARGEST_RATE = math.radians(1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingCommand:
-    """Dipole moment that the pointing law commands, and the attitude and rate errors.
+    """Dipole moment (3,), A m^2, within the coils' limit, and the errors relative to the reference.
 
-    Attributes:
-        dipole: dipole moment (3,) within the coils' limit, A m^2.
-        rotation: rotation vector (3,) from the reference attitude to the body, rad.
-        rate: rate (3,) of the body relative to the reference, rad/s.
+    The errors are a rotation vector (3,), rad, from the reference attitude to the body, and a rate (3,),
+    rad/s.
     """
 
     dipole: FloatArray

@@ -162,10 +162,8 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 class SunAcquisitionSettings:
     """Settings of Sun acquisition.
 
-    Attributes:
-        inertia: inertia tensor (3, 3) in body axes, kg m^2.
-        axis: unit vector (3,) of the body axis to align with the Sun.
-        limit: dipole limit along each body axis, equal for all axes or (3,), A m^2.
+    The inertia tensor (3, 3), kg m^2, and the unit vector `axis` (3,) to align with the Sun are in body axes.
+    The dipole limit, A m^2, is equal for all axes or (3,).
     """
 
     inertia: FloatArray

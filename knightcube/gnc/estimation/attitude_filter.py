@@ -90,9 +90,8 @@ _SHARE_ERROR = 0.15
 class CommandCheck:
     """Check of the commanded coil currents against the gyro samples.
 
-    Attributes:
-        active: whether the coil currents are suspected to differ from the commanded currents.
-        ended_ns: time at which the commands last became trusted again, ns.
+    It is `active` while the coil currents are suspected to differ from the commanded currents. The commands
+    last became trusted again at the time `ended_ns`.
     """
 
     def __init__(self, model: PropagationModel) -> None:

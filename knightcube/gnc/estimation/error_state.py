@@ -91,13 +91,10 @@ class ErrorState:
 
 
 class Weighed(NamedTuple):
-    """The optimal gain for an innovation of k components and n states, with intermediate results.
+    """The optimal gain (n, k) for an innovation of k components and n states, with intermediate results.
 
-    Attributes:
-        square: normalised square y' S^-1 y of the innovation y.
-        gain: optimal gain (n, k).
-        cross: covariance (n, k) of states and innovation.
-        spread: covariance S (k, k) of the innovation.
+    These are the normalised square y' S^-1 y of the innovation y, the covariance `cross` (n, k) of states and
+    innovation, and the covariance S (k, k) of the innovation, `spread`.
     """
 
     square: float

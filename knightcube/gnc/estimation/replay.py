@@ -42,10 +42,9 @@ from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torqui
 
 
 class CommandHistory:
-    """The recent coil commands in order of time; no coil is driven before the first command.
+    """The recent coil commands in order of time.
 
-    Attributes:
-        idle: dipole moment and magnetic field (`Torquing`) while no coil is driven.
+    Before the first command, no coil is driven, with the dipole moment and magnetic field `idle`.
     """
 
     def __init__(self, body: RigidBody, history_ns: int) -> None:
@@ -110,10 +109,7 @@ consistent filter, one gyro sample in forty exceeds this limit of the squared in
 class Checkpoint:
     """A measurement, whether it passed the gate, and the state of the filter after its application.
 
-    Attributes:
-        innovation: components of the innovation, in the unit of the measurement, or an empty tuple for the
-            first checkpoint.
-        variance: covariance of the innovation, or None for the first checkpoint.
+    The innovation, in the unit of the measurement, is empty for the first checkpoint, and its variance None.
     """
 
     measurement: Measurement

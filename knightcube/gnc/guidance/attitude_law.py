@@ -61,13 +61,10 @@ class AttitudeReference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeReferences:
-    """The commanded motion at equally spaced times.
+    """The commanded motion at equally spaced times (n,), s.
 
-    Attributes:
-        times: (n,) s.
-        quaternion: commanded attitudes (n, 4), from ICRS into body axes.
-        rate: commanded body rates (n, 3) in the axes of the commanded attitude, rad/s.
-        acceleration: commanded angular accelerations (n, 3) in the axes of the commanded attitude, rad/s^2.
+    The attitudes (n, 4) rotate ICRS into body axes. The body rates (n, 3), rad/s, and angular accelerations
+    (n, 3), rad/s^2, are in the axes of the commanded attitude.
     """
 
     times: FloatArray

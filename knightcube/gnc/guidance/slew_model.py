@@ -86,13 +86,9 @@ class SlewCraft:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewEnvironment:
-    """The environment of the body at n times, in ICRS axes.
+    """The magnetic field (n, 3), T, and the position (n, 3), m, of the body at n times, in ICRS axes.
 
-    Attributes:
-        field: (n, 3) T.
-        position: (n, 3) m.
-        pressures: pressure vectors of air and sunlight, or None if aerodynamic and solar radiation torques
-            are not modelled.
+    The pressure vectors of air and sunlight are None if their torques are not modelled.
     """
 
     field: FloatArray
@@ -307,14 +303,10 @@ class HermiteCubic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewPath:
-    """The path of a slew, given at times that begin with zero and interpolated by the collocation cubics.
+    """The path of a slew, given at times (n,), s, from zero on and interpolated by the collocation cubics.
 
-    Attributes:
-        times: (n,) s.
-        quaternion: attitudes (n, 4), from ICRS into body axes.
-        rate: body rates (n, 3) in body axes, rad/s.
-        acceleration: angular accelerations (n, 3) in body axes, rad/s^2.
-        dipole: dipole moments (n, 3) of the coils in body axes, linear between the times, A m^2.
+    The attitudes (n, 4) rotate ICRS into body axes. Rates (n, 3), rad/s, angular accelerations (n, 3),
+    rad/s^2, and dipole moments (n, 3), A m^2, linear between the times, are in body axes.
     """
 
     times: FloatArray
@@ -371,10 +363,8 @@ class SlewPath:
 class Cone:
     """An exclusion cone: body `axis` (3,) stays at least `angle` rad away from a direction.
 
-    Attributes:
-        name: for messages.
-        direction: function from times (n,), s after the start of the slew, to unit vectors (n, 3) along the
-            axis of the cone, ICRS.
+    The function `direction` returns unit vectors (n, 3) along the axis of the cone, ICRS, for times (n,), s,
+    after the start of the slew.
     """
 
     name: str

@@ -411,13 +411,9 @@ FIRST_BARRIER = 1e-3
 class Iterate:
     """An iterate of the interior point method.
 
-    Attributes:
-        linear: the equations linearised about the trajectory of the iterate.
-        multipliers: Lagrange multipliers of the equations, at their indices in the vector (size,) of all
-            elements.
-        slack, dual: slack variables and dual variables of the inequalities g >= 0.
-        slope: derivative (size,) of the Lagrangian without the inequalities, with respect to all unknowns and
-            multipliers.
+    The Lagrange multipliers of the equations are at their indices in the vector (size,) of all elements. The
+    slack and dual variables are those of the inequalities g >= 0. The derivative (size,) of the Lagrangian
+    without the inequalities, with respect to all unknowns and multipliers, is `slope`.
     """
 
     linear: LinearisedEquations
@@ -577,9 +573,7 @@ class SlewProgram:
 class NewtonRun:
     """An interior point iteration that starts from an initial guess, and can be interrupted and resumed.
 
-    Attributes:
-        point: newest iterate of the interior point method.
-        is_over: whether the iteration has ended, at an optimum or because no further step is possible.
+    The newest iterate is `point`. The iteration `is_over` at an optimum or if no further step is possible.
     """
 
     def __init__(

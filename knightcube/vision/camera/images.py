@@ -428,12 +428,9 @@ KEPT_FRAMES_FOLDER = "frames"
 
 @dataclass(frozen=True, slots=True)
 class KeptFrames:
-    """Folder and limits of the frames that the vision worker keeps on disk.
+    """Folder and maximum number of the frames that the vision worker keeps on disk.
 
-    Attributes:
-        folder: folder of the kept frames.
-        most: maximum number of kept frames.
-        name: file name of the next frame, without suffix.
+    The file of the next frame has the name `name`, without suffix.
     """
 
     folder: Path

@@ -110,9 +110,8 @@ class ScanLines:
 class ImagePart:
     """A rectangle of an image in which a second search finds edges on more scan lines.
 
-    Attributes:
-        box: lowest and highest (x, y) of the rectangle (2, 2), px.
-        levels: brightness levels of the whole image.
+    The lowest and highest (x, y) are the `box` (2, 2), px. The brightness levels are those of the whole
+    image.
     """
 
     box: FloatArray

@@ -150,12 +150,9 @@ The number of edges gives the density of chance edges.
 
 @dataclass(frozen=True, slots=True)
 class LimbInView:
-    """Length of the limb in an image, and how often scan lines cross the limb.
+    """Length of the part of a limb in an image that should show edges, px, and crossings with scan lines.
 
-    Attributes:
-        length: length of the part of the limb that should show edges, px.
-        crossings: number of crossings of scan lines with the part of the limb that should show edges.
-        all_crossings: number of crossings of scan lines with the whole limb in the image.
+    The number `crossings` is that of this part, and `all_crossings` that of the whole limb in the image.
     """
 
     length: float

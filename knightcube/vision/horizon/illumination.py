@@ -221,12 +221,10 @@ class ImageBrightness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseNadir:
-    """An estimated nadir with an uncertainty of several degrees.
+    """An estimated nadir (3,) in body axes, with an uncertainty of several degrees.
 
-    Attributes:
-        direction: unit vector (3,) in body axes.
-        covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction.
-        explained: mean probability of the samples' brightness for the most likely nadir.
+    The covariance (3, 3), rad^2, is zero along the direction. The mean probability of the samples' brightness
+    for the most likely nadir is `explained`.
     """
 
     direction: FloatArray

@@ -80,13 +80,7 @@ def nadirs_of_triples(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConeCandidate:
-    """A circular cone that may be a horizon.
-
-    Attributes:
-        direction: axis of the cone (3,).
-        cosine: cosine of the cone's half-angle.
-        members: mask of the image's edges that agree with the cone (n,).
-    """
+    """Axis (3,), cosine of the half-angle and mask of the edges (n,) of a cone that may be a horizon."""
 
     direction: FloatArray
     cosine: float

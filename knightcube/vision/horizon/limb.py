@@ -46,12 +46,7 @@ MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipsoid:
-    """A spheroid centred on the origin.
-
-    Attributes:
-        pole: unit vector (3,) along the axis of the spheroid.
-        equatorial, polar: semi-axes of the spheroid, m.
-    """
+    """A spheroid centred on the origin, with the unit vector `pole` (3,) and the semi-axes in m."""
 
     pole: FloatArray
     equatorial: float

@@ -290,13 +290,7 @@ def nadir_of_uncertain_field(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FieldTrial:
-    """The best horizon of a search with a trial focal length.
-
-    Attributes:
-        solution: result of the search, which may be a refusal.
-        nadir: nadir of the horizon, even if the horizon was refused.
-        horizon: the horizon.
-    """
+    """The best horizon of a search with a trial focal length, and its nadir, even if it was refused."""
 
     solution: HorizonSolution
     nadir: NadirMeasurement
@@ -353,14 +347,10 @@ def _by_field(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """One horizon search in an image.
+    """One horizon search in an image, which read `read` pixels.
 
-    Attributes:
-        observation: edges and sampled pixels as directions.
-        levels: brightness levels of the dark and bright pixels of the image.
-        hypotheses: horizons that were fitted to the edges, in descending order of quality.
-        read: number of pixels that the search read.
-        altitudes: range of an unknown altitude, m.
+    The fitted horizons are in descending order of quality. An unknown altitude is in the range `altitudes`,
+    m.
     """
 
     observation: Observation
@@ -607,13 +597,9 @@ class JointNadir:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """A nadir from the image of one camera, which is compared with the nadirs of the other cameras.
+    """A nadir (3,), with its covariance (3, 3), rad^2, in body axes, from the image of one camera.
 
-    Attributes:
-        camera: index of the camera.
-        nadir: unit vector (3,) to nadir, body axes.
-        covariance: covariance (3, 3) of nadir, rad^2, body axes.
-        edges: number of edges on the horizon.
+    The horizon in this image has `edges` edges.
     """
 
     camera: int

@@ -37,12 +37,7 @@ class SensedDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoughAttitude:
-    """An approximate attitude of a camera.
-
-    Attributes:
-        quaternion: attitude quaternion (4,) from inertial to camera axes, scalar last.
-        sigma: standard deviation of the attitude per axis, rad.
-    """
+    """An approximate attitude (4,) of a camera, inertial to camera axes, with `sigma` per axis, rad."""
 
     quaternion: FloatArray
     sigma: float

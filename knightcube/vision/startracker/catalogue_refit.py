@@ -155,12 +155,9 @@ def refit_motion(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """Catalogue stars in and around a frame.
+    """Catalogue stars in and around a frame: positions (n, 2) at mid-exposure, px, and fluxes (n,), counts.
 
-    Attributes:
-        places: positions of the stars at mid-exposure (n, 2), px.
-        light: flux of each star during the exposure (n,), counts.
-        inside: fraction of each star's path that lies in the frame (n,).
+    The fraction `inside` (n,) of each star's path lies in the frame.
     """
 
     places: FloatArray

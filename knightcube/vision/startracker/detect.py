@@ -122,13 +122,10 @@ _MOST_COMPARED = 500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peaks:
-    """Local maxima (peaks) of the smoothed frame, the highest first.
+    """Local maxima (peaks) of the smoothed frame: column and row (p, 2), and height (p,), counts.
 
-    Attributes:
-        place: column and row of each peak (p, 2).
-        height: height of each peak in the smoothed frame (p,), counts.
-        area: index of the area that contains each peak (p,).
-        core: radius of the saturated disc around each peak (p,), px; 0 if the peak is not saturated.
+    The highest peak is first. Each peak is in the area with the index `area` (p,). The radius of the
+    saturated disc around a peak is `core` (p,), px; 0 if the peak is not saturated.
     """
 
     place: IntArray

@@ -64,14 +64,9 @@ _APART = 2 * _HALF_OF_FIRST + 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """The first fits of n stars, each with a free width of its Gaussian.
+    """The first fits of n stars, each with a free width (n,) of its Gaussian, px, and the windows fitted.
 
-    Attributes:
-        width: standard deviation of the Gaussian fitted to each star (n,), px.
-        error: standard deviation of each fitted width (n,), px.
-        hot: mask of the sources that are hot pixels instead of stars (n,).
-        fitted: results of the fits to the stars.
-        windows: windows in which the stars were fitted.
+    The standard deviation of each width is `error` (n,), px. The mask `hot` (n,) marks hot pixels.
     """
 
     width: FloatArray

@@ -187,9 +187,8 @@ _ROUNDS = 3
 class NoiseModel:
     """The noise model of pixels that contain the light of a star.
 
-    Attributes:
-        photon: variance of the photon noise per count of light, counts (the reciprocal of the gain).
-        mismatch: difference between the PSF and a Gaussian, as a fraction of the star's counts.
+    The photon noise has the variance `photon` per count (the reciprocal of the gain). The PSF differs from a
+    Gaussian by the fraction `mismatch` of the star's counts.
     """
 
     photon: float = 0.0
@@ -684,11 +683,9 @@ _LEAST_OVERLAP = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Ordered pairs of stars. The second star of a pair contributes light to the window of the first star.
+    """Ordered pairs of stars: indices (p,) of a star and of a neighbour that contributes light to its window.
 
-    Attributes:
-        first, second: indices of the first and of the second star of each pair (p,).
-        overlap: largest overlap of each star with a neighbour (n,), between 0 and 1.
+    The largest overlap of each star with a neighbour is `overlap` (n,), between 0 and 1.
     """
 
     first: IntArray

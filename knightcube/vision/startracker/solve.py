@@ -251,12 +251,7 @@ class SolveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudePrior:
-    """A predicted attitude of the camera.
-
-    Attributes:
-        quaternion: attitude quaternion (4,) from ICRS to camera axes.
-        sigma: standard deviation of the attitude about each axis, rad.
-    """
+    """A predicted attitude (4,) of the camera, ICRS to camera axes, with `sigma` about each axis, rad."""
 
     quaternion: FloatArray
     sigma: float
@@ -264,12 +259,9 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RatePrior:
-    """A predicted angular velocity of the camera.
+    """A predicted angular velocity (3,) of the camera, rad/s, camera axes, with `sigma` per component.
 
-    Attributes:
-        rate: angular velocity (3,), rad/s, camera axes.
-        sigma: standard deviation of each component of the angular velocity, rad/s.
-        course: rotation of the camera as a function of time during the exposure, or None if unknown.
+    The rotation of the camera as a function of time during the exposure is `course`, or None if unknown.
     """
 
     rate: FloatArray

@@ -57,11 +57,9 @@ _ROUNDING = 12.0**-0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A quantity that is interpolated bilinearly between the centres of blocks of a frame.
+    """A quantity given at the centres of blocks of pixels (down, across) and interpolated bilinearly.
 
-    Attributes:
-        values: values at the centres of the blocks of pixels of the frame (down, across).
-        shape: rows and columns of the frame.
+    The frame has the rows and columns `shape`.
     """
 
     values: FloatArray
