@@ -1,4 +1,4 @@
-"""Tests of compiled functions: whether the compiled or the numpy implementation runs, also without numba."""
+"""Tests that the compiled or the numpy implementation of a function runs as expected, even without numba."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_variable_selects_the_numpy_form(monkeypatch: pytest.MonkeyPatch) ->
     "numba", ["", "raise ImportError('Numba needs NumPy 2.4 or less')"], ids=["missing", "unfit"]
 )
 def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Path) -> None:
-    """Numba refuses its import if numpy is too new."""
+    """If numba cannot be used, numpy implementations run. Numba fails on import if numpy is too new."""
     (tmp_path / "numba.py").write_text(numba, encoding="utf-8")
     hidden = "" if numba else "sys.modules['numba'] = None\n"
     code = (
@@ -52,7 +52,10 @@ def test_without_a_usable_numba_the_numpy_form_is_used(numba: str, tmp_path: Pat
 
 
 def test_compilation_is_announced_and_a_damaged_file_of_machine_code_is_left_aside(tmp_path: Path) -> None:
-    """The file of a compiled function is truncated, as after a full disk or a power failure."""
+    """Compilation is announced, and a truncated file of machine code is ignored.
+
+    A full disk or a power failure may truncate the file.
+    """
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     environment = {
         **os.environ,
@@ -97,9 +100,9 @@ def test_arrays_that_numba_does_not_know_are_left_to_numpy(
 
 @pytest.mark.parametrize("module", ["knightcube", "flight.__main__", "knightcube.vision.star_tracker"])
 def test_an_import_does_not_load_numba(module: str) -> None:
-    """The import of numba takes a third of a second and 100 MB.
+    """A command that calls no compiled function does not import numba.
 
-    A command that calls no compiled function must not import numba.
+    The import of numba takes a third of a second and 100 MB.
     """
     code = f"import sys, {module}; sys.exit('numba' in sys.modules)"
     subprocess.run(

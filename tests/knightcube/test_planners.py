@@ -32,7 +32,10 @@ SLEW: dict[str, Any] = {
 
 
 def test_the_current_of_a_step_moves_the_body_to_its_end() -> None:
-    """The equation of motion J w' = n A B I cos(theta) - k theta - c w is integrated independently."""
+    """The planned current of a step moves a body to the end of the step.
+
+    The equation of motion J w' = n A B I cos(theta) - k theta - c w is integrated independently.
+    """
     found = plan_step(PLANT, start_angle=0.2, end_angle=-0.6, horizon=12.0, start_rate=0.01, end_rate=-0.02)
 
     def flow(time: float, state: list[float]) -> list[float]:
@@ -65,8 +68,8 @@ def test_a_slew_leads_from_nadir_to_the_sun_within_the_limits() -> None:
     path, around = found.plan.path, found.task.along(np.array([0.0, found.plan.horizon]))
     down = -around.position[0] / np.linalg.norm(around.position[0])
     assert attitude_matrix(path.quaternion[0]) @ down == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
-    # The equinox is at 14:46 UTC, 2.6 h after the end, so the Sun's ecliptic longitude of date is -0.107 deg.
-    # The longitude of J2000 is smaller by the precession of 26.2 years, 0.366 deg.
+    # The equinox is at 14:46 UTC, 2.6 h after the end of the slew, so the Sun's ecliptic longitude of date is
+    # -0.107 deg. The longitude of J2000 is smaller by the precession of 26.2 years, which is 0.366 deg.
     longitude, obliquity = np.radians([-0.473, 23.44])
     sun = np.array([1.0, np.sin(longitude) * np.cos(obliquity), np.sin(longitude) * np.sin(obliquity)])
     sun /= np.linalg.norm(sun)
@@ -77,7 +80,10 @@ def test_a_slew_leads_from_nadir_to_the_sun_within_the_limits() -> None:
 
 
 def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
-    """The time may carry any zone; without one it is UTC."""
+    """A slew starts at the best time of its window.
+
+    The time may have any time zone, and is UTC without one.
+    """
     fixed = plan_slew(**SLEW)
     zone = timezone(timedelta(hours=2))
     later = plan_slew(**SLEW | {"time": AT.astimezone(zone)}, window=1200.0)

@@ -21,7 +21,7 @@ from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
 
 def _names_for_type_checkers() -> set[tuple[str, str]]:
-    """Return (module, name) of the imports that only type checkers read."""
+    """Return (module, name) of the imports that only type checkers evaluate."""
     tree = ast.parse(Path(knightcube.__file__).read_text(encoding="utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
     return {
@@ -82,7 +82,10 @@ PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.9e-4, resistance=23.0
     ],
 )
 def test_a_result_is_shown_in_one_line(result: Callable[[], object], shown: str) -> None:
-    """The arrays of a result would fill pages in an interactive session."""
+    """The text of a result is one line.
+
+    The arrays of the result would fill pages in an interactive session.
+    """
     assert re.fullmatch(shown, repr(result()))
 
 
@@ -92,7 +95,10 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 
 def test_importing_the_library_imports_none_of_its_modules() -> None:
-    """A program that needs one name does not load the modules of all other names."""
+    """The import of the library loads no other modules until a name is used.
+
+    A program that needs one name does not load the modules of all other names.
+    """
     script = "import sys, knightcube; print([m for m in sys.modules if m.startswith('knightcube.')])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -1,4 +1,4 @@
-"""Tests of initial orbits of artificial passes against trajectories integrated by scipy."""
+"""Tests of initial orbits from artificial passes, against trajectories that scipy integrates."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIGMA = 1e-5
 
 
 def flown(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
-    """Return the states (n, 6) at `times` of a free fall with the given state at `times[middle]`."""
+    """Return the states (n, 6) at `times` of a free fall that has the given state at `times[middle]`."""
 
     def slope(_: float, y: FloatArray) -> FloatArray:
         x, r2 = y[:3], float(y[:3] @ y[:3])

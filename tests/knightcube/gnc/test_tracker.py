@@ -1,4 +1,4 @@
-"""Tests of bearings-only tracks: uncertainty, several objects, loss of sight, and no false tracks."""
+"""Tests of tracks from bearings alone: uncertainty, several objects, outages, and no false tracks."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _PERIOD = 1.0
 
 
 def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the NEES of direction and of rate (two degrees of freedom each) of each frame.
+    """Return the NEES of direction and of rate in each frame, with two degrees of freedom each.
 
-    `sigma` (rad) is the standard deviation of a sighting, and half of it that of the attitude. `known` states
-    whether the gravity gradient is known.
+    `sigma` (rad) is the standard deviation of a sighting. The standard deviation of the attitude is half of
+    `sigma`. If `known` is set, the tracker knows the gravity gradient.
     """
     motion = MotionModel()
     state = None
@@ -55,7 +55,7 @@ def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> t
 
 @pytest.mark.parametrize("known", [False, True])
 def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
-    """The sum of the NEES at the ends of 60 passes is a chi-square with 120 degrees of freedom."""
+    """The NEES at the ends of 60 passes has the sum of a chi-square with 120 degrees of freedom."""
     rng = np.random.default_rng(16)
     times = np.arange(0.0, 24.0, _PERIOD)
     place, rate = [], []
@@ -70,7 +70,10 @@ def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
 
 
 def test_the_gravity_gradient_takes_the_tides_out_of_a_minute_s_prediction() -> None:
-    """In ten passes within 250 km, a straight-line extrapolation has errors of at least 1.2e-3 rad."""
+    """With the gravity gradient, the error of a prediction over a minute decreases to less than a tenth.
+
+    In ten passes within 250 km, a straight-line extrapolation has errors of at least 1.2e-3 rad.
+    """
     rng = np.random.default_rng(9)
     times = np.arange(0.0, 60.5, 2.0)
     for _ in range(10):
@@ -118,7 +121,8 @@ def test_a_track_ends_when_its_object_stays_away() -> None:
     for index, time in enumerate(flown.times):
         seen = flown.directions[index : index + 1] if time < 8.0 else np.zeros((0, 3))
         ends += [time for _ in tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE))[1]]
-    # The last sighting is at 7 s, and the search continues with each frame.
+    # The last sighting is at 7 s. The track ends at the first frame after the longest time without a
+    # sighting.
     assert ends == [7.0 + TrackSettings().coast + 1.0]
     assert tracker.objects == ()
 
@@ -127,8 +131,7 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
     rng = np.random.default_rng(5)
     times = np.arange(0.0, 30.0, 1.0)
     slow = a_pass(rng, np.radians(0.1), times, 15.0).directions
-    # The second sky is the first one, mirrored at a plane through the middle of the path, where both paths
-    # cross.
+    # The second path is the first path, mirrored at a plane through its middle, where both paths cross.
     middle = slow[15]
     normal = np.cross(middle, slow[16])
     normal /= np.linalg.norm(normal)
@@ -147,9 +150,9 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
 
 
 def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None:
-    """Where the two objects are within 3 px, the frame shows one object with the flux of both.
+    """Two equally bright objects that cross keep their track numbers, in twenty tested pairs.
 
-    Twenty pairs are tested.
+    While the objects are within 3 px, the frame shows one object with the flux of both.
     """
     rng = np.random.default_rng(77)
     times = np.arange(0.0, 30.0, 1.0)
@@ -190,7 +193,7 @@ def test_an_object_that_flashes_by_four_magnitudes_is_one_track() -> None:
     for index, time in enumerate(times):
         magnitude = np.array([5.0 + 3.0 * np.sin(2.0 * np.pi * time / 25.0)])
         seen = flown.directions[index : index + 1]
-        if magnitude[0] > 6.0:  # too faint to be detected
+        if magnitude[0] > 6.0:  # too faint for the camera
             seen, magnitude = np.zeros((0, 3)), np.zeros(0)
         _, ended = tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE, magnitude))
         assert not ended

@@ -1,4 +1,4 @@
-"""Tests of the PID and the adaptive controller: poles, reference model, start, saturation, refusals."""
+"""Tests of PID and adaptive controller: poles, reference model, start, saturation, refusals."""
 
 from __future__ import annotations
 
@@ -17,14 +17,20 @@ SETTINGS = AdaptiveSettings(bandwidth=1.0, adaptation=10.0, reference_bandwidth=
 
 
 def test_with_the_plant_known_the_body_follows_the_reference_model() -> None:
-    """The angle of a critically damped second-order model is 1 - (1 + wt) exp(-wt)."""
+    """With known plant parameters, the angle is that of the reference model, 1 - (1 + wt) exp(-wt).
+
+    The reference model is critically damped and of second order.
+    """
     rows = fly(AdaptiveController(BELIEVED, PERIOD, SETTINGS), BELIEVED, held(0.1), 20.0, noise=0.0)
     x = 0.5 * rows[:, 0]
     np.testing.assert_allclose(rows[:, 1], 0.1 * (1.0 - (1.0 + x) * np.exp(-x)), atol=3e-3)
 
 
 def test_an_unknown_torque_is_learnt_and_the_offset_goes() -> None:
-    """With constant parameters the same controller keeps most of the offset d / (g l) of 0.23 deg."""
+    """By adaptation, the offset of an unknown torque disappears.
+
+    With constant parameters, the same controller keeps most of the offset d / (g l) of 0.23 deg.
+    """
     pushed = replace(BELIEVED, disturbance=4e-3)
     learning, fixed = (
         fly(AdaptiveController(BELIEVED, PERIOD, settings), pushed, held(0.1), 80.0)
@@ -72,7 +78,10 @@ def placed(bandwidth: float) -> PidController:
 
 
 def test_a_small_step_is_the_response_of_three_equal_poles() -> None:
-    """With b = 0 the target acts only through the integral: theta = 1 - (1 + wt + (wt)^2/2) exp(-wt)."""
+    """The response to a small step is that of three equal poles, 1 - (1 + wt + (wt)^2/2) exp(-wt).
+
+    With b = 0, the target acts only through the integral.
+    """
     w, size = 0.8, 0.02
     rows = fly(placed(w), BELIEVED, held(size), 15.0, noise=0.0)
     x = w * rows[:, 0]

@@ -1,4 +1,4 @@
-"""Tests of Trajkovic and Hedley's cornerness against hand-computed patches and an exhaustive search."""
+"""Tests of Trajkovic and Hedley's cornerness, against patches computed by hand and an exhaustive search."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _patch(rows: list[list[float]]) -> FloatArray:
 
 
 def _by_the_corrected_equations(patch: FloatArray) -> float:
-    """Return the corrected 3.9-3.13 at the centre of a 3 x 3 patch, in the thesis's own symbols."""
+    """Return the corrected equations 3.9-3.13 at the centre of a 3 x 3 patch, in the thesis's symbols."""
     centre, right, left, below, above = patch[1, 1], patch[1, 2], patch[1, 0], patch[2, 1], patch[0, 1]
     r_a = (right - centre) ** 2 + (left - centre) ** 2
     r_b = (below - centre) ** 2 + (above - centre) ** 2
@@ -55,10 +55,11 @@ def _by_brute_force(patch: FloatArray, neighbours: int) -> float:
 
 
 def test_a_patch_computed_by_hand() -> None:
-    """The centre is 5, with 1 right, 3 left, 8 below and 6 above, so r_A = 16 + 4 and r_B = 9 + 1.
+    """The response of a patch equals 2/29, which was computed by hand.
 
-    B1 = (8-1)(1-5) + (6-3)(3-5) = -34, B2 = (8-3)(3-5) + (6-1)(1-5) = -30; B = -34, C = 20, A = 10 - 20 + 68
-    = 58, A + B = 24 > 0: R = 20 - 34^2/58 = 2/29.
+    The centre is 5, with 1 right, 3 left, 8 below and 6 above, so r_A = 16 + 4 and r_B = 9 + 1. B1 =
+    (8-1)(1-5) + (6-3)(3-5) = -34 and B2 = (8-3)(3-5) + (6-1)(1-5) = -30, so B = -34. With C = 20 and A = 10 -
+    20 + 68 = 58, A + B = 24 > 0, and R = 20 - 34^2/58 = 2/29.
     """
     patch = _patch([[0, 6, 0], [3, 5, 1], [0, 8, 0]])
     assert simple_response(patch, 4)[1, 1] == 10.0
@@ -66,13 +67,19 @@ def test_a_patch_computed_by_hand() -> None:
 
 
 def test_where_no_direction_between_is_lower_the_simple_response_stands() -> None:
-    """The pixels 1 (right), 3 (left), 1 (below) and 1 (above) around 5 give B1 = B2 = 4, not negative."""
+    """If no direction between the neighbours gives a lower value, the simple response is returned.
+
+    The pixels 1 (right), 3 (left), 1 (below) and 1 (above) around 5 give B1 = B2 = 4, which is not negative.
+    """
     patch = _patch([[0, 1, 0], [3, 5, 1], [0, 1, 0]])
     assert interpixel_response(patch, 4)[1, 1] == 20.0
 
 
 def test_eight_neighbours_by_hand() -> None:
-    """The ring around 5 is 0 except f = i = 5, so the intensity does not change along that diagonal."""
+    """With eight neighbours, the response is zero if the intensity does not change along one diagonal.
+
+    The ring around 5 is 0, except f = i = 5.
+    """
     patch = _patch([[5, 0, 0], [0, 5, 0], [0, 0, 5]])
     assert simple_response(patch, 4)[1, 1] == 50.0
     assert simple_response(patch, 8)[1, 1] == 0.0
@@ -87,9 +94,9 @@ def test_with_four_neighbours_it_is_the_corrected_equations() -> None:
 
 
 def test_the_printed_b1_would_not_be_the_least_change() -> None:
-    """Equation 3.12 as printed mixes two diameters.
+    """Equation 3.12 as printed mixes two diameters, so it does not give the smallest change.
 
-    The corrected equation agrees with an exhaustive search.
+    The corrected equation agrees with an exhaustive search over all diameters.
     """
     patch = _patch([[0, 6, 0], [3, 5, 1], [0, 8, 0]])
     printed = (8 - 1) * (1 - 5) + (6 - 1) * (3 - 5)
@@ -114,7 +121,7 @@ def test_edges_and_flat_parts_answer_nothing_and_corners_do(neighbours: int) -> 
     assert response[20, 35] == 0.0
     assert response[5, 5] == 0.0
     # With four neighbours, r_A = r_B = 1, B = B2 = -1 and A = 2. With eight neighbours, the lower left
-    # diagonal gives no lower value.
+    # diagonal gives no smaller value.
     assert response[20, 20] == pytest.approx(0.5 if neighbours == 4 else 1.0)
 
 
@@ -168,7 +175,8 @@ def _streak(roll: float, length: float = 40.0) -> tuple[FloatArray, FloatArray]:
     return image, true_endpoints(camera, star, rotation)[0]
 
 
-# The response of Trajkovic's detectors depends on the direction of a streak, which no constant corrects.
+# The response of Trajkovic's detectors depends on the direction of a streak, so a constant correction leaves
+# an error.
 _TOLERANCE: dict[DetectorName, float] = {
     "harris": 0.1,
     "minimum-eigenvalue": 0.1,
@@ -180,7 +188,7 @@ _TOLERANCE: dict[DetectorName, float] = {
 _ROLLS = [0.0, 0.4, 0.8, 1.6, 2.5]
 
 
-# With four neighbours, a streak near the diagonals looks like a row of corners, and is refused.
+# With four neighbours, a streak near a diagonal looks like a row of corners, and is refused.
 _TOO_SLANTED = [0.8, 2.5]
 
 
@@ -215,9 +223,9 @@ def test_without_its_constant_each_detector_is_biased_inward_by_it(detector: Det
 
 @pytest.mark.parametrize("detector", DETECTOR_NAMES)
 def test_a_crossing_of_two_streaks_has_not_two_corners(detector: DetectorName) -> None:
-    """Two crossing streaks have four ends.
+    """Two crossing streaks do not give exactly two corners, because they have four ends.
 
-    Trajkovic-4, whose response grows with brightness, finds only the crossing.
+    Trajkovic-4 finds only the crossing, because its response increases with brightness.
     """
     crossing = _streak(0.0)[0] + _streak(0.5 * np.pi)[0]
     assert len(_corners(crossing, StreakSettings.of(detector))) != 2
@@ -229,7 +237,10 @@ def test_trajkovic_4_refuses_a_streak_near_a_diagonal(roll: float) -> None:
 
 
 def test_the_centre_of_intensity_of_the_image_lies_far_inside_the_streak() -> None:
-    """The thesis uses this localisation, for which streaks.md states an error of 2.2 px with 7 x 7 pixels."""
+    """The thesis localises corners by the intensity of the image, which gives ends far inside the streak.
+
+    For 7 x 7 pixels, streaks.md states an error of 2.2 px.
+    """
     image, truth = _streak(0.0)
     found = np.linalg.norm(np.diff(_corners(image, StreakSettings(centre_of="image")), axis=0))
     assert 1.5 < 0.5 * (np.linalg.norm(truth[1] - truth[0]) - found) < 2.5

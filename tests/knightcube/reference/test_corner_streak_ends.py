@@ -1,4 +1,4 @@
-"""Tests of the attitudes at both ends of an exposure and the rate between them (Sease 3.22-3.29)."""
+"""Tests of the attitudes at both ends of an exposure, and of the rate between them (Sease 3.22-3.29)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ def _error(solution: FrameSolution, truth: FloatArray) -> FloatArray:
 def test_the_streaks_of_every_detector_are_identified_and_both_ends_give_the_rate(
     detector: DetectorName,
 ) -> None:
-    """The attitude is correct to a third of a pixel (15"), and the rate to 2 %, as the thesis states."""
+    """With each detector, the attitude is correct to a third of a pixel (15"), and the rate to 2 %.
+
+    These are the accuracies of the thesis.
+    """
     frame = _frame(0)
     solution, found = _solve(_streaks(frame, detector))
     assert solution.status is SolveStatus.SOLVED
@@ -65,7 +68,7 @@ def test_the_streaks_of_every_detector_are_identified_and_both_ends_give_the_rat
 
 
 def test_the_errors_of_attitude_and_rate_are_of_the_size_that_they_are_said_to_be() -> None:
-    """The squared errors of ten frames are within twice the 1e-5 quantiles of chi-square."""
+    """The squared normalised errors of ten frames are below twice the 1e-5 quantiles of chi-square."""
     attitude, rate = 0.0, 0.0
     for seed in range(10):
         frame = _frame(seed)
@@ -82,9 +85,9 @@ def test_the_errors_of_attitude_and_rate_are_of_the_size_that_they_are_said_to_b
 
 
 def test_a_wrong_direction_of_time_leaves_the_attitude_at_mid_exposure_and_turns_the_rate() -> None:
-    """A frame does not show which end was first.
+    """If the order of the ends is wrong, the attitude at mid-exposure is right, and the rate is reversed.
 
-    Both orders give the same middle attitude and opposite rates.
+    A frame does not show which end was first.
     """
     frame = _frame(1)
     streaks = _streaks(frame)
@@ -105,7 +108,7 @@ def test_a_prior_tells_where_to_look() -> None:
 
 
 def test_streaks_of_no_sky_are_refused_and_their_rate_stays() -> None:
-    """Mirrored ends match no part of the sky."""
+    """Streaks of a mirrored sky are not identified, but they still give their rate."""
     streaks = _streaks(_frame(2))
     mirrored = streaks.endpoints * np.array([-1.0, 1.0]) + np.array([NARROW.pinhole.columns - 1.0, 0.0])
     strewn = replace(streaks, endpoints=mirrored)
@@ -144,13 +147,14 @@ def test_exact_endpoints_give_back_the_rate_its_angle_and_axis(theta_deg: float,
         found.rotation_vector / np.linalg.norm(found.rotation_vector), rate / np.linalg.norm(rate), atol=1e-8
     )
     assert field_fraction(found.rate, exposure, _FIELD) == pytest.approx(fraction, rel=1e-8)
-    # The ends are half the rotation before and after mid-exposure, in whose axes the stars are given.
+    # The ends are half the rotation before and after mid-exposure. The star directions are in the axes of
+    # mid-exposure.
     for fix, sign in ((found.start, -0.5), (found.end, 0.5)):
         assert angle_between(fix.quaternion, from_rotation_vector(sign * rate * exposure)) < 1e-11
 
 
 def test_the_sign_is_that_of_a_star_fixed_in_the_sky() -> None:
-    """In a camera that rotates about +y, stars move to -x: v' = (-omega_y, omega_x) at v = z."""
+    """In a camera that rotates about +y, stars move towards -x, because v' = (-omega_y, omega_x) at v = z."""
     stars = _field(2)
     ends = _CAMERA.pinhole.project(stars)[:, None] + np.array([[4.0, 0.0], [-4.0, 0.0]])
     found = attitudes_of_ends(ends, stars, np.full(len(stars), 0.1), _CAMERA.pinhole, 1.0)
@@ -159,7 +163,10 @@ def test_the_sign_is_that_of_a_star_fixed_in_the_sky() -> None:
 
 
 def test_the_equations_as_printed_hold_with_the_sign_corrected() -> None:
-    """Equations 3.24-3.26 use the matrix Delta from start to end, its trace and its skew part."""
+    """Equations 3.24-3.26 hold with the corrected sign.
+
+    They use the matrix Delta from start to end, its trace and its skew-symmetric part.
+    """
     rate = rate_at(np.deg2rad(50.0), 0.1, 0.3)
     stars = _field(3)
     found = attitudes_of_ends(
@@ -181,7 +188,8 @@ def test_the_attitudes_are_of_the_frame_the_reference_is_given_in() -> None:
     rate = rate_at(1.0, 0.05)
     stars = _field(4)
     ends = true_endpoints(_CAMERA, stars, rate)
-    # Catalogue directions of the same stars: the axes of mid-exposure are A(q) of the catalogue's.
+    # Catalogue directions of the same stars. The matrix A(q) transforms catalogue axes into the axes of
+    # mid-exposure.
     catalogue = stars @ attitude_matrix(q)
     found = attitudes_of_ends(ends, catalogue, np.full(12, 0.1), _CAMERA.pinhole, 1.0)
     middle = multiply(from_rotation_vector(0.5 * found.rotation_vector), found.start.quaternion)
@@ -218,7 +226,10 @@ def test_a_turn_about_the_boresight_does_not_count_as_an_error_across_it() -> No
 
 
 def test_a_frame_with_its_stars_known_gives_both_attitudes_to_a_fifth_of_a_pixel() -> None:
-    """With Harris's corners, streaks of 10 % and true identifications, the thesis states 0.10 px."""
+    """With known identifications, both attitudes are correct to a fifth of a pixel.
+
+    For Harris's corners and streaks of 10 % of the field, the thesis states 0.10 px.
+    """
     rng = np.random.default_rng(7)
     rate = rate_at(np.deg2rad(60.0), 0.1 * _FIELD, 0.4)
     stars, magnitudes = random_stars(rng, _CAMERA.pinhole, 0.05, 6.0)

@@ -64,13 +64,16 @@ def _small_frame(seed: int, length: float = 50.0, theta: float = 0.5 * np.pi) ->
 @pytest.mark.parametrize("theta_deg", [90.0, 60.0, 30.0])
 @pytest.mark.parametrize("length", [25.0, 60.0, 200.0])
 def test_the_rate_vector_is_within_a_percent(theta_deg: float, length: float) -> None:
-    """The thesis states a magnitude error of 0.69 % at 102 px (Table 3.1), and 2 % in its abstract."""
+    """The rate vector is within 1 %.
+
+    The thesis states 0.69 % at 102 px (Table 3.1), and 2 % in its abstract.
+    """
     theta = np.deg2rad(theta_deg)
     rate = rate_at(theta, length / _FOCAL / np.sin(theta), 0.3)
     result = _estimate(star_frame(_WHOLE, rate, 1.0, 1, faintest=6.5), _WHOLE, rate)
     error = _rate_of(result) - rate
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(rate)
-    # The magnitude is more accurate than the direction; 0.25 % is 0.06 px of 25 px.
+    # The magnitude is more accurate than the direction. For a streak of 25 px, 0.25 % is 0.06 px.
     assert np.linalg.norm(_rate_of(result)) == pytest.approx(np.linalg.norm(rate), rel=0.0025)
 
 
@@ -83,7 +86,10 @@ def test_curved_streaks_about_an_axis_near_the_boresight_are_measured(theta_deg:
 
 
 def test_the_covariance_is_that_of_the_errors_over_many_frames() -> None:
-    """The normalised squared errors of 40 frames are in the chi-square band, widened for the bias."""
+    """The normalised squared errors of 40 frames are in the chi-square band, widened for the bias.
+
+    The bias is that of the corner detector.
+    """
     settings = dataclasses.replace(StreakSettings(), endpoint_bias_sigma=0.0)
     nees = []
     for seed in range(40):
@@ -92,11 +98,11 @@ def test_the_covariance_is_that_of_the_errors_over_many_frames() -> None:
         error = _rate_of(result) - rate
         assert result.covariance is not None
         nees.append(float(error @ np.linalg.solve(result.covariance, error)))
-    # The mean of 40 chi-squares of 3 degrees of freedom is 3 +- 0.39. The band is 3 sigma downwards and 4.5
-    # sigma upwards, because the error scale comes from some 15 streaks per frame, and the detector's bias is
+    # The mean of 40 chi-squares with 3 degrees of freedom is 3 +- 0.39. The band is 3 sigma downwards and 4.5
+    # sigma upwards. The error scale comes from only some 15 streaks per frame, and the detector's bias is
     # constant only to 0.02 px.
     assert 1.83 < np.mean(nees) < 4.75
-    # The normalised square exceeds 16.3 in one of a thousand frames.
+    # One of a thousand chi-squares exceeds 16.3.
     assert np.count_nonzero(np.array(nees) > 16.3) <= 2
 
 
@@ -144,7 +150,7 @@ def test_below_twenty_pixels_it_says_too_short(length: float) -> None:
     assert result.status is StreakStatus.TOO_SHORT
     assert result.rate is None
     assert result.covariance is None
-    # The moments of a region give its length only to a few pixels.
+    # The moments of a region give its length only to within a few pixels.
     assert result.length == pytest.approx(length, abs=4.0)
 
 
@@ -233,7 +239,7 @@ def test_eight_and_twelve_bit_cameras_give_the_rate(dtype: type, top: int, gain:
     settings = dataclasses.replace(StreakSettings(), gain=gain, saturation=float(top))
     result = _estimate(pixels, camera, rate, settings)
     found = _rate_of(result)
-    # Rounding to 40 e- adds as much noise as the camera has, so the limit is twice the usual one.
+    # Rounding to 40 e- adds as much noise as the camera itself has, so the limit is twice the usual limit.
     assert np.linalg.norm(found - rate) < 0.02 * np.linalg.norm(rate)
     assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(rate), rel=0.0025)
 
@@ -285,7 +291,7 @@ def test_ends_are_grouped_for_an_axis_normal_to_and_along_the_boresight(theta_de
     swap = np.random.default_rng(seed + 100).uniform(size=30) < 0.5
     first = np.where(swap[:, None], ends, starts)
     second = np.where(swap[:, None], starts, ends)
-    # Three streaks are outliers with another motion.
+    # Three streaks are outliers with a different motion.
     second[[4, 11, 20]] = np.roll(second[[4, 11, 20]], 1, axis=0)
     star = np.ones(30, dtype=np.bool_)
     star[[4, 11, 20]] = False
@@ -293,7 +299,7 @@ def test_ends_are_grouped_for_an_axis_normal_to_and_along_the_boresight(theta_de
     axis, agree = rotation_axis(first, second, 1.0 / _PINHOLE.focal_length / length)
     assert np.count_nonzero(agree & star) >= 25
     order = rotation_angles(first, second, axis)[star] < 0.0
-    # Either all streaks or none are reversed, because one frame does not show the direction of time.
+    # Either all streaks or no streaks are reversed, because one frame does not show the direction of time.
     reversed_order = order ^ swap[star]
     assert reversed_order.all() or not reversed_order.any()
     assert abs(axis @ true_axis) > np.cos(np.deg2rad(6.0))
@@ -302,7 +308,7 @@ def test_ends_are_grouped_for_an_axis_normal_to_and_along_the_boresight(theta_de
 def test_the_angle_turned_is_the_rotations() -> None:
     axis = rate_at(0.7, 1.0, 1.1)
     v = _PINHOLE.unit_vectors(np.array([[100.0, 900.0], [500.0, 30.0]]))
-    # With v' = -omega x v the stars rotate backwards about +axis.
+    # With v' = -omega x v, the stars rotate about the axis in the negative sense.
     np.testing.assert_allclose(rotation_angles(v, rotate(v, 0.3 * axis), axis), -0.3)
 
 
@@ -318,7 +324,7 @@ _CAMERA = star_camera()
 _FIELD = np.deg2rad(20.0)
 
 
-# Rate errors (%) of Table 3.1 for a rotation of 10 % of the field.
+# Errors (%) of the rate in Table 3.1, for a rotation by 10 % of the field of view.
 _THESIS: dict[DetectorName, float] = {
     "harris": 0.0069,
     "minimum-eigenvalue": 0.0120,
@@ -329,7 +335,7 @@ _THESIS: dict[DetectorName, float] = {
 
 @functools.cache
 def _frame(seed: int, theta_deg: float) -> tuple[Image, FloatArray]:
-    """Return a frame with a rotation of 10 % of the field, and its rate."""
+    """Return a frame with a rotation by 10 % of the field of view, and its rate."""
     rate = rate_at(np.deg2rad(theta_deg), 0.1 * _FIELD, 0.5 * seed)
     return star_frame(_CAMERA, rate, 1.0, 300 + seed, faintest=6.5), rate
 
@@ -345,13 +351,16 @@ def test_every_detector_reaches_the_thesis_at_ten_percent_of_the_field(detector:
         assert result.status is StreakStatus.RATE
         assert np.linalg.norm(result.rate) == pytest.approx(np.linalg.norm(rate), rel=_THESIS[detector])
         solved += 1
-    # Trajkovic-4 refuses half of all streaks, and some frames.
+    # Trajkovic-4 refuses half of all streaks, and therefore some frames.
     assert solved >= (1 if detector == "trajkovic-4" else 3)
 
 
 @pytest.mark.parametrize("detector", ["minimum-eigenvalue", "trajkovic-4", "trajkovic-8"])
 def test_without_its_constant_the_rate_is_short_by_it(detector: DetectorName) -> None:
-    """The error is twice the bias over the streak length, which is 10 % of the field at theta = 90 deg."""
+    """Without the correction of the bias, the rate error is twice the bias divided by the streak length.
+
+    At theta = 90 deg, the streak length is 10 % of the field of view.
+    """
     settings = dataclasses.replace(StreakSettings.of(detector), endpoint_bias=0.0)
     pixels, rate = _frame(0, 90.0)
     result = estimate_rate(pixels, _CAMERA.pinhole, 1.0, settings, rate, 1e-3)
@@ -379,7 +388,8 @@ def test_the_thesiss_mean_threshold_serves_a_frame_without_noise_and_no_other() 
     assert result.status is StreakStatus.RATE
     assert result.rate is not None
     assert np.linalg.norm(result.rate) == pytest.approx(np.linalg.norm(rate), rel=0.01)
-    # Faint stars hardly raise the mean of the image, so half of all pixels exceed it and are connected.
+    # Faint stars hardly increase the mean of the image, so half of all pixels exceed the mean and are
+    # connected.
     noisy = np.rint(0.02 * clean + rng.normal(150.0, 12.0, clean.shape)).astype(np.uint16)
     assert segment_frame(noisy, settings).regions.area.max() > 0.2 * noisy.size
     assert estimate_rate(noisy, camera.pinhole, 1.0, settings, rate, 1e-3).rate is None

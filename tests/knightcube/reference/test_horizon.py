@@ -29,7 +29,7 @@ PAPER_POINTS = np.array([[258.0, 128.0], [215.0, 256.0], [200.0, 384.0]])
 
 def test_the_papers_three_points_give_its_circle_to_its_digits() -> None:
     circle = fit_circle(PAPER_POINTS)
-    # The paper states (837.17, 393.79) and 637.3; the full values are 837.1786, 393.7905, 637.2538.
+    # The paper states (837.17, 393.79) and 637.3. The unrounded values are 837.1786, 393.7905 and 637.2538.
     assert circle.centre == pytest.approx([837.1786, 393.7905], abs=5e-5)
     assert circle.radius == pytest.approx(637.2538, abs=5e-5)
     assert np.floor(100.0 * circle.centre) / 100.0 == pytest.approx([837.17, 393.79])
@@ -38,7 +38,10 @@ def test_the_papers_three_points_give_its_circle_to_its_digits() -> None:
 
 
 def test_scan_lines_with_the_papers_edges_lead_to_the_papers_circle() -> None:
-    """The line has a dark sky, a bright Earth from the published pixels on, noise, a star and a dark gap."""
+    """Scan lines with the paper's edge points give the circle of the paper.
+
+    Each line has a dark sky, a bright Earth from the published pixels on, noise, a star and a dark gap.
+    """
     generator = np.random.default_rng(3)
     lines = generator.normal(12.0, 3.0, (3, 512))
     for line, (start, _) in zip(lines, PAPER_POINTS, strict=True):
@@ -89,7 +92,8 @@ ALTITUDE = 380e3
 FOCAL = 386.77
 """Focal length (px): 512 px across 67 deg."""
 CAMERAS = (
-    # Boresight along body x: right is body y; along body y: right is -x. Rows run down along body z.
+    # If the boresight is along body x, body y is to the right. If the boresight is along body y, -x is to the
+    # right. Rows run down along body z.
     LevelCamera(np.array([0.0, 1.0]), (255.5, 255.5)),
     LevelCamera(np.array([-1.0, 0.0]), (255.5, 255.5)),
 )
@@ -97,7 +101,7 @@ BORESIGHTS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def _seen_circle(camera: LevelCamera, boresight: FloatArray, nadir: FloatArray) -> HorizonCircle:
-    """Return the circle through three limb points at the image centre, projected exactly."""
+    """Return the circle through three limb points near the image centre, projected exactly."""
     right = np.array([*camera.right, 0.0])
     down = np.array([0.0, 0.0, 1.0])
     cosine = np.sqrt(1.0 - (6_371_008.8 / (6_371_008.8 + ALTITUDE)) ** 2)
@@ -122,7 +126,10 @@ def test_two_level_cameras_show_a_small_tilt(tilt_deg: tuple[float, float]) -> N
 
 
 def test_the_horizon_plane_lies_below_by_the_tangents_projection() -> None:
-    """At 380 km the limb is 2,233 km away and 19.3 deg below the horizontal (errata, 4.1): 739 km lower."""
+    """The plane of the horizon is 739 km lower than the projection of the tangent suggests (errata, 4.1).
+
+    At an altitude of 380 km, the limb is 2,233 km away and 19.3 deg below the horizontal.
+    """
     assert horizon_plane_depth(ALTITUDE) == pytest.approx(2_233e3 * np.sin(np.radians(19.32)), rel=1e-3)
 
 
@@ -133,7 +140,10 @@ def test_cameras_that_look_the_same_way_are_refused() -> None:
 
 
 def test_nadir_is_carried_on_by_the_rotation_of_a_sight() -> None:
-    """Equation (6) is exact for the shortest rotation, whose axis is normal to the line of sight."""
+    """Nadir is propagated exactly by the shortest rotation of a line of sight, as equation (6) states.
+
+    The axis of the shortest rotation is normal to the line of sight.
+    """
     before = np.array([0.0, 0.0, 1.0])
     rotation = turn(np.array([0.02, -0.01, 0.0]))
     nadir = np.array([0.1, 0.9, 0.3])

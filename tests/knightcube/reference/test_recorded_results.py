@@ -1,4 +1,4 @@
-"""Tests that results of the reference methods on small problems equal the recorded ones to five digits."""
+"""Tests that reference methods give the recorded results of small problems to five digits."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sky() -> KnownSky:
 
 
 def kind() -> ListKind:
-    """Return the kind of list with two false stars and a tenth of the true stars missing."""
+    """Return the kind of star lists with two false stars, and with a tenth of the true stars missing."""
     faintest = float(sky().stars.magnitude[-1])
     return ListKind(
         field_deg=FIELD_DEG, noise_px=0.2, known_deg=0.05, faintest=faintest, false_stars=2, lost=0.1
@@ -65,12 +65,12 @@ def kind() -> ListKind:
 
 
 def drawn(seed: int) -> StarList:
-    """Return a star list that is drawn with a seed."""
+    """Return a random star list of a seed."""
     return draw(kind(), sky().index.stars, np.random.default_rng(seed))
 
 
 def check_identified(name: str) -> None:
-    """Compare the results of a method on lists of the sky and on random lists with the record."""
+    """Compare a method's results for lists of the sky and for random lists with the recorded results."""
     found = [METHODS[name].identify(drawn(seed).field(), sky()) for seed in (1, 2)]
     found.append(METHODS[name].identify(draw_random(kind(), 12, np.random.default_rng(3)).field(), sky()))
     check(__file__, f"identified {name}", found)
@@ -86,7 +86,7 @@ def test_the_identification_by_a_classical_method_is_as_recorded(name: str) -> N
 
 
 def moving(seed: int) -> tuple[StarList, FloatArray, StarMotion]:
-    """Return a list of stars, their directions and their motion; the motion of one star is wrong."""
+    """Return a star list, its directions and its motion; the motion of one star is wrong."""
     one = drawn(seed)
     rng = np.random.default_rng(seed)
     direction = one.field().direction
@@ -135,7 +135,7 @@ def test_the_shapes_of_measured_triangles_are_as_recorded() -> None:
 
 
 def samples() -> list[tuple[PathSample, float, float]]:
-    """Return commanded motions with measured angles and rates."""
+    """Return commanded motions with the measured angles and rates."""
     found = []
     for k in range(60):
         t = 0.1 * k

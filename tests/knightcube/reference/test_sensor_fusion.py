@@ -1,4 +1,4 @@
-"""Tests of attitudes from cameras and magnetometer, and of their fusion, with known direction errors."""
+"""Tests of attitudes from cameras and magnetometer, and of their fusion, with known errors of directions."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _direction(
 
 
 def fly(seconds: int, sunlit: float) -> list[tuple[float, FloatArray, SeparateAttitudes]]:
-    """Return times (s), true attitudes and results at 0.5 Hz; Sun and nadir are in view before `sunlit` s."""
+    """Return times (s), true attitudes and results at 0.5 Hz. Sun and nadir are in view before `sunlit` s."""
     rng = np.random.default_rng(37)
     method = SeparateDetermination(GyroBiasFilter(GYRO, 3.5e-3, 2.5e-7))
     rows = []
@@ -75,7 +75,7 @@ def fly(seconds: int, sunlit: float) -> list[tuple[float, FloatArray, SeparateAt
         if number % 20 != 19:
             continue
         truth = multiply(from_rotation_vector(at * RATE), START)
-        # The satellite moves by 0.065 deg/s along its orbit, and the field rotates twice as fast.
+        # The satellite moves by 0.065 deg/s along its orbit, and the field rotates at twice this rate.
         down = np.array([math.cos(1.14e-3 * at), math.sin(1.14e-3 * at), 0.0])
         field = np.array([math.cos(2.3e-3 * at), 0.3, math.sin(2.3e-3 * at)]) / math.hypot(1.0, 0.3)
         sun = _direction(truth, SUN, SUN_SIGMA, rng) if at < sunlit else None
@@ -111,7 +111,10 @@ def test_one_field_alone_gives_no_attitude_at_the_start() -> None:
 
 
 def test_a_drift_of_the_attitude_since_the_start_is_attributed_to_the_gyro_bias() -> None:
-    """The gyros are accurate apart from their bias, so that the drift divided by the time is the bias."""
+    """The gyro bias is the drift of the attitude since the start, divided by the time.
+
+    Apart from their bias, the gyros are accurate.
+    """
     filter_ = GyroBiasFilter(1e-9, 1e-2, 0.0)
     filter_.update(KnownAttitude(START, 1e-12 * np.eye(3)))
     for _ in range(10):

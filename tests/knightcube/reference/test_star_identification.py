@@ -1,4 +1,4 @@
-"""Tests that the methods find the stars of a synthetic sky, refuse random points, and of image matching."""
+"""Tests of star identification by each reference method, and of image matching."""
 
 from __future__ import annotations
 
@@ -68,12 +68,13 @@ def _drawn(kind: ListKind, seed: int) -> list[StarList]:
 
 
 def _right(answer: StarMatch, drawn: StarList) -> bool:
-    """Return whether all identifications are true and the attitude error is below ten sigmas of a star."""
+    """Return whether all identifications are true, and the attitude error is below ten sigmas of a star."""
     if answer.status is not MatchStatus.IDENTIFIED or answer.fix is None:
         return False
     claimed = answer.star >= 0
     off = angle_between(answer.fix.quaternion, drawn.attitude)
-    # About the boresight, a star's error is divided by its lever arm, a tenth of a radian.
+    # For the rotation about the boresight, the error of a star is divided by its distance of 0.1 rad from the
+    # boresight.
     return bool(
         np.all(answer.star[claimed] == drawn.star[claimed])
         and off < 10.0 * drawn.kind.noise_px / drawn.camera.focal_length / 0.1
@@ -82,7 +83,7 @@ def _right(answer: StarMatch, drawn: StarList) -> bool:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_the_stars_of_a_clean_list_are_all_found(name: str) -> None:
-    """With 0.1 px of noise all identifications are right, and nearly all guide stars are identified."""
+    """With 0.1 px of noise, all identifications are right, and nearly all guide stars are identified."""
     for drawn in _drawn(_kind(), 1):
         answer = METHODS[name].identify(drawn.field(), _sky())
         assert _right(answer, drawn)
@@ -90,7 +91,10 @@ def test_the_stars_of_a_clean_list_are_all_found(name: str) -> None:
 
 
 def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None:
-    """Michalski's eq. 31 agrees to 1 % for pairs 30 sigma apart or more, and is wider for blended stars."""
+    """Limits of cosines by Michalski's eq. 31 agree with limits of angles to 1 %, for pairs 30 sigma apart.
+
+    For blended stars, the limits of cosines are wider.
+    """
     drawn = _drawn(_kind(noise_px=0.3), 6)[0]
     view = next(views(drawn.field(), DEFAULT))
     one, other = (np.array(index) for index in zip(*combinations(range(view.stars), 2), strict=True))
@@ -106,7 +110,7 @@ def test_limits_of_cosines_admit_the_pairs_that_limits_of_angles_admit() -> None
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_false_and_missing_stars_are_survived(name: str) -> None:
-    """With two false stars and a tenth missing, at most one list is refused and none is wrong."""
+    """With two false stars and a tenth missing, at most one list is refused, and no result is wrong."""
     answers = [
         (METHODS[name].identify(d.field(), _sky()), d) for d in _drawn(_kind(false_stars=2, lost=0.1), 2)
     ]
@@ -118,7 +122,7 @@ def test_false_and_missing_stars_are_survived(name: str) -> None:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_half_a_pixel_of_noise_is_survived(name: str) -> None:
-    """With half a pixel of noise, the many partners of a pair must not outvote the true one."""
+    """With half a pixel of noise, stars are identified although a pair has many possible partners."""
     lists = _drawn(_kind(noise_px=0.5, false_stars=2, lost=0.1), 3)
     answers = [METHODS[name].identify(drawn.field(), _sky()) for drawn in lists]
     assert all(answer.fix is None or _right(answer, one) for answer, one in zip(answers, lists, strict=True))
@@ -155,7 +159,10 @@ def test_points_strewn_at_random_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_mirrored_sky_is_refused(name: str) -> None:
-    """A mirrored sky has the same angles, areas and moments; only the orientation differs."""
+    """A mirrored sky is refused.
+
+    It has the same angles, areas and moments, and only its orientation differs.
+    """
     drawn = _drawn(_kind(), 4)[0]
     field = drawn.field()
     mirrored = replace(field, direction=field.direction * np.array([-1.0, 1.0, 1.0]))
@@ -180,7 +187,10 @@ def test_a_field_of_view_that_is_not_known_is_refused_with_the_reason(name: str)
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_two_points_within_their_errors_of_one_another_do_no_harm(name: str) -> None:
-    """One guide star is the best match of both points, and a single star does not determine an attitude."""
+    """If one guide star is the best match of two points, neither is identified wrongly.
+
+    A single star does not determine an attitude.
+    """
     drawn = _drawn(_kind(noise_px=2.0), 11)[0]
     field = drawn.field()
     twice = field.subset(np.repeat(np.arange(len(field)), 2))
@@ -203,7 +213,7 @@ def test_the_triangle_tables_hold_only_triangles_that_the_field_can_show() -> No
 
 
 def _motion(drawn: StarList, seed: int) -> tuple[StarMotion, FloatArray]:
-    """Return velocities of at most 1 deg/s, which are random for false points, and the rate."""
+    """Return velocities of at most 1 deg/s and the rate. The velocities of false points are random."""
     rng = np.random.default_rng(seed)
     field = drawn.field()
     rate = np.deg2rad([0.6, -0.7, 0.4])
@@ -216,7 +226,10 @@ def _motion(drawn: StarList, seed: int) -> tuple[StarMotion, FloatArray]:
 
 @pytest.mark.parametrize("false", [2, 5, 10])
 def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> None:
-    """One in a hundred stars may be lost, and one in ten false points may agree with the rate by chance."""
+    """False points whose motion differs from the common rate are discarded.
+
+    One of a hundred stars may be lost, and one of ten false points may have the right motion by chance.
+    """
     kept, strangers, points = 0, 0, 0
     for number, drawn in enumerate(_drawn(_kind(false_stars=false), 7)):
         motion, rate = _motion(drawn, number)
@@ -226,7 +239,7 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
         points += int(true.sum())
         strangers += int(shared.shares[~true].sum())
         off = shared.rate - rate
-        # 25 is exceeded by a chi-square with 3 degrees of freedom once in 60,000 cases
+        # A chi-square with 3 degrees of freedom exceeds 25 once in 60,000 cases
         assert off @ np.linalg.solve(shared.covariance, off) < 25.0
         assert _right(identify_by_rate(drawn.field(), _sky(), motion=motion), drawn)
     assert kept >= 0.99 * points
@@ -234,7 +247,10 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
 
 
 def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
-    """The direction after a small body rotation, by the attitude matrix, agrees with v' = -w x v."""
+    """The direction of a star after a small rotation of the body agrees with v' = -w x v.
+
+    The direction is computed by the attitude matrix.
+    """
     rate, step = np.array([0.02, -0.01, 0.03]), 1e-4
     before = np.array([0.1, 0.2, 1.0]) / np.linalg.norm([0.1, 0.2, 1.0])
     after = attitude_matrix(from_rotation_vector(rate * step)) @ before
@@ -242,7 +258,10 @@ def test_a_star_at_rest_in_the_sky_moves_against_the_body() -> None:
 
 
 def test_a_previous_attitude_turned_by_the_rate_names_too_few_stars_for_a_pattern() -> None:
-    """Only four stars are detected a second later, which are too few for lost-in-space identification."""
+    """A previous attitude, propagated by the rate, identifies four stars a second later.
+
+    Four stars are too few for lost-in-space identification.
+    """
     drawn = _drawn(_kind(), 8)[0]
     whole, rate = _motion(drawn, 8)
     few = np.arange(5)
@@ -286,9 +305,9 @@ def _stars(seed: int, noise: float, half_deg: float = 10.0) -> tuple[FloatArray,
     ("axis", "limits"), [((0, 0, 1), (0.01,)), ((1, 0, 0), (200, 8)), ((0.6, 0.8, 0), (200, 8))]
 )
 def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limits: tuple[float, ...]) -> None:
-    """A roll of 1 deg about the boresight is exact after one step.
+    """After a roll by 1 deg about the boresight, the attitude is exact after one step.
 
-    After a tilt of 1 deg, the error is up to 200 arcseconds after one step and 8 arcseconds after two.
+    After a tilt by 1 deg, the error is up to 200 arcseconds after one step and 8 arcseconds after two steps.
     """
     observed, reference, true = _stars(3, 0.0)
     prior = multiply(from_rotation_vector(np.radians(1.0) * np.array(axis)), true)
@@ -300,7 +319,11 @@ def test_a_roll_needs_one_step_and_a_tilt_several(axis: tuple[float, ...], limit
 
 
 def test_noisy_stars_give_the_attitude_of_the_q_method_within_its_uncertainty() -> None:
-    """In the image plane, stars at the edge of a 20 deg field have up to 1.06 times their weight."""
+    """The attitude of noisy stars agrees with the q method within its uncertainty.
+
+    In the image plane, the weight of stars at the edge of a 20 deg field is up to 1.06 times their usual
+    weight.
+    """
     for seed in range(10):
         observed, reference, _ = _stars(100 + seed, SIGMA)
         optimal = SOLVERS["davenport"](observed, reference, np.full(15, SIGMA))

@@ -30,7 +30,10 @@ def _found_by_hand(key: FloatArray, low: float, high: float) -> list[int]:
 def test_ranges_hold_the_keys_that_a_search_through_all_finds(
     drawn: FloatArray, ends: list[tuple[float, float]], cells: int | None
 ) -> None:
-    """Keys are often equal, cells few or many, and ranges empty, reversed or beyond all keys."""
+    """A range contains the keys that an exhaustive search finds.
+
+    Keys are often equal, cells are few or many, and ranges may be empty, reversed or beyond all keys.
+    """
     key = np.sort(drawn)
     index = star_tables.build_k_vector(key, cells)
     start, stop = index.ranges([low for low, _ in ends], [high for _, high in ends])
@@ -50,7 +53,10 @@ def test_a_key_that_is_the_low_end_is_in_and_one_that_is_the_high_end_is_out(
 
 
 def test_a_million_skewed_keys_agree_with_bisection() -> None:
-    """The keys are float32, nearly all in a few cells, and some values are keys themselves."""
+    """A search among a million float32 keys, nearly all in a few cells, agrees with bisection.
+
+    Some of the searched values are keys themselves.
+    """
     rng = np.random.default_rng(11)
     key = np.sort(rng.exponential(1.0, 1_000_000).astype(np.float32) ** 4)
     ends = np.concatenate([rng.choice(key, 400).astype(np.float64), rng.uniform(-1.0, 1.1 * key[-1], 400)])
@@ -98,7 +104,10 @@ def table() -> PairTable:
 
 
 def test_the_table_has_every_pair_within_the_widest_angle_and_no_other(table: PairTable) -> None:
-    """Compare with the arc cosine of all products, up to float32."""
+    """The table contains every pair within the largest angle, and no other pair, up to float32.
+
+    The expected angles are the arc cosines of all products.
+    """
     direction = _sky(300).direction
     one, other = np.triu_indices(300, 1)
     angle = np.arccos(np.clip(np.sum(direction[one] * direction[other], axis=-1), -1.0, 1.0))
@@ -131,9 +140,9 @@ def test_the_magnitude_limit_gives_the_wanted_number_of_stars_in_a_field() -> No
 
 @pytest.mark.parametrize("degrees", [0.01, 0.1, 5.0, 90.0])
 def test_the_variance_of_a_cosine_is_that_of_drawn_pairs(degrees: float) -> None:
-    """Some pairs of stars are as close together as their errors are large.
+    """The variance of a cosine agrees with drawn pairs, even if two stars are as close as their errors.
 
-    20,000 random draws determine the standard deviation to within 1.5 % (3 sigma).
+    The 20,000 random draws determine the standard deviation to within 1.5 % (3 sigma).
     """
     rng = np.random.default_rng(4)
     sigma = np.radians([0.02, 0.05])

@@ -1,4 +1,4 @@
-"""Tests of area, polar moment and their variances against closed forms, integration and Monte Carlo."""
+"""Tests of area, polar moment and their variances, against closed forms, integration and Monte Carlo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _corners(seed: int, half_width: float = 0.12) -> FloatArray:
 
 
 def _moment_of_plane_triangle(corners: FloatArray) -> float:
-    """Return the integral of squared distance from the centroid, by iterated quadrature."""
+    """Return the integral of the squared distance from the centroid, by iterated quadrature."""
     p, q, r = corners
     centroid = corners.mean(axis=0)
     double_area = float(np.linalg.norm(np.cross(q - p, r - p)))
@@ -69,7 +69,10 @@ def test_spherical_area_is_that_of_the_sum_of_angles_and_of_equation_32(seed: in
 
 @pytest.mark.parametrize("seed", range(3))
 def test_spherical_moment_is_the_adaptive_integral_of_its_definition(seed: int) -> None:
-    """Equation 34 is integrated by iterated adaptive quadrature, theta by its cosine and sine."""
+    """The polar moment equals its definition (34), integrated by iterated adaptive quadrature.
+
+    The integral over theta uses its cosine and sine.
+    """
     corners = _corners(seed)
     middle = corners.sum(axis=0) / np.linalg.norm(corners.sum(axis=0))
     volume = abs(float(np.linalg.det(corners)))
@@ -84,7 +87,7 @@ def test_spherical_moment_is_the_adaptive_integral_of_its_definition(seed: int) 
 
 
 def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
-    """The definition (34) is summed as by Cole & Crassidis: triangles are quartered seven times."""
+    """The polar moment equals the sum (34) of Cole & Crassidis over triangles that are quartered 7 times."""
     corners = _corners(1)
     middle = corners.sum(axis=0) / np.linalg.norm(corners.sum(axis=0))
     triangles = corners[None]
@@ -98,7 +101,7 @@ def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
     theta = 2.0 * np.arcsin(0.5 * np.linalg.norm(centre - middle, axis=-1))
     total = float(np.sum(theta**2 * spherical_shape(triangles)[0]))
-    # Each division reduces the error to a quarter, finally to about (1/128)^2 of the moment.
+    # Each division reduces the error to a quarter, and seven divisions to about (1/128)^2 of the moment.
     assert spherical_shape(corners[None])[1][0] == pytest.approx(total, rel=2e-4)
 
 
@@ -111,9 +114,9 @@ def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
 def test_propagated_variances_agree_with_a_monte_carlo(
     shape: Shape, measured_shape: MeasuredShape, seed: int
 ) -> None:
-    """The corners have unequal errors (eq. 40-48).
+    """The propagated variances (eq. 40-48) agree with 20,000 random draws, for unequal errors of corners.
 
-    20,000 random draws determine a standard deviation to within 0.5 %.
+    The random draws determine a standard deviation to within 0.5 %.
     """
     corners = _corners(seed)
     sigma = np.array([3e-5, 6e-5, 9e-5])

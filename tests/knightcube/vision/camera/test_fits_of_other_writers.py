@@ -1,4 +1,4 @@
-"""Tests with FITS files written by astropy, and with mutated headers."""
+"""Tests with FITS files that astropy has written, and with changed headers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GREY = COLOURS[1]
 
 
 def _written(*units: object) -> bytes:
-    """Return the bytes of a FITS file that astropy writes from header data units."""
+    """Return the bytes of a FITS file that astropy writes from some header data units."""
     out = io.BytesIO()
     fits.HDUList(list(units)).writeto(out)
     return out.getvalue()
@@ -101,7 +101,10 @@ VALUES = st.one_of(
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(KEYWORDS), VALUES), min_size=1, max_size=3))
 def test_a_wrong_value_in_a_header_is_read_or_named_in_one_line(changes: list[tuple[str, str]]) -> None:
-    """A refusal names a changed keyword, its value, or the resulting size of the image."""
+    """A file with a wrong header value is read, or refused in one line that names the problem.
+
+    The line names the changed keyword, its value, or the resulting size of the image.
+    """
     header: dict[str, str] = {"SIMPLE": "T", "BITPIX": "16", "NAXIS": "2", "NAXIS1": "30", "NAXIS2": "20"}
     header |= dict(changes)
     text = "".join(f"{key:<8}= {value:>20}"[:80].ljust(80) for key, value in header.items()) + "END".ljust(80)

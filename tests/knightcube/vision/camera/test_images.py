@@ -1,4 +1,4 @@
-"""Tests of image files of each supported kind, written by Pillow, by the test, or by the vision worker."""
+"""Tests of image files of each supported format, written by Pillow, by the test, or by the vision worker."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _tiff(pixels: Image, order: str, photometric: int = 1, channels: int = 1) ->
     ]
     entries = b""
     for tag, kind, count, value in tags:
-        # A two-byte value occupies the first two of the four bytes.
+        # A value of two bytes is stored in the first two of the four bytes.
         form = "HHIHxx" if kind == 3 else "HHII"
         entries += struct.pack(order + form, tag, kind, count, value)
     mark = b"II" if order == "<" else b"MM"
@@ -116,9 +116,9 @@ def test_a_jpeg_is_read_to_its_compression(tmp_path: Path) -> None:
     ("mode", "name"), [("RGB", "a.png"), ("RGBA", "a.png"), ("RGB", "a.tif"), ("P", "a.png"), ("P", "a.tif")]
 )
 def test_colour_becomes_luminance(tmp_path: Path, mode: str, name: str) -> None:
-    """The luminance of ITU-R BT.601 is 0.299 R + 0.587 G + 0.114 B."""
+    """The luminance of a colour image is 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601)."""
     colours = np.array([[[200, 0, 0], [0, 200, 0], [0, 0, 200], [10, 20, 30]]], dtype=np.uint8)
-    # The palette holds all four colours exactly.
+    # The palette contains all four colours exactly.
     pillow.fromarray(colours).convert(mode, palette=pillow.Palette.ADAPTIVE).save(tmp_path / name)
     image = read_image(tmp_path / name)
     assert image.dtype == np.uint8
@@ -147,7 +147,7 @@ def test_one_bit_becomes_black_and_white(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (6, 4)])
 def test_16_bit_colour_becomes_luminance_of_16_bits(tmp_path: Path, colour_type: int, channels: int) -> None:
-    """If all channels are equal, the luminance equals the 16-bit count of each pixel."""
+    """If all channels of a 16-bit image are equal, the luminance equals the count of each channel."""
     path = tmp_path / "a.png"
     path.write_bytes(_png(SIXTEEN, colour_type, channels))
     found = read_image(path)
@@ -275,7 +275,7 @@ def test_photographs_of_the_sky_are_dark_with_bright_stars(
     image = read_image(SKY / name)
     assert image.shape == shape
     assert image.dtype == kind
-    # A wrong byte order would turn the 16-bit frames into noise, in which neighbouring pixels differ.
+    # With a wrong byte order, the 16-bit frames would be noise, in which neighbouring pixels differ.
     assert np.median(image) < 0.25 * image.max()
     smooth = np.abs(np.diff(image.astype(float), axis=1))
     assert np.median(smooth) < 0.05 * image.max()
@@ -301,7 +301,10 @@ def test_every_kind_of_pixel_keeps_its_type_and_value(bits: int, kind: str, expe
 
 
 def test_unsigned_integers_keep_their_values() -> None:
-    """FITS 4.4.2.5 stores value - BZERO, so that 0, 32768 and 65535 are stored as -32768, 0 and 32767."""
+    """Unsigned integers keep their values: 0, 32768 and 65535 are stored as -32768, 0 and 32767.
+
+    FITS 4.4.2.5 stores the value minus BZERO.
+    """
     stored = np.array([[-32768, 0, 32767]])
     image = fits_image(fits_file(stored.astype(">i2"), 16, BZERO=32768, BSCALE=1), "x.fits")
     assert image.dtype == np.uint16
@@ -313,7 +316,7 @@ def test_unsigned_integers_keep_their_values() -> None:
 
 
 def test_a_scale_gives_physical_values() -> None:
-    """The value is BZERO + BSCALE times the stored value, with a D in the exponent of a double."""
+    """The value of a pixel is BZERO + BSCALE times the stored value; the exponent of a double may use D."""
     image = fits_image(fits_file(PIXELS.astype(">i2"), 16, BZERO="-1.5", BSCALE="2.5D-1"), "x.fits")
     assert image.dtype == np.float64
     assert image.tolist() == (-1.5 + 0.25 * PIXELS).tolist()
@@ -412,11 +415,15 @@ def test_a_full_disk_loses_only_the_stored_frame(tmp_path: Path) -> None:
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tiff"])
 def test_a_photograph_is_rotated_as_its_metadata_state(tmp_path: Path, name: str, orientation: int) -> None:
-    """The marks are at the top left; for orientations from 5 on, the stored image's long side is vertical."""
+    """A photograph is rotated as the orientation in its metadata states.
+
+    The marks are then at the top left. For orientations from 5 on, the long side of the stored image is
+    vertical.
+    """
     pixels = np.zeros((32, 48), dtype=np.uint8)
     pixels[:8, :24], pixels[16:24, 8:16] = 200, 100
-    # Each orientation states the sides to which row 0 and column 0 of the stored image belong (EXIF 2.3,
-    # section 4.6.4).
+    # Each orientation defines the sides of the scene to which row 0 and column 0 of the stored image belong
+    # (EXIF 2.3, section 4.6.4).
     stored = {
         1: pixels,
         2: pixels[:, ::-1],

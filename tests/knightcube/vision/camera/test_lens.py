@@ -1,4 +1,4 @@
-"""Tests of the calibrated lens against the pinhole and its own polynomial, and of rejected lenses."""
+"""Tests of the calibrated lens against the pinhole and against its polynomial, and of refused lenses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_without_distortion_it_is_the_pinhole() -> None:
 
 
 def test_a_star_falls_where_the_polynomial_says() -> None:
-    """For f = 1000 px, a star 10 deg off the axis is at 176.33 (1 - 0.3 x 0.031091 + 0.1 x 0.00096666) px."""
+    """At f = 1000 px, a star 10 deg off axis is at 176.33 (1 - 0.3 x 0.031091 + 0.1 x 0.00096666) px."""
     lens = Lens(2000, 2000, 1000.0, (990.0, 1010.0), -0.3, 0.1)
     direction = np.array([[np.sin(np.radians(10.0)), 0.0, np.cos(np.radians(10.0))]])
     expected = [990.0 + 176.326981 * (1.0 - 0.3 * 0.0310912041 + 0.1 * 0.000966662976), 1010.0]
@@ -52,7 +52,7 @@ def test_unit_vectors_undo_the_projection_to_a_nanopixel(
     except LensError:
         assume(False)
     points = _points(2)
-    # Even if the distortion curve is nearly flat at the edge, a direction is projected back onto its pixel.
+    # A direction is projected back onto its pixel, even if the distortion curve is nearly flat at the edge.
     vectors = lens.unit_vectors(points)
     assert np.max(np.abs(lens.project(vectors) - points)) < 1e-9
     assert np.allclose(np.linalg.norm(vectors, axis=-1), 1.0, rtol=0.0, atol=1e-14)
@@ -60,7 +60,7 @@ def test_unit_vectors_undo_the_projection_to_a_nanopixel(
 
 @given(k1=st.floats(-2.0, 2.0), k2=st.floats(-2.0, 2.0))
 def test_a_lens_is_refused_exactly_when_its_image_folds_within_the_detector(k1: float, k2: float) -> None:
-    """A lens is valid if the distorted tangent increases up to the corner of the image."""
+    """A lens is accepted if and only if the distorted tangent increases up to the corner of the image."""
     corner = np.hypot(512.0, 512.0) / 512.0
     tangent = np.linspace(0.0, 6.0, 60_001)
     stretched = tangent * (1.0 + k1 * tangent**2 + k2 * tangent**4)
@@ -78,7 +78,7 @@ def test_a_direction_beyond_the_fold_is_not_imaged() -> None:
     lens = Lens(200, 200, 1000.0, (99.5, 99.5), -0.5)
     tangents = np.array([0.1, 0.8, 1.0, 1.4])
     points = lens.project(np.stack([tangents, 0.0 * tangents, np.ones(4)], axis=-1))
-    # The distorted tangent decreases beyond 1/sqrt(1.5) = 0.816. A tangent of 1.4 would give pixel 127.
+    # The distorted tangent decreases beyond 1/sqrt(1.5) = 0.816. A tangent of 1.4 would give the pixel 127.
     assert np.isfinite(points[:2]).all()
     assert np.isnan(points[2:]).all()
     assert np.isnan(lens.unit_vectors(np.array([[99.5 + 545.0, 99.5]]))).all()
@@ -88,7 +88,10 @@ def test_a_direction_beyond_the_fold_is_not_imaged() -> None:
 def test_pixels_and_directions_agree_with_aspect_shear_and_tangential_terms(
     shape: tuple[float, float, float, float],
 ) -> None:
-    """The positions are those of Brown (1966), then stretched and sheared about the axis."""
+    """With stretched and sheared axes and tangential terms, pixels and directions agree.
+
+    The positions are those of Brown (1966), which are then stretched and sheared about the axis.
+    """
     aspect, shear, p1, p2 = shape
     lens = Lens(1000, 800, 1000.0, (490.0, 410.0), -0.1, 0.02, *shape)
     points = np.random.default_rng(2).uniform([-0.5, -0.5], [999.5, 799.5], (200, 2))
@@ -141,9 +144,10 @@ def test_the_boresight_falls_between_the_middle_pixels() -> None:
 
 
 def test_the_field_of_view_ends_at_the_outer_edge_of_the_outermost_pixel() -> None:
-    """By Sease, section 2.4, half the field of view corresponds to half the columns.
+    """The field of view ends at the outer edge of the outermost pixel, half the columns from the centre.
 
-    Coordinate 0 is the centre of a pixel, whose edge is at -0.5.
+    This is the definition of Sease, section 2.4. Coordinate 0 is the centre of a pixel, whose edge is at
+    -0.5.
     """
     edge = np.radians(10.0)
     points = CAMERA.project(np.array([[np.sin(edge), 0.0, np.cos(edge)], [-np.sin(edge), 0.0, np.cos(edge)]]))
@@ -176,7 +180,10 @@ def test_projection_does_not_depend_on_distance(x: float, y: float, distance: fl
 
 @given(COLUMN, ROW)
 def test_a_direction_behind_the_camera_has_no_pixel(x: float, y: float) -> None:
-    """Errata to section 2.1 of the thesis: a direction and its opposite would project to the same pixel."""
+    """A direction behind the camera has no pixel, although its opposite projects to a pixel.
+
+    This corrects section 2.1 of the thesis (errata).
+    """
     behind = CAMERA.project(-CAMERA.unit_vectors(np.array([[x, y]])))
     assert np.all(np.isnan(behind))
     assert not CAMERA.contains(behind, margin=1e9)[0]

@@ -33,7 +33,7 @@ class Instant:
 
     @property
     def nadir(self) -> FloatArray:
-        """The true nadir (3,) in body axes."""
+        """True nadir direction (3,) in body axes."""
         return np.asarray(attitude_matrix(self.attitude) @ (-self.position / np.linalg.norm(self.position)))
 
     @property
@@ -51,7 +51,7 @@ class Instant:
 
 
 def instant(cameras: list[MountedCamera], nadir: FloatArray, sun: FloatArray, seed: int) -> Instant:
-    """Return an instant above 53 deg north with nadir (3,) in body axes and the Sun (3,) in inertial axes."""
+    """Return a satellite above 53 deg north, with nadir (3,) in body and Sun (3,) in inertial axes."""
     down = np.array([-0.6, 0.0, -0.8])
     position = -(6_378_137.0 + ALTITUDE) * down
     middle = nadir / np.linalg.norm(nadir) + down

@@ -14,7 +14,8 @@ from knightcube.vision.horizon.settings import EdgeSettings
 SIZE = 256
 FEW = EdgeSettings(lines=8)
 CENTRES = np.arange(16, 256, 32)
-"""Centres of eight equal strips of 256 px, each between the pixels 15 and 16 of the strip."""
+"""Centres (px) of eight equal strips of an image of 256 px, each between the pixels 15 and 16 of its strip.
+"""
 
 
 def step(place: float, width: float = 0.5, dark: float = 10.0, bright: float = 110.0) -> FloatArray:
@@ -24,7 +25,7 @@ def step(place: float, width: float = 0.5, dark: float = 10.0, bright: float = 1
 
 
 def border(place: float) -> FloatArray:
-    """Return an image that is bright from `place` px to 60 px."""
+    """Return an image that is bright between the columns `place` px and 60 px."""
     return np.where(np.arange(SIZE) < 60, step(place), 10.0)
 
 
@@ -36,7 +37,7 @@ def bars(*levels: float) -> FloatArray:
 def test_a_majority_of_the_window_decides_and_ends_are_continued() -> None:
     line = np.array([[0, 1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1, 1, 0]], dtype=bool)
     assert run_filtered(line, 3).astype(int).tolist() == [[0, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0]]
-    # A window of five removes pairs and keeps groups of three.
+    # A majority filter of five pixels removes pairs and keeps groups of three.
     assert run_filtered(line, 5).astype(int).tolist() == [[0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0]]
     assert run_filtered(line).tolist() == run_filtered(line, 5).tolist()
     assert run_filtered(line, 1).tolist() == line.tolist()
@@ -48,9 +49,10 @@ def test_a_majority_of_the_window_decides_and_ends_are_continued() -> None:
 def test_an_edge_is_placed_at_its_steepest_point_at_the_scale_that_covers_it(
     width: float, scale: float
 ) -> None:
-    """The slope of a Gaussian edge of w px at the scale s is (1 + (w/s)^2)^-1/2.
+    """An edge is located at its steepest point, at the smallest sufficient scale.
 
-    The next scale is chosen if it increases the slope by a factor of 1.4, which is the case from w = 1.37 s.
+    The slope of a Gaussian edge of w px at the scale s is (1 + (w/s)^2)^-1/2. The next scale is used if it
+    increases the slope by a factor of 1.4, which holds from w = 1.37 s on.
     """
     edges, lines = find_edges(step(130.3, width), FEW)
     assert len(edges) == 8
@@ -58,7 +60,7 @@ def test_an_edge_is_placed_at_its_steepest_point_at_the_scale_that_covers_it(
     assert edges.points[:, 1].tolist() == CENTRES.tolist() == lines.rows.tolist() == lines.columns.tolist()
     assert edges.towards.tolist() == [[1.0, 0.0]] * 8
     assert edges.scale.tolist() == [scale] * 8
-    # The same edge is tested in the vertical direction, with its bright side above.
+    # The same edge is tested in the vertical direction, with the bright side above.
     upright, _ = find_edges(step(130.3, width).T[::-1], FEW)
     assert upright.points[:, 1] == pytest.approx(np.full(8, SIZE - 1 - 130.3), abs=0.02 + 0.01 * width)
     assert upright.towards.tolist() == [[0.0, -1.0]] * 8
@@ -73,7 +75,7 @@ def test_the_profile_and_the_background_are_the_pixels_across_the_edge() -> None
     assert np.all(edges.profile_steps.min(axis=1) < -8.0)
     assert np.all(edges.profile_steps.max(axis=1) > 4.0)
     assert edges.background == pytest.approx(np.full(8, 10.0), abs=0.1)
-    # From the right, the same samples follow in reverse order.
+    # A profile from the right has the same samples in reverse order.
     turned, _ = find_edges(image[:, ::-1], FEW)
     assert turned.profile == pytest.approx(edges.profile)
     assert turned.profile_steps == pytest.approx(edges.profile_steps, abs=1e-9)
@@ -90,7 +92,10 @@ def test_samples_outside_the_image_are_missing_from_a_profile() -> None:
 
 @pytest.mark.parametrize(("place", "count"), [(3.4, 0), (4.6, 8), (250.4, 8), (251.6, 0)])
 def test_edges_within_four_pixels_of_the_border_are_ignored(place: float, count: int) -> None:
-    """The image ends at 0 and 255 px, so the edges are 3.4, 4.6, 4.6 and 3.4 px from the border."""
+    """Edges within four pixels of the border are ignored.
+
+    The image ends at 0 and 255 px, so the tested edges are 3.4, 4.6, 4.6 and 3.4 px from the border.
+    """
     line = border(place) if place < 128 else border(255.0 - place)[:, ::-1]
     edges, _ = find_edges(line, FEW)
     assert np.count_nonzero(np.abs(edges.points[:, 0] - place) < 1.0) == count
@@ -112,7 +117,10 @@ def test_levels_are_those_of_a_dark_and_a_bright_half_and_the_noise_of_the_dark(
 
 @pytest.mark.parametrize(("lit", "found"), [(7, False), (8, True)])
 def test_fewer_than_sixteen_lit_pixels_are_a_star(lit: int, found: bool) -> None:
-    """Every pixel is read on its row and on its column, so that seven pixels count as 14 and eight as 16."""
+    """Fewer than sixteen lit samples are a star. Each pixel is sampled twice: in its row and in its column.
+
+    Seven pixels thus count as 14 samples, and eight pixels as 16.
+    """
     image = np.random.default_rng(2).normal(10.0, 1.0, (32, 64))
     image[10, 20 : 20 + lit] = 100.0
     levels = find_edges(image, EdgeSettings(lines=64))[1].levels
@@ -121,7 +129,10 @@ def test_fewer_than_sixteen_lit_pixels_are_a_star(lit: int, found: bool) -> None
 
 @pytest.mark.parametrize(("low", "high", "found"), [(22.0, 38.0, True), (24.0, 36.0, False)])
 def test_the_weakest_edge_is_a_seventh_of_the_span(low: float, high: float, found: bool) -> None:
-    """The step crosses the brightness threshold of 0.3, with contrasts on both sides of the limit 0.15."""
+    """The smallest contrast of an edge is 0.15 of the brightness span.
+
+    Each step crosses the brightness threshold of 0.3, with a contrast above or below the limit of 0.15.
+    """
     edges, _ = find_edges(bars(0.0, 0.0, low, high, 100.0, 100.0, 100.0, 100.0), FEW)
     at = edges.points[:, 0]
     assert np.count_nonzero(np.abs(at - 95.5) < 1.0) == (8 if found else 0)
@@ -135,7 +146,11 @@ def test_pixels_above_three_tenths_of_the_span_are_bright(grey: float, place: fl
 
 @pytest.mark.parametrize(("sigmas", "lit"), [(5.5, False), (6.5, True)])
 def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, lit: bool) -> None:
-    """A quarter of the image at 100 sigma determines the brightness span, of which 1 % is below the noise."""
+    """Pixels within six sigma of the dark pixels are not bright.
+
+    A quarter of the image at 100 sigma determines the brightness span, and 1 % of this span is below the
+    noise.
+    """
     noise = np.random.default_rng(3).normal(0.0, 1.0, (SIZE, SIZE))
     image = bars(0.0, sigmas, 0.0, 100.0) + noise
     low = EdgeSettings(lines=8, threshold=0.01, run=1)
@@ -144,7 +159,10 @@ def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, 
 
 
 def test_of_too_many_edges_those_with_the_darkest_side_are_kept() -> None:
-    """With eight bars on a rising background, each of 8 rows has 4 rising edges, of which two are kept."""
+    """If there are too many edges, those with the darkest side are kept.
+
+    Eight bars on a rising background give 4 rising edges in each of 8 rows, of which two are kept.
+    """
     image = bars(0.0, 100.0, 4.0, 100.0, 8.0, 100.0, 12.0, 100.0)
     settings = EdgeSettings(lines=8, most=2)
     edges, _ = find_edges(image, settings)
@@ -191,7 +209,8 @@ def test_directions_steps_and_samples_are_those_of_the_lens() -> None:
     assert seen.rays.brighter == pytest.approx(seen.across)
     assert seen.rays.pixel == pytest.approx(np.linalg.norm(seen.across, axis=1))
     assert len(seen.rays) == len(edges)
-    # The samples are every 32nd pixel of eight columns and eight rows, and the right half of them is bright.
+    # The samples are every 32nd pixel of eight columns and eight rows. The right half of the samples is
+    # bright.
     places = np.stack(np.meshgrid(CENTRES, CENTRES, indexing="ij"), axis=-1).reshape(-1, 2)
     points = np.concatenate([places, places[:, ::-1]]).astype(float)
     assert seen.samples.rays == pytest.approx(camera.unit_vectors(points))

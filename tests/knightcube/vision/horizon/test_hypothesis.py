@@ -1,4 +1,4 @@
-"""Tests of the chance that random edges form a horizon, and photographs without a limb."""
+"""Tests of the probability that random edges form a horizon, and of photographs without a limb."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hal
 
 
 def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> None:
-    """A scan line counts as crossing the circle only up to 0.954 of the radius from the centre.
+    """Scan lines cross a circle as often as its extent in x and y predicts.
 
-    There the cosine of the angle between scan line and normal of the circle is 0.3.
+    A scan line is counted only up to 0.954 of the radius from the centre, where the cosine of the angle
+    between scan line and normal of the circle is 0.3.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 7200, endpoint=False)
     circle = 256.0 + 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -39,7 +40,7 @@ def test_edges_along_a_whole_limb_are_significant_and_a_tenth_of_them_are_not() 
     others = generator.uniform(-200.0, 200.0, 100)
     assert log10_chance(limb, generator.normal(0.0, 0.1, 40), others, CAMERA, 2) < -50.0
     assert log10_chance(limb, generator.uniform(-2.0, 2.0, 4), others, CAMERA, 2) > 0.0
-    # An unknown altitude and edges that are not on the limb increase the probability of a chance horizon.
+    # An unknown altitude, and edges that are not on the limb, increase the probability of a chance horizon.
     good = generator.normal(0.0, 0.3, 25)
     known, unknown = (log10_chance(limb, good, others, CAMERA, n) for n in (2, 3))
     crowded = log10_chance(limb, good, generator.uniform(-20.0, 20.0, 200), CAMERA, 2)
@@ -55,7 +56,10 @@ def test_points_that_the_lens_does_not_image_are_not_part_of_a_limb() -> None:
 
 
 def test_a_small_disc_is_not_a_limb_from_low_orbit() -> None:
-    """A lens ghost with a radius of 10.6 deg looks like the Earth from an altitude of 28,000 km."""
+    """A small disc is not the limb from a low orbit.
+
+    A lens ghost with a radius of 10.6 deg looks like the Earth from an altitude of 28,000 km.
+    """
     y, x = np.mgrid[0:512, 0:512]
     disc = np.clip(74.0 - np.hypot(x - 200.0, y - 230.0), 0.0, 1.0)
     pixels = np.random.default_rng(1).normal(10.0 + 100.0 * disc, 1.0).clip(0, 255).astype(np.uint8)
@@ -70,7 +74,7 @@ def test_a_small_disc_is_not_a_limb_from_low_orbit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
 def test_a_photograph_of_the_sky_shows_no_horizon(name: str) -> None:
-    """The photographs from the ground show trees, a dome and a comet's tail among the stars."""
+    """Photographs of the sky from the ground, with trees, a dome or a comet's tail, show no horizon."""
     path = DATA / "sky" / name
     if not path.exists():
         pytest.skip("needs ../shared/data/sky")
@@ -98,7 +102,7 @@ def test_clouds_below_a_real_limb_show_no_horizon_of_their_own() -> None:
 
 @pytest.mark.parametrize("field", [4.0, 8.0, 12.8, 16.0, 30.0, 67.0])
 def test_a_bright_day_sky_over_ground_shows_no_horizon(field: float) -> None:
-    """In the photograph of an aircraft, the bright side is the sky and the dark side is textured ground."""
+    """A photograph of an aircraft, with a bright sky above dark textured ground, shows no horizon."""
     path = DATA / "limb/day_sky_uav.jpg"
     if not path.exists():
         pytest.skip("needs ../shared/data/limb")

@@ -1,4 +1,4 @@
-"""Tests that false images contradict a known attitude, and that correct images never do."""
+"""Tests that false images contradict a known attitude, and that true images never contradict it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PINHOLE = Pinhole.from_field_of_view(128, 128, math.radians(80.0))
 CAMERA = MountedCamera(PINHOLE, np.array([0.0, 0.0, 0.0, 1.0]))
 AWAY = 1.496e11
 ERROR = math.radians(0.3)
-"""Error (rad per axis) of the attitude with which images are tested."""
+"""Error (rad per axis) of the attitude in the tests of images."""
 
 
 def _samples(rays: FloatArray, bright: bool) -> Samples:
@@ -65,14 +65,17 @@ def test_no_sound_image_is_judged_false() -> None:
     ("fault", "least"), [("black", 6), ("saturated", 30), ("blinded", 30), ("garbage", 30)]
 )
 def test_images_of_a_broken_camera_are_judged_false(fault: str, least: int) -> None:
-    """Many of the 60 views show only the night side, or space near the Sun."""
+    """Images of a broken camera are found to be false in many of the 60 views.
+
+    The other views show only the night side, or space near the Sun.
+    """
     views = [view(seed) for seed in range(60)]
     false = [bool(judged(np.asarray(SPOILT[fault](one[0], 1)), *one[1:])) for one in views]
     assert sum(false) >= least
 
 
 def test_the_ground_under_the_camera_decides() -> None:
-    """A nadir camera shows bright ground at noon, and dark ground on the night side."""
+    """A nadir camera must show bright ground at noon, and dark ground on the night side."""
     down, overhead, beside = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
     dark, lit = np.zeros((128, 128), np.uint8), np.full((128, 128), 200, np.uint8)
     assert "dark" in judged(dark, down, 500e3, overhead)
@@ -98,9 +101,9 @@ def ground_angle(angle: float) -> float:
 
 
 def sun_at(elevation: float, angle: float) -> FloatArray:
-    """Return the Sun (3,) at an `elevation` (rad) above the ground seen at `angle` (rad) from nadir."""
+    """Return the Sun (3,) at an `elevation` (rad) above the ground seen at the `angle` (rad) from nadir."""
     zenith = ground_angle(angle) - (0.5 * math.pi - elevation)
-    # The ground's normal is opposite to nadir, rotated by the angle at the Earth's centre.
+    # The normal of the ground is opposite to nadir, rotated by the angle at the Earth's centre.
     return np.array([math.sin(zenith), 0.0, -math.cos(zenith)])
 
 
@@ -162,7 +165,10 @@ def test_stray_light_of_the_sun_excuses_a_bright_sky(apart_deg: float, false: bo
 def test_samples_are_compared_by_day_by_night_and_above_the_air(
     angle: float, elevation_deg: float, dark: int, lit: int
 ) -> None:
-    """The atmosphere extends 60 km above a limb at a distance of 2,575 km, or by an angle of 0.0233 rad."""
+    """Samples are compared on lit ground, on dark ground, and in the sky above the atmosphere.
+
+    The atmosphere extends 60 km above a limb at a distance of 2,575 km, which is an angle of 0.0233 rad.
+    """
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     sun = sun_at(math.radians(elevation_deg), min(angle, LIMB - 1e-9))
     for bright in (True, False):
@@ -183,7 +189,10 @@ def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: i
 def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_are(
     spread_deg: float, stray: bool
 ) -> None:
-    """Twelve bright samples among 400 samples of a dark sky are close together or far apart."""
+    """Bright samples close together may be the glare of an unknown Sun. Scattered ones are stray light.
+
+    Twelve of 400 samples of a dark sky are bright.
+    """
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     draw = np.random.default_rng(4)
     sky = normalise(at(2.2) + 0.8 * draw.standard_normal((400, 3)))
@@ -197,7 +206,10 @@ def test_the_glare_of_an_unknown_sun_is_not_stray_light_but_scattered_samples_ar
 
 
 def test_a_bright_band_in_the_sky_is_stray_light_although_it_is_as_small_as_a_glare() -> None:
-    """The band is 4 deg wide and 20 deg long, and the samples are 1 deg apart."""
+    """A bright band in the sky is stray light, although its area is not larger than that of a glare.
+
+    The band is 4 deg wide and 20 deg long, and the samples are 1 deg apart.
+    """
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     middle = at(2.2)[0]
     first, second = tangent_basis(middle)
@@ -209,7 +221,10 @@ def test_a_bright_band_in_the_sky_is_stray_light_although_it_is_as_small_as_a_gl
 
 
 def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> None:
-    """In 800 evenly spread directions with the Sun overhead, the ground is bright and the sky is dark."""
+    """Samples in all directions give a coarse nadir with the error of its search grid.
+
+    In 800 evenly spread directions with the Sun overhead, the ground is bright and the sky is dark.
+    """
     number = np.arange(800) + 0.5
     z, turn = 1.0 - 2.0 * number / 800, math.pi * (3.0 - math.sqrt(5.0)) * number
     rays = np.column_stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z])
@@ -224,7 +239,7 @@ def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> 
     assert error < 2.0 * found.sigma < math.radians(6.0)
     assert found.covariance @ found.direction == pytest.approx(np.zeros(3), abs=1e-6)
     assert 0.9 < found.explained < 1.0
-    # Without the Sun direction, a dark sample may be ground.
+    # If the Sun direction is unknown, a dark sample may be ground.
     blind = coarse_nadir([ImageBrightness(rays, bright)], ALTITUDE)
     assert blind is not None
     assert blind.explained < found.explained
@@ -234,7 +249,7 @@ def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> 
 
 
 def test_the_samples_of_an_image_stand_in_the_middle_of_its_cells() -> None:
-    """In cells of 16 px, the samples are the rays of pixels 8, 24, ... in columns and rows."""
+    """In cells of 16 px, the samples are the rays of the pixels 8, 24, ... in columns and rows."""
     image = np.zeros((128, 128), np.uint8)
     image[:64, 40] = 31
     image[64:, 40] = 30
@@ -265,7 +280,7 @@ def test_space_is_dark_and_has_no_texture_beyond_the_noise(
     angles = LIMB + np.linspace(0.1, 0.5, 40)
     rays = np.concatenate([at(float(angle)) for angle in angles] + [at(0.3)] * 100)
     draw = np.random.default_rng(2)
-    # A quarter of the sky shows bright structure, and the ground below the limb is bright and has texture.
+    # A quarter of the sky has bright structure. The ground below the limb is bright and has texture.
     levels = np.where(np.arange(len(rays)) < 10, 1.0, np.where(np.arange(len(rays)) < 40, level, 1.0))
     texture = np.where(np.arange(len(rays)) < 40, 0.6745 * mottle * draw.choice([-1.0, 1.0], len(rays)), 1.0)
     samples = Samples(rays, levels > 0.3, levels, texture, noise, floor)

@@ -1,4 +1,4 @@
-"""Tests of initial guesses from drawn edges: cones through many edges, and orientations from directions."""
+"""Tests of initial guesses: cones through many drawn edges, and orientations from directions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COSINE = math.cos(math.radians(65.0))
 
 
 def ring(nadir: FloatArray, half_angle: float, count: int, off: float = 0.0) -> EdgeRays:
-    """Return edges about `nadir` (3,), bright inside, each displaced by `off` px outwards from a cone."""
+    """Return edges on a cone about `nadir` (3,), bright inside, each displaced outwards by `off` px."""
     turn = shortest_turn(NADIR, nadir)
     azimuth = np.arange(count) * (2.0 * np.pi / count)
     angle = half_angle + off * PIXEL
@@ -114,14 +114,17 @@ def test_two_edges_determine_a_known_cone_and_three_an_unknown_one() -> None:
     edges = ring(NADIR, math.acos(COSINE), 3)
     assert best_cone(edges, np.arange(3) < 2, (COSINE, COSINE), 0.5, 400) is not None
     assert best_cone(edges, np.arange(3) < 1, (COSINE, COSINE), 0.5, 400) is None
-    # The second of the tried triples contains all three edges.
+    # Only the second of the tried triples has all its edges on one cone.
     cone = best_cone(edges, free(edges), (0.0, 1.0), 0.5, 2)
     assert cone is not None
     assert cone.members.all()
 
 
 def test_few_trials_are_spread_over_all_pairs() -> None:
-    """The first third of the edges has no cone in common with the others, and its pairs are tried first."""
+    """A few trials are spread over all pairs of edges.
+
+    The first third of the edges has no common cone with the other edges, and its pairs are tried first.
+    """
     draw = np.random.default_rng(1)
     good = ring(NADIR, math.acos(COSINE), 30)
     stray = EdgeRays(
@@ -168,7 +171,10 @@ def test_one_direction_gives_the_rotation_about_nadir_with_the_error_of_its_leve
 
 
 def test_the_more_accurate_direction_decides_and_the_average_is_weighted() -> None:
-    """Two measurements with errors of 0.01 and 0.02 rad, which differ by 0.03 rad, have weights of 4 to 1."""
+    """The weighted mean of two measurements with errors of 0.01 and 0.02 rad has the weights 4 to 1.
+
+    The measurements differ by 0.03 rad.
+    """
     quaternion, nadir, down = true_attitude()
     level = across(down, 0.5 * math.pi)
     pair = sensed(level, 0.01), sensed(level, 0.02, 0.03 * nadir)
@@ -189,9 +195,9 @@ def test_a_direction_along_nadir_gives_no_rotation(lever: float, known: bool) ->
 def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
     off_deg: float, accepted: bool
 ) -> None:
-    """In flight, initial guesses of nadir are wrong by up to 0.3 deg.
+    """An exact direction may deviate from a guessed nadir by four times the guess's error of 0.2 deg.
 
-    A deviation of four times 0.2 deg is accepted.
+    In flight, initial guesses of nadir are wrong by up to 0.3 deg.
     """
     _, nadir, down = true_attitude()
     level = across(down, 0.5 * math.pi)
@@ -200,15 +206,15 @@ def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
         error = side * math.radians(off_deg) * axis
         found = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, 1e-6, error),)))
         assert (found.mismatch <= MOST_MISMATCH) is accepted
-        # For a sensor error of one degree, the same deviation is less than one standard deviation.
+        # With a sensor error of one degree, the same deviation is less than one standard deviation.
         coarse = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, math.radians(1.0), error),)))
         assert coarse.mismatch == pytest.approx(off_deg / math.hypot(1.0, 0.2), rel=1e-6)
 
 
 def test_the_fraction_of_nadirs_allowed_by_a_direction_is_that_of_a_belt() -> None:
-    """The fraction of the sphere within four sigma of a great circle is sin(4 sigma).
+    """A direction permits the nadirs in a belt, within four sigma of a great circle.
 
-    Two such belts intersect.
+    The belt has the fraction sin(4 sigma) of the sphere. Two directions permit the intersection of two belts.
     """
     _, nadir, down = true_attitude()
     one = sensed(across(down, 0.5 * math.pi), 0.03)
@@ -291,7 +297,10 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
 
 @pytest.mark.parametrize("altitude", [250e3, 700e3, 1900e3])
 def test_the_errors_of_the_spherical_model_are_those_of_limbs_of_the_ellipsoid(altitude: float) -> None:
-    """The truth is the circular cone through the limb of the ellipsoid, from positions all over a sphere."""
+    """The errors of the spherical model are those of limbs of the ellipsoid, seen from all over a sphere.
+
+    The truth is the circular cone through the limb of the ellipsoid.
+    """
     count = 300
     height = (2.0 * np.arange(count) + 1.0) / count - 1.0
     radii, tilts = np.zeros(count), np.zeros((count, 2))

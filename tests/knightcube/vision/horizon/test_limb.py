@@ -1,4 +1,4 @@
-"""Tests of the limb model: tangents by another method, gradients by differences, covariance by many fits."""
+"""Tests of the limb model: tangents by another method, gradients, and covariance by many fits."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _view(
 
 
 def test_rays_along_the_limb_touch_the_ellipsoid_at_its_height() -> None:
-    """The minimum of (x/a)^2 + (y/a)^2 + (z/b)^2 along each ray is one."""
+    """Rays along the limb touch the ellipsoid: the minimum of (x/a)^2 + (y/a)^2 + (z/b)^2 is one."""
     view = _view(np.random.default_rng(1))
     rays = limb_rays(view, 90) @ view.rotation
     axes = np.array([SEMI_MAJOR_AXIS, SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS]) + HEIGHT
@@ -51,7 +51,7 @@ def test_rays_along_the_limb_touch_the_ellipsoid_at_its_height() -> None:
 
 
 def test_limb_and_sun_elevation_agree_with_the_simulator() -> None:
-    """The simulator computes the limb with independent code."""
+    """Limb and Sun elevation agree with the simulator, which has independent code for the limb."""
     generator = np.random.default_rng(2)
     attitude = normalise(generator.standard_normal(4))
     sun = 1.5e11 * normalise(generator.standard_normal(3))
@@ -66,7 +66,10 @@ def test_limb_and_sun_elevation_agree_with_the_simulator() -> None:
 
 
 def test_the_quadratic_cone_is_zero_on_the_limb_and_positive_within() -> None:
-    """M = Q r r' Q - (r' Q r - 1) Q is the discriminant in t of |L (r + t u)| = 1, with Q = L' L."""
+    """The quadratic form of the limb is zero on the limb and positive within the limb.
+
+    M = Q r r' Q - (r' Q r - 1) Q is the discriminant in t of |L (r + t u)| = 1, with Q = L' L.
+    """
     view = _view(np.random.default_rng(3))
     stretching = view.surface.stretching(view.limb_height)
     form = stretching @ stretching
@@ -125,7 +128,7 @@ def _arc(view: LimbView, generator: np.random.Generator, sigma: float) -> FloatA
 
 
 def test_the_fits_covariance_is_that_of_its_errors() -> None:
-    """The summed NEES of 200 fits is a chi-square with 400 degrees of freedom.
+    """The summed NEES of 200 fits agrees with a chi-square with 400 degrees of freedom.
 
     The 99.9 % limits of the sum are 310 and 497.
     """
@@ -166,7 +169,7 @@ def test_wrong_edges_do_not_move_the_fit() -> None:
 
 @pytest.mark.parametrize("height", [-6.4e6, -7e6, -2e7])
 def test_a_limb_below_the_centre_of_the_earth_is_refused(height: float) -> None:
-    """The semi-axes of a surface that far below the ground are negative."""
+    """A limb far below the ground is refused, because the surface would have negative semi-axes."""
     view = _view(np.random.default_rng(3))
     below = replace(view, limb_height=height)
     agreeing = np.zeros(20), np.random.default_rng(4).normal(size=(20, PARAMETERS)), np.full(20, 1e-4)
@@ -183,7 +186,7 @@ def test_edges_all_in_one_place_give_no_limb() -> None:
 
 
 def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
-    """If four successive points have the same error, they must reduce neither covariance nor error."""
+    """If four successive points have the same error, they reduce neither the covariance nor the error."""
     generator = np.random.default_rng(8)
     view = _view(generator)
     rays = limb_rays(view, 240)[:80]
@@ -203,7 +206,10 @@ def test_points_with_correlated_errors_get_a_smaller_weight() -> None:
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_residuals_beyond_the_sigmas_increase_the_covariance(share: float) -> None:
-    """Some or all of the points have errors of four times their stated sigmas."""
+    """Residuals beyond the stated sigmas increase the covariance.
+
+    Some or all of the points have errors of four times their stated sigmas.
+    """
     generator = np.random.default_rng(12)
     view = _view(generator)
     prior, sizes = Prior(1.0, 10.0, 10.0), []
