@@ -28,7 +28,7 @@ def frame_job(
 ) -> FrameJob:
     """Return the job for a frame with attitude `held` (4,) at mid-exposure, and rate `turn` (3,), rad/s.
 
-    `knows` states whether attitude and rate are known in advance, to 1e-4.
+    If `knows` is set, the job has prior values of attitude and rate with errors of 1e-4.
     """
     rng = np.random.default_rng(seed)
     attitudes = np.array([multiply(from_rotation_vector(turn * t), held) for t in TIMES])
@@ -58,7 +58,7 @@ HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 
 @dataclass(frozen=True)
 class Shot:
-    """A satellite at `place` (2,), px, at mid-exposure, with motion (2,), px, and camera rate `turn` (3,)."""
+    """A satellite at `place` (2,), px, at mid-exposure, its motion (2,), px, and the rate `turn` (3,)."""
 
     place: FloatArray
     motion: FloatArray

@@ -61,7 +61,7 @@ SIZE = 128
 
 
 def test_a_polygon_hides_the_pixels_inside_it_and_no_others() -> None:
-    """A triangle of 20 x 10 px has 100 px; a pixel is inside if its centre is."""
+    """A polygon hides exactly the pixels whose centres are inside. A triangle of 20 x 10 px has 100 px."""
     mask = polygon_mask(40, 60, [[(9.5, 4.5), (29.5, 4.5), (9.5, 14.5)]])
     assert abs(int(mask.sum()) - 100) <= 5
     rows, columns = np.nonzero(mask)
@@ -72,7 +72,7 @@ def test_a_polygon_hides_the_pixels_inside_it_and_no_others() -> None:
 
 
 def frame(edge: float, mask: BoolArray | None = None, level: float = 60.0) -> Image:
-    """Return a dark sky and a bright ground that begins at the column `edge`, behind a structure."""
+    """Return a dark sky and a bright ground from the column `edge` on, partly hidden by a structure."""
     picture = np.where(np.arange(SIZE) < edge, 10.0, 180.0 + 20.0 * np.sin(np.arange(SIZE) + edge))
     picture = np.tile(picture, (SIZE, 1))
     return (picture if mask is None else np.where(mask, level, picture)).astype(np.uint8)
@@ -91,7 +91,10 @@ def learned(mask: BoolArray, frames: int = 40, level: float = 60.0) -> Structure
 
 @pytest.mark.parametrize("level", [10.0, 60.0, 180.0])
 def test_structure_is_learned_while_the_limb_moves(level: float) -> None:
-    """The structure is as dark as the sky, grey, or as bright as the ground; its mask is one block wider."""
+    """Structure is recognised while the limb moves, whether it is dark, grey or bright.
+
+    The mask of the structure is one block wider than the structure.
+    """
     found = learned(BOOM, level=level).mask
     assert found is not None
     assert np.mean(found[BOOM]) > 0.9
@@ -106,17 +109,20 @@ def test_a_limb_that_does_not_move_teaches_nothing() -> None:
 
 
 def test_a_mask_that_becomes_wrong_is_discarded_at_once() -> None:
-    """The structure is folded away, and the first frame without it is searched without a mask."""
+    """A mask that has become wrong is discarded with the first frame that contradicts it.
+
+    The structure was folded away, and this frame is searched without a mask.
+    """
     known = learned(BOOM)
     gone = known.after(frame(64.0))
     assert gone.mask is None or np.mean(gone.mask[BOOM]) < 0.1
-    # If half of the image does not change, the cause is not a structure but a limb that moves little.
+    # If half of the image is constant, the cause is not a structure, but a limb that hardly moves.
     large = learned(polygon_mask(SIZE, SIZE, [[(-1.0, -1.0), (128.0, -1.0), (128.0, 80.0), (-1.0, 80.0)]]))
     assert large.mask is None
 
 
 def test_configured_structure_stays_hidden() -> None:
-    """Blocks that the polygon touches are hidden, however their brightness changes."""
+    """The blocks that a configured polygon touches stay hidden, even if their brightness changes."""
     known = StructureMap.of(BOOM)
     for edge in EDGES:
         known = known.after(frame(edge))
@@ -127,7 +133,10 @@ def test_configured_structure_stays_hidden() -> None:
 
 
 def test_a_lit_panel_hides_no_limb_with_its_mask_and_makes_none_alone() -> None:
-    """A bright panel covers a sixth of the frame, on sky, limb and ground."""
+    """A lit panel with its mask does not prevent the fit of the limb, and without a limb gives no horizon.
+
+    The panel covers a sixth of the frame, on sky, limb and ground.
+    """
     scene = limb_scene(zenith=np.array([1.0, 0.0, 1.0]), sun=np.array([1.0, 0.6, 0.5]), texture=3)
     mask = polygon_mask(512, 512, [[(60.0, -1.0), (250.0, -1.0), (210.0, 512.0), (110.0, 300.0)]])
     picture = np.where(mask, np.uint8(150), render(MODEL, scene, np.random.default_rng(1)))

@@ -1,6 +1,6 @@
-"""Tests of the nadir from rendered frames: in daylight, at the terminator, and without a limb.
+"""Tests of the nadir from rendered frames: by day, at the terminator, and without a limb.
 
-With several cameras, a joint fit of the limb and a coarse nadir without a limb in view are tested.
+For several cameras, the tests include a joint fit of the limb, and a coarse nadir without a limb in view.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _gps(scene: EarthScene) -> HorizonKnowledge:
 
 
 def test_the_profile_of_the_air_agrees_with_the_simulator() -> None:
-    """The simulator's optical depth is Chapman's function, and the estimator's is a sum along the ray."""
+    """The estimator's optical depth, a sum along the ray, agrees with Chapman's function in the simulator."""
     air, _, _, _ = limb_light(np.array([[0.0, 10e3, UNIT_DEPTH_HEIGHT, 18.4e3, 40e3]]), np.array([500.0]))[
         :, 0
     ]
@@ -118,7 +118,10 @@ def test_a_rough_attitude_gives_what_the_coarse_sensors_give(day: tuple[EarthSce
 def test_without_the_flattenings_direction_the_allowance_covers_the_error(
     day: tuple[EarthScene, Image],
 ) -> None:
-    """At a latitude of 45 deg, the ellipsoid tilts the horizon most."""
+    """If the direction of the Earth's axis is unknown, the uncertainty covers the error by the flattening.
+
+    At a latitude of 45 deg, the ellipsoid tilts the horizon most.
+    """
     scene, frame = day
     for knowledge in (_gps(scene), HorizonKnowledge(altitude=600e3)):
         found = find_nadir(frame, MODEL.lens, knowledge, SETTINGS)
@@ -128,7 +131,10 @@ def test_without_the_flattenings_direction_the_allowance_covers_the_error(
 
 
 def test_the_fitted_altitude_stays_within_the_given_range(day: tuple[EarthScene, Image]) -> None:
-    """The range begins two sigmas above the best fit; nadir changes as with a known higher altitude."""
+    """A permitted range of altitudes that begins two sigmas above the best fit limits the fitted altitude.
+
+    The nadir changes in the same direction as with a known higher altitude.
+    """
     frame = day[1]
     free = find_nadir(frame, MODEL.lens, HorizonKnowledge(), SETTINGS).nadir
     assert free is not None
@@ -153,7 +159,10 @@ def test_the_fitted_altitude_stays_within_the_given_range(day: tuple[EarthScene,
 def test_a_limited_normal_distribution_has_the_published_moments(
     limits: tuple[float, float], mean: float, share: float
 ) -> None:
-    """Johnson, Kotz and Balakrishnan, Continuous Univariate Distributions 1, section 13.10.1."""
+    """A truncated normal distribution has the moments of Johnson, Kotz and Balakrishnan.
+
+    The source is Continuous Univariate Distributions 1, section 13.10.1.
+    """
     found = limited_normal(7.0, 3.0, (7.0 + 3.0 * limits[0], 7.0 + 3.0 * limits[1]))
     assert found[0] == pytest.approx(7.0 + 3.0 * mean, abs=0.01)
     assert found[1] == pytest.approx(share, rel=0.02)
@@ -170,7 +179,7 @@ def test_an_unknown_altitude_is_fitted_with_its_spread(day: tuple[EarthScene, Im
 
 def test_a_horizon_that_contradicts_the_coarse_sun_is_refused(day: tuple[EarthScene, Image]) -> None:
     scene, frame = day
-    # The opposite of the true Sun direction is inconsistent with the horizon.
+    # The opposite of the true Sun direction contradicts the horizon.
     wrong = SensedDirection(-(scene.camera_matrix @ scene.sun), scene.sun, np.radians(5.0))
     found = find_nadir(frame, MODEL.lens, replace(_gps(scene), sensed=(wrong,)), SETTINGS)
     assert found.status is HorizonStatus.REFUSED
@@ -180,7 +189,10 @@ def test_a_horizon_that_contradicts_the_coarse_sun_is_refused(day: tuple[EarthSc
 
 
 def test_a_horizon_with_bright_sky_is_refused(day: tuple[EarthScene, Image]) -> None:
-    """The image is rotated by 180 deg, but the attitude is that of the original image."""
+    """A horizon with bright sky is refused.
+
+    The image is rotated by 180 deg, but the known attitude is that of the original image.
+    """
     scene, frame = day
     found = find_nadir(
         frame[::-1, ::-1],
@@ -192,9 +204,10 @@ def test_a_horizon_with_bright_sky_is_refused(day: tuple[EarthScene, Image]) -> 
 
 
 def test_a_horizon_of_few_edges_is_read_more_closely_where_it_runs() -> None:
-    """The first pass reads 14 lines in each direction, the second pass 42 lines near the limb only.
+    """A horizon with few edges is searched in a second pass on more lines near the limb.
 
-    The second pass reads fewer pixels, and its result is more accurate.
+    The first pass reads 14 lines in each direction, and the second pass reads 42 lines near the limb. The
+    second pass reads fewer pixels, and its result is more accurate.
     """
     generator = np.random.default_rng((3, 0, 1))
     scene = random_scene(generator, MODEL, "sunlit", (400e3, 700e3))
@@ -220,7 +233,10 @@ def test_sky_alone_and_noise_alone_show_no_horizon(level: float) -> None:
 
 
 def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_reported() -> None:
-    """The image shows the paper's uniqueness problem (Fig. 14): either edge of the band may be the limb."""
+    """A band between two equal arcs gives an ambiguous result with both horizons.
+
+    In the paper's uniqueness problem (Fig. 14), either edge of the band may be the limb.
+    """
     scene = limb_scene(1000e3, zenith=np.array([1.0, 0.2, 0.3]), sun=np.array([1.0, 0.3, 0.2]), dip=0.25)
     frame = render(MODEL, scene, np.random.default_rng(4))
     band = np.minimum(frame, frame[::-1])
@@ -234,7 +250,7 @@ def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_reported() -> N
 
 
 def test_the_terminator_is_distinguished_from_the_limb() -> None:
-    """In a crescent, the inner edge is as bright and as round as the outer edge, but must not be fitted."""
+    """The terminator of a crescent is not fitted, although it is as bright and as round as the limb."""
     generator = np.random.default_rng(31)
     scene = random_scene(generator, MODEL, "terminator", (1200e3, 1800e3))
     frame = render(MODEL, scene, generator)
@@ -262,7 +278,7 @@ def test_impossible_knowledge_is_refused(wrong: dict[str, object], complaint: st
 
 
 def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
-    """The photograph from OPS-SAT-1 has 27 scan lines.
+    """The horizon in a photograph from OPS-SAT-1 is fitted on 27 scan lines to less than half a pixel.
 
     The README of the photograph reports an independent fit with 0.44 px rms.
     """
@@ -275,7 +291,7 @@ def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
     assert found.nadir is not None, found.reason
     assert found.nadir.residual <= 0.5
     assert found.nadir.used >= 20
-    # The sky is at the top, so that nadir is below the image, and the limb rises to the right.
+    # The sky is at the top of the photograph, so nadir is below the image. The limb rises to the right.
     assert found.nadir.direction[1] > 0.9
     circle = fit_circle(found.points[found.on_horizon])
     assert circle.radius == pytest.approx(22_211.0, rel=0.2)
@@ -298,18 +314,18 @@ def test_invalid_settings_are_refused() -> None:
 
 JOINT_SETTINGS = finder_settings(WIDE_MODEL)
 EARTHLIGHT = 30.0
-"""Counts of the logarithmic camera at an intensity of 0.025."""
+"""Counts of the logarithmic camera at the relative intensity 0.025."""
 
 
 def error_deg(found: JointNadir, truth: FloatArray) -> float:
-    """Return the error of a nadir, deg."""
+    """Return the error (deg) of a nadir direction."""
     assert found.nadir is not None, found.reason
     return float(np.degrees(np.linalg.norm(tangent_basis(truth) @ found.nadir.direction)))
 
 
 @pytest.fixture(scope="module")
 def level() -> Instant:
-    """Return a level satellite by day, with three cameras on the limb and the fourth on the sky."""
+    """Return a level satellite by day. Three cameras see the limb, and the fourth camera sees the sky."""
     return instant(UW, np.array([0.02, -0.03, 1.0]), np.array([0.8, 0.5, 0.3]), 11)
 
 
@@ -326,7 +342,10 @@ def test_all_cameras_together_are_more_accurate_than_each_camera(level: Instant)
 
 
 def test_an_exactly_known_sun_does_not_reject_a_true_limb(level: Instant) -> None:
-    """Before the limb fit, a cone through the edges is wrong by 0.1 to 0.3 deg; the Sun is exact."""
+    """An exactly known Sun direction does not lead to the refusal of a true limb.
+
+    Before the limb fit, a cone through the edges has an error of 0.1 to 0.3 deg.
+    """
     rough = level.knowledge()
     for sigma in (np.radians(0.005), np.radians(1.0)):
         seen = replace(rough, sensed=(SensedDirection(level.sun_in_body, level.sun, sigma),))
@@ -339,9 +358,9 @@ def test_an_exactly_known_sun_does_not_reject_a_true_limb(level: Instant) -> Non
 
 
 def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three(level: Instant) -> None:
-    """All three limbs are 6 km higher.
+    """If the atmosphere is higher than assumed, three opposite cameras give a better nadir than one camera.
 
-    A single limb then tilts nadir by 0.13 deg, but three opposite limbs do not.
+    All limbs are 6 km higher. A single limb then has a nadir error of 0.13 deg.
     """
     joint = nadir_of_cameras(level.frames, UW, level.knowledge(), JOINT_SETTINGS)
     with pytest.MonkeyPatch.context() as patch:
@@ -353,7 +372,10 @@ def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three
 
 
 def test_two_cameras_that_disagree_leave_the_nadir_ambiguous(level: Instant) -> None:
-    """One of two images is flipped vertically, and no third camera or attitude shows which image is right."""
+    """If two cameras disagree and no other information decides, the nadir is ambiguous.
+
+    One of the two images is flipped vertically.
+    """
     frames = {0: level.frames[0], 1: np.ascontiguousarray(level.frames[1][::-1])}
     found = nadir_of_cameras(frames, UW, HorizonKnowledge(position=level.position), JOINT_SETTINGS)
     assert found.nadir is None
@@ -369,7 +391,7 @@ def test_two_cameras_outvote_a_third(level: Instant) -> None:
 
 
 def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_cameras() -> None:
-    """Either edge of the band in the third image may be the limb, and the other cameras decide."""
+    """The nadir of the other cameras decides which edge of the band in the third image is the limb."""
     tilted = instant(UW, np.array([-0.22, -0.38, 1.0]), np.array([0.8, 0.5, 0.3]), 12)
     frames = {**tilted.frames, 2: np.minimum(tilted.frames[2], tilted.frames[2][::-1])}
     knowledge = HorizonKnowledge(position=tilted.position)
@@ -383,9 +405,10 @@ def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_camera
 
 
 def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
-    """The limb is 68 deg from nadir.
+    """If the Earth fills one camera and the others are dark, the nadir is coarse.
 
-    The Earth therefore fills a field of 33 deg half width whose centre is up to 25 deg from nadir.
+    The limb is 68 deg from nadir, so the Earth fills a field of 33 deg half width if its centre is up to 25
+    deg from nadir.
     """
     boresight = VT[0].in_body(np.array([0.0, 0.0, 1.0]))
     aside = tangent_basis(boresight)
@@ -410,7 +433,7 @@ def test_dark_images_give_no_coarse_nadir() -> None:
 
 
 def _changed(changes: Callable[[Hypothesis], Hypothesis]) -> Callable[..., Hypothesis | None]:
-    """Return a version of `examine` that modifies every hypothesis."""
+    """Return a version of the function `examine` that changes every hypothesis."""
 
     def examined(*arguments: Any) -> Hypothesis | None:
         found = examine(*arguments)
@@ -438,7 +461,10 @@ def test_a_horizon_counts_up_to_the_limit_of_each_evidence(
     wrong: float,
     status: HorizonStatus,
 ) -> None:
-    """The tested quantity is on either side of its documented limit; all others are as in a sunlit frame."""
+    """A horizon is accepted up to the documented limit of each quantity, and refused beyond it.
+
+    All other quantities are as in a sunlit frame.
+    """
     scene, frame = day
     for value, expected in ((sound, HorizonStatus.FOUND), (wrong, status)):
         changed = _changed(lambda one, value=value: replace(one, **{evidence: value}))  # type: ignore[misc]
@@ -481,13 +507,13 @@ def test_a_measurement_states_its_altitude_points_and_tangent_covariance(
     assert found.nadir.used == np.count_nonzero(found.on_horizon) == len(found.limb) == len(found.limb_sigma)
     assert found.nadir.altitude == pytest.approx(600e3, abs=15e3)
     assert found.nadir.altitude_sigma == pytest.approx(SETTINGS.altitude_sigma, rel=0.01)
-    # The trace of a covariance does not depend on the axes, and the error along the direction is zero.
+    # The trace of a covariance does not depend on the axes, and the variance along the direction is zero.
     tangent = found.nadir.tangent_covariance
     assert np.trace(tangent) == pytest.approx(np.trace(found.nadir.covariance), rel=1e-6)
     assert found.nadir.sigma == pytest.approx(np.sqrt(0.5 * np.trace(tangent)), rel=1e-6)
     assert found.nadir.covariance @ found.nadir.direction == pytest.approx(np.zeros(3), abs=1e-12)
     assert found.nadir.direction == pytest.approx(found.view.nadir)
-    # An altitude above the mean sphere is wrong because of the Earth's flattening, and the limb fit improves
+    # Because of the Earth's flattening, an altitude above the mean sphere is wrong, and the limb fit improves
     # it.
     sphere = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
     assert sphere.nadir is not None

@@ -40,7 +40,7 @@ def dusk() -> tuple[EarthScene, Image]:
 
 
 def known(one: EarthScene) -> HorizonKnowledge:
-    """Return the prior knowledge that a GPS receiver gives."""
+    """Return the prior information of a satellite with a GPS receiver."""
     return HorizonKnowledge(position=one.position, sun=one.sun, pole=one.pole)
 
 

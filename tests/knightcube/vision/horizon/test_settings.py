@@ -1,4 +1,4 @@
-"""Tests of prior information and settings on both sides of their limits, and of the logarithmic response."""
+"""Tests of prior information and settings below and above their limits, and of the logarithmic response."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from knightcube.vision.horizon.settings import (
 
 
 def test_a_logarithmic_detector_adds_equal_counts_for_each_decade_of_light() -> None:
-    """With 50 counts per decade above 20, the counts are those of 0, 9 and 99 times the dark current."""
+    """A logarithmic detector gives the same number of counts for each decade of light.
+
+    With 50 counts per decade above 20, the tested counts are those of 0, 9 and 99 times the dark current.
+    """
     response = LogarithmicResponse(20.0, 50.0)
     counts = np.array([[20, 70, 120]], dtype=np.uint8)
     assert light_of(counts, response) == pytest.approx(np.array([[0.0, 9.0, 99.0]]))
@@ -26,7 +29,10 @@ def test_a_logarithmic_detector_adds_equal_counts_for_each_decade_of_light() -> 
 
 
 def test_a_camera_is_above_the_air() -> None:
-    """The equatorial radius is 6,378.1 km, and a limb is visible from an altitude of 50 km."""
+    """A camera must be above the atmosphere: the limb is visible from an altitude of 50 km on.
+
+    The equatorial radius is 6,378.1 km.
+    """
     HorizonKnowledge(position=np.array([0.0, 6_428.2e3, 0.0]), altitude=50e3)
     with pytest.raises(ValueError, match="inside the Earth"):
         HorizonKnowledge(position=np.array([0.0, 6_428.0e3, 0.0]))

@@ -14,10 +14,10 @@ _STEPS = 801
 def object_path(
     camera: Camera, direction: FloatArray, motion: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Return the pixels (801, 2) of an object that rotates by `motion` (3,) rad relative to the stars.
+    """Return the path (801, 2), px, of an object that rotates by `motion` (3,) rad relative to the stars.
 
-    `direction` (3,) is the object's direction at mid-exposure. An object whose motion equals the camera's
-    `rotation` (3,) stays at one pixel.
+    `direction` (3,) is the direction of the object at mid-exposure. An object whose motion equals the
+    camera's `rotation` (3,) stays at one pixel.
     """
     time = np.linspace(-0.5, 0.5, _STEPS)[:, None]
     among_stars = np.swapaxes(attitude_matrix(from_rotation_vector(time * motion)), 1, 2) @ direction
@@ -28,7 +28,7 @@ def object_path(
 def add_object(
     image: FloatArray, camera: Camera, path: FloatArray, magnitude: float, exposure: float
 ) -> None:
-    """Add the electrons of an object along `path` (m, 2) to `image` in place."""
+    """Add the electrons of an object, spread along `path` (m, 2), to `image` in place."""
     electrons = camera.zero_magnitude * 10.0 ** (-0.4 * magnitude) * exposure
     parts = np.array_split(path, 40)
     for part in parts:
@@ -58,7 +58,7 @@ def frame_with(
     objects: list[tuple[FloatArray, float]],
     faintest: float = 7.0,
 ) -> Image:
-    """Return a frame of a star field, which depends only on the seed, with objects (path, magnitude)."""
+    """Return a frame of a star field, which depends only on the seed, with some objects (path, magnitude)."""
     image = expose(camera, *star_field(camera, seed, faintest), rotation, exposure)
     for path, magnitude in objects:
         add_object(image, camera, path, magnitude, exposure)

@@ -1,8 +1,8 @@
-"""Tests of the detection of objects.
+"""Tests of the detection of objects by the deviation of their streaks from those of stars.
 
-The indicators are tested against hand-computed values, for stars at every angle, and for objects. Frames test
-detections, false alarms, overlaps with stars, objects that cross, and the attitude from a crowded sky at
-rest.
+The indicators of a deviation are compared with values computed by hand, for stars at every angle, and for
+objects. Simulated frames test detections, false alarms, overlaps with stars, objects that cross, and the
+attitude from a crowded sky at rest.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _THETAS = [2.0, 10.0, 30.0, 60.0, 80.0, 90.0]
 
 
 def _stars(theta_deg: float, seed: int = 1, n: int = 14) -> tuple[FloatArray, FloatArray]:
-    """Return exact ends (n, 2, 2) of star streaks over the whole field, and the rotation (3,).
+    """Return exact ends (n, 2, 2) of star streaks in the whole field of view, and the rotation (3,).
 
     The longest streak has 100 px.
     """
@@ -72,14 +72,18 @@ def _stars(theta_deg: float, seed: int = 1, n: int = 14) -> tuple[FloatArray, Fl
 
 
 def test_the_indicators_of_a_quarter_circle_by_hand() -> None:
-    """The streak from (13, 20) to (10, 23) is a quarter circle of radius 3 around (10, 20)."""
+    """The indicators of a quarter circle agree with values computed by hand.
+
+    The streak from (13, 20) to (10, 23) is a quarter circle of radius 3 around (10, 20).
+    """
     ends = np.array([[[13.0, 20.0], [10.0, 23.0]]])
     centre = np.array([10.0, 20.0])
     assert centre_residuals(ends, centre)[0] == pytest.approx(0.0, abs=1e-15)
     assert angular_displacements(ends, centre)[0] == pytest.approx(0.5 * np.pi)
     assert lengths(ends)[0] == pytest.approx(3.0 * np.sqrt(2.0))
     assert slopes(ends)[0] == pytest.approx(0.75 * np.pi)
-    # If the centre is displaced by (1, 0), the residual is the component of the displacement along the chord.
+    # If the centre is displaced by (1, 0), the residual is the component of this displacement along the
+    # chord.
     assert abs(centre_residuals(ends, centre + np.array([1.0, 0.0]))[0]) == pytest.approx(np.sqrt(0.5))
 
 
@@ -101,9 +105,10 @@ def test_a_star_at_the_same_position_is_the_same_star(theta_deg: float) -> None:
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 def test_exact_stars_have_no_deviations_for_any_axis(theta_deg: float) -> None:
-    """The exact streaks of stars do not deviate from the expected ones.
+    """The exact streaks of stars do not deviate from the expected streaks, for any rotation axis.
 
-    Over the field, the projection changes the slopes of the streaks by 1.8 deg and their lengths by 6 %.
+    In the field of view, the projection changes the slopes of the streaks by 1.8 deg and their lengths by 6
+    %.
     """
     ends, turn = _stars(theta_deg)
     found = evaluate(ends[:, ::-1], np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
@@ -115,7 +120,10 @@ def test_exact_stars_have_no_deviations_for_any_axis(theta_deg: float) -> None:
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg: float) -> None:
-    """Differences of end points along and across a streak have unit variance; the residual includes both."""
+    """Deviations of the ends along and across a streak have unit variance, in units of the ends' errors.
+
+    The residual includes both deviations.
+    """
     rng = np.random.default_rng(3)
     ends, turn = _stars(theta_deg, n=14)
     long = lengths(ends) > 25.0
@@ -127,7 +135,8 @@ def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg:
         for _ in range(60)
     ]
     spread = np.sqrt(np.mean(np.square(deviations), axis=(0, 1)))
-    # The tolerance of a fifth allows for the fitted centre and the stretched edge of the field.
+    # The tolerance of a fifth allows for the fitted centre, and for the stretched projection at the edge of
+    # the field.
     np.testing.assert_allclose(spread, [1.0, 1.0, np.sqrt(2.0)], rtol=0.2)
 
 
@@ -139,13 +148,16 @@ def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg:
 def test_each_indicator_sees_its_own_part_of_a_motion(
     theta_deg: float, along: float, across: float, expected: tuple[bool, bool, bool]
 ) -> None:
-    """The second end of an object is displaced by 6 px, which is 42 standard deviations of 0.1 px."""
+    """Each indicator detects its own component of a motion.
+
+    The ends of an object are displaced by 6 px relative to each other, 42 standard deviations of 0.1 px.
+    """
     ends, turn = _stars(theta_deg)
     one = int(np.argmax(lengths(ends)))
     chord = ends[one, 1] - ends[one, 0]
     chord /= np.linalg.norm(chord)
     side = np.array([-chord[1], chord[0]])
-    # The displacement is symmetric about the middle, so that the reference star remains the same.
+    # Half of the displacement is applied to each end, so that the reference star remains the same.
     moved = 0.5 * (along * chord + across * side)
     ends[one] += [-moved, moved]
     found = evaluate(ends, np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
@@ -168,10 +180,10 @@ def test_the_lower_bound_keeps_a_quiet_frame_quiet_and_the_strict_rule_a_loud_on
     sigma = np.full(len(ends), 0.1)
     quiet = evaluate(ends + 0.1 * noise, sigma, turn, _PINHOLE, _BOUNDS)
     strict_only = evaluate(ends + 0.1 * noise, sigma, turn, _PINHOLE, (0.0, 0.0, 0.0))
-    # With 2.5 sigma limits for thirty streaks and three indicators, nearly every frame has a false alarm.
+    # With limits of 2.5 sigma for thirty streaks and three indicators, nearly every frame has a false alarm.
     assert strict_only.fired.any()
     assert not quiet.fired.any()
-    # If the errors are ten times as large as expected, the scatter within the frame prevents false alarms.
+    # If errors are ten times larger than expected, the scatter within the frame prevents false alarms.
     loud = evaluate(ends + noise, sigma, turn, _PINHOLE, _BOUNDS)
     assert np.count_nonzero(np.abs(loud.deviations) > _BOUNDS) > 3 * np.count_nonzero(loud.fired)
 
@@ -198,7 +210,7 @@ def _detect(pixels: FloatArray, rotation: FloatArray, exposure: float = 1.0) -> 
 
 
 def _turn(pixels: FloatArray, rotation: FloatArray, exposure: float) -> FloatArray:
-    """Return the rotation estimated by maximum likelihood, with the sign of the true rotation."""
+    """Return the maximum likelihood estimate of the rotation, with the sign of the true rotation."""
     settings = LikelihoodSettings(saturation=_SETTINGS.saturation, gain=_SETTINGS.gain)
     found = estimate_motion(pixels, _FRAME_CAMERA.pinhole, exposure, settings, rotation / exposure, 0.0)
     assert found.rate is not None
@@ -212,7 +224,7 @@ def _see(
     rotation: FloatArray = _ROTATION,
     exposure: float = 1.0,
 ) -> tuple[ObjectReport, FloatArray]:
-    """Return the detections in a frame with one object, and the object's true path in the image."""
+    """Return the detections in a frame with one object, and the true path of the object in the image."""
     path = object_path(_FRAME_CAMERA, _PLACE, motion, rotation)
     pixels = frame_with(_FRAME_CAMERA, rotation, exposure, seed, [(path, magnitude)], _FAINTEST)
     return _detect(pixels, rotation, exposure), path
@@ -230,8 +242,8 @@ def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: floa
     report, path = _see(motion, 4.0, exposure=exposure)
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.5)
-    # The image does not show which end is first. The reported order is the one with the smaller rate; the
-    # rate for the other order is reported too.
+    # The image does not show which end is first. The reported order gives the smaller rate, and the rate for
+    # the other order is reported too.
     assert found.relative_rate == pytest.approx(px / _FOCAL / exposure, rel=0.02)
     assert found.other_relative_rate > found.relative_rate
     np.testing.assert_allclose(found.direction, [np.cos(towards), np.sin(towards)], atol=0.03)
@@ -245,7 +257,7 @@ def test_a_tracked_object_is_a_point_that_moves_among_the_stars(theta_deg: float
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.3)
     assert set(found.fired) == {"displacement", "residual"}
-    # Stars move by -omega x v, and the object moves oppositely at the camera's rate.
+    # Stars move by -omega x v. The object moves in the opposite direction, at the camera's rate.
     star = -np.cross(rotation, _PLACE)
     assert found.relative_rate == pytest.approx(np.linalg.norm(star), rel=0.02)
     np.testing.assert_allclose(found.direction, -star[:2] / np.linalg.norm(star[:2]), atol=0.05)
@@ -261,7 +273,7 @@ def test_time_reversal_reverses_all_motions() -> None:
     path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)
     pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
     forward, backward = _only(_detect(pixels, _ROTATION)), _only(_detect(pixels, -_ROTATION))
-    # The fit of the ends stops when the steps are a fraction of their uncertainty.
+    # The fit of the ends stops when its steps are a fraction of the uncertainty of the ends.
     tenth = 0.1 * float(forward.sigma.min())
     np.testing.assert_allclose(backward.endpoints, forward.endpoints[::-1], atol=tenth)
     np.testing.assert_allclose(backward.direction, -forward.direction, atol=1e-4)
@@ -278,8 +290,8 @@ def test_frames_without_an_object_have_none() -> None:
         assert report.verdicts.count(Verdict.STAR) >= 4
 
 
-# Offset (px) of a second star along and across the first star's streak of 55 px, and the second star's
-# magnitude.
+# Offset (px) of a second star along and across the streak of the first star, which has 55 px, and magnitude
+# of the second star.
 @pytest.mark.parametrize(
     ("along", "across", "magnitude"),
     [
@@ -304,7 +316,7 @@ def test_overlapping_streaks_of_two_stars_are_not_reported_as_an_object(
     image = expose(_FRAME_CAMERA, directions, magnitudes, _ROTATION, 1.0)
     report = _detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(6)), _ROTATION)
     assert report.objects == ()
-    # The blend is recognised from its pixels: at least one region is classified as stars or as unclear.
+    # The pixels show that the region is a blend: at least one region is classified as stars or as unclear.
     assert {Verdict.STARS, Verdict.UNCLEAR} & set(report.verdicts + report.crowded)
 
 
@@ -313,7 +325,7 @@ def test_an_object_that_crosses_a_star_is_found() -> None:
     directions = np.concatenate([directions, _PLACE[None]])
     image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 4.0), _ROTATION, 1.0)
     star = -np.cross(_ROTATION, _PLACE)[:2]
-    # In the image, the object moves perpendicular to the star's path.
+    # In the image, the object moves perpendicularly to the path of the star.
     across = np.arctan2(star[0], -star[1])
     seen = object_path(
         _FRAME_CAMERA, _PLACE, _ROTATION + motion_across(_PLACE, 60.0 / _FOCAL, across), _ROTATION
@@ -328,7 +340,10 @@ def test_an_object_that_crosses_a_star_is_found() -> None:
 @pytest.mark.parametrize("along", [8.0, 25.0])
 @pytest.mark.parametrize("magnitude", [4.0, 6.0])
 def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: float) -> None:
-    """The blended region is long, and saturated at magnitude 4."""
+    """A tracked object on the streak of a star is found.
+
+    The region of both is long, and saturated at magnitude 4.
+    """
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
     directions = np.concatenate([directions, _PLACE[None]])
     image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 5.0), _ROTATION, 1.0)
@@ -352,7 +367,10 @@ def test_a_bright_star_whose_core_is_saturated_is_not_reported_as_an_object() ->
 
 
 def test_a_piece_of_a_faint_star_is_not_reported_as_an_object() -> None:
-    """At the segmentation threshold, a streak breaks into segments that together have the flux of a star."""
+    """A segment of a faint star is not reported as an object.
+
+    At the segmentation threshold, a streak breaks into segments that together have the flux of the star.
+    """
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, 5.5)
     faint = np.concatenate([directions, _PLACE[None]])
     for seed in range(3):
@@ -417,14 +435,14 @@ def test_pixels_that_cannot_be_solved_for_leave_the_streak_unclear(monkeypatch: 
 
 HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 MEETING = np.array([251.3, 262.8])
-"""Position (px) at which both objects meet after 7 s."""
+"""Position (px) at which the objects meet after 7 s."""
 MOTIONS = np.array([[8.0, 2.0], [5.0, -5.5]])
 """Image motions (px/s), which are 0.33 and 0.30 deg/s."""
 MAGNITUDE = 4.5
 
 
 def _looking_at(right_ascension_deg: float, declination_deg: float) -> FloatArray:
-    """Return the attitude (4,) of a camera with the given boresight and north up."""
+    """Return the attitude (4,) of a camera with a given boresight and north up."""
     right, up = np.radians([right_ascension_deg, declination_deg])
     sight = np.array([np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)])
     east = np.array([-np.sin(right), np.cos(right), 0.0])
@@ -432,7 +450,7 @@ def _looking_at(right_ascension_deg: float, declination_deg: float) -> FloatArra
 
 
 def _places(since: FloatArray) -> FloatArray:
-    """Return the positions (k, 2, 2), px, of both objects at times (k,), s, relative to their meeting."""
+    """Return the positions (k, 2, 2), px, of both objects at times (k,), s, from their encounter."""
     return np.asarray(MEETING + since[:, None, None] * MOTIONS)
 
 
@@ -464,7 +482,10 @@ def test_two_equally_bright_objects_that_cross_keep_their_tracks() -> None:
 @pytest.mark.parametrize(("right", "up"), [(-131.5, -72.95), (102.7, -39.5)])
 @pytest.mark.parametrize("rate_deg", [0.0, 0.3])
 def test_a_crowded_sky_at_rest_or_nearly_so_has_an_attitude(right: float, up: float, rate_deg: float) -> None:
-    """Faint regions merge and look long, but the streaks are at most 1.5 px long."""
+    """A crowded sky at rest, or with streaks of up to 1.5 px, gives an attitude.
+
+    Faint regions merge and look long.
+    """
     held = _looking_at(right, up)
     turn = np.array([0.0, np.radians(rate_deg), 0.0])
     found = run(frame_job(held, turn, []))
@@ -492,7 +513,10 @@ def test_a_star_is_explained_as_well_without_an_object_as_with_one() -> None:
 
 
 def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
-    """Two star streaks on one line overlap by a fifth of their length."""
+    """A segment that another star's streak continues may be the beginning of a star's streak.
+
+    Two star streaks on one line overlap by a fifth of their length.
+    """
     pinhole = _FRAME_CAMERA.pinhole
     image = np.zeros((512, 512))
     first, second = (star_path(_PLACE, _ROTATION, start, pinhole) for start in (0.5, -0.3))
@@ -509,7 +533,10 @@ def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
 
 
 def test_a_spot_among_streaks_is_a_short_region_in_its_place() -> None:
-    """The spot is far from the left and upper borders of the frame, and so is the box of its region."""
+    """A spot among streaks is a short region at its true position.
+
+    Spot and region are far from the left and upper borders of the frame.
+    """
     rng = np.random.default_rng(4)
     image = rng.normal(100.0, 2.0, (200, 300))
     rows, columns = np.mgrid[:200, :300]

@@ -1,4 +1,4 @@
-"""Tests of the image-processing job, with satellites beside stars and brighter than stars."""
+"""Tests of the image-processing job, with satellites near stars and brighter than stars."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_an_object_beside_a_catalogue_star_is_measured_correctly(
     focal = CAMERA.pinhole.focal_length
     claim = np.sqrt(0.5 * np.trace(sighted.covariance[own])) * focal
     assert claim < 0.06
-    # The limit is the 99.99 % quantile for two degrees of freedom.
+    # The limit is the 99.99 % quantile of chi-square with two degrees of freedom.
     assert np.linalg.norm(sighted.points[own] - place) < 4.3 * claim
     assert abs(sighted.magnitudes[own] - magnitude) < 0.3
     assert len(sighted.points) == 1
@@ -54,7 +54,7 @@ def test_stars_alone_are_not_reported_as_objects() -> None:
 @pytest.mark.parametrize("knows", [True, False])
 @pytest.mark.parametrize(("turn", "magnitude"), [(0.0, -1.0), (0.02, 2.0)])
 def test_a_bright_satellite_is_not_identified_as_a_star(turn: float, magnitude: float, knows: bool) -> None:
-    """Neither the identification nor the catalogue refit identifies the satellite as a star."""
+    """Neither the star identification nor the second fit identifies a bright satellite as a star."""
     place, motion = np.array([203.3, 301.8]), np.array([2.5, 1.0])
     shot = Shot(place, motion, magnitude, np.array([0.0, turn, 0.0]), knows)
     found = shot.found()
@@ -70,7 +70,10 @@ def test_a_bright_satellite_is_not_identified_as_a_star(turn: float, magnitude: 
 
 
 def test_the_catalogue_holds_stars_only() -> None:
-    """Hipparcos numbers end at 120,416, and the fastest star is Barnard's with 10.4" per year."""
+    """The catalogue contains only stars. Hipparcos numbers end at 120,416.
+
+    The fastest star is Barnard's Star with 10.4" per year.
+    """
     stars = catalogue.load()
     assert len(np.unique(stars.hip)) == len(stars.hip)
     assert stars.hip.min() >= 1

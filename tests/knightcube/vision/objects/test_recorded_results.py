@@ -50,7 +50,7 @@ def test_two_satellites_are_as_recorded() -> None:
 
 
 def streaked() -> Image:
-    """Return a frame of star streaks with an object that has a different motion."""
+    """Return a frame of star streaks, with an object that moves differently."""
     direction = SMALL.pinhole.unit_vectors(np.array([[170.0, 230.0]]))[0]
     path = object_path(SMALL, direction, motion_across(direction, 0.03, 0.4), TURN)
     return frame_with(SMALL, TURN, 1.0, 7, [(path, 2.0)], 5.5)

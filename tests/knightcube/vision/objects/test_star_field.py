@@ -1,4 +1,4 @@
-"""Tests that stars are recognised between frames without a catalogue, and moving objects are detected."""
+"""Tests that stars are matched between frames without a catalogue, and that moving objects are detected."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ SIGMA = 0.1 * PIXEL
 
 
 def sky(rng: np.random.Generator, density: int = 900) -> FloatArray:
-    """Return `density` stars over the whole sky; 900 stars are about 7 in a field of 20 deg."""
+    """Return `density` stars in the whole sky; 900 stars are about 7 in a field of 20 deg."""
     stars = rng.standard_normal((density, 3))
     return np.asarray(stars / np.linalg.norm(stars, axis=1, keepdims=True))
 
 
 def seen(stars: FloatArray, attitude: FloatArray, rng: np.random.Generator) -> FieldPoints:
-    """Return the points of a frame, with position errors."""
+    """Return the star positions in a frame, with errors."""
     directions = stars @ attitude_matrix(attitude).T
     directions = directions[(directions[:, 2] > 0.8) & (np.abs(directions[:, :2]).max(axis=1) < 0.17)]
     noisy = directions + SIGMA * rng.standard_normal(directions.shape)
@@ -38,9 +38,9 @@ def seen(stars: FloatArray, attitude: FloatArray, rng: np.random.Generator) -> F
 
 
 def flown(rate: FloatArray, error: float, frames: int) -> list[tuple[FloatArray, LocatedFrame, FieldPoints]]:
-    """Return true attitudes, results and points of frames a second apart.
+    """Return true attitudes, results and points of frames at intervals of a second.
 
-    The last point of a frame is the object.
+    The last point of each frame is the object.
     """
     rng = np.random.default_rng(4)
     stars, field, rows = sky(rng, 4000), StarField(), []

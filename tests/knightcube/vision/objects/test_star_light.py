@@ -36,7 +36,7 @@ _CORNER = np.array([200.0, 220.0])
 def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | None, seed: int) -> Patch:
     """Return a patch of 90 x 40 px with stars of `flux` counts each.
 
-    An object adds 40,000 counts along the path `extra` (n, 2), px in the frame, if given.
+    If `extra` (n, 2), px in the frame, is given, an object adds 40,000 counts along this path.
     """
     image = np.zeros((40, 90))
     for middle in middles:
@@ -58,7 +58,7 @@ def test_overlapping_stars_leave_an_empty_residual() -> None:
     patch = _patch(middles, 60_000.0, None, 1)
     paths, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
     assert len(paths) >= 2
-    # Each true star has its own path, accurate to a tenth of a pixel.
+    # Each true star has a fitted path that is accurate to a tenth of a pixel.
     for middle in middles:
         assert min(np.linalg.norm(path.mean(axis=0) - middle) for path in paths) < 0.1
     assert brightest_left(patch, left) is None
@@ -74,7 +74,10 @@ def test_a_point_on_a_star_remains_and_is_measured() -> None:
 
 
 def test_a_line_across_a_star_remains_with_its_ends() -> None:
-    """The star covers the middle of the line, and the ends are located by all of the line's light."""
+    """After the subtraction of a star, the streak of an object that crosses the star keeps its ends.
+
+    The star covers the middle of the streak, and the ends are located by all of its remaining light.
+    """
     ends = np.array([[230.2, 226.4], [255.7, 253.1]])
     middle = _CAMERA.pinhole.unit_vectors(np.array([[240.3, 238.7]]))[0]
     image = np.zeros((512, 512))
@@ -119,7 +122,10 @@ def test_pure_noise_contains_neither_star_nor_object() -> None:
 
 @pytest.mark.parametrize("crossed", [False, True])
 def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) -> None:
-    """A star of 50 px is alone in its region, or is crossed by an object of 15,000 counts."""
+    """A region with a star and an object exceeds the chi-square that is expected of a star alone.
+
+    The star's streak has 50 px, and the object has 15,000 counts.
+    """
     middle = _CAMERA.pinhole.unit_vectors(np.array([[245.0, 240.0]]))[0]
     path = star_path(middle, _ROTATION, 0.5, _CAMERA.pinhole)
     ends = np.array([[240.0, 225.0], [252.0, 255.0]])
@@ -142,7 +148,10 @@ def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) ->
     ("beyond", "gap"), [(0.0, 0.0), (12.0, 0.0), (30.0, 0.0), (-40.0, 0.0), (-40.0, 8.0)]
 )
 def test_the_ends_of_a_streak_follow_its_light(beyond: float, gap: float) -> None:
-    """The assumed end of a 100 px streak is `beyond` px too far; some pixels before it are saturated."""
+    """The fitted ends of a streak follow its light if the assumed end is `beyond` px too far.
+
+    The streak has 100 px, and some pixels before its end are saturated.
+    """
     ends = np.array([[200.0, 210.0], [280.0, 270.0]])
     image = np.zeros((512, 512))
     deposit(image, ends[0] + np.linspace(0.0, 1.0, 2001)[:, None] * np.diff(ends, axis=0), 60_000.0, 1.0)
@@ -160,7 +169,10 @@ def test_the_ends_of_a_streak_follow_its_light(beyond: float, gap: float) -> Non
 
 
 def test_a_hidden_end_has_a_large_claim() -> None:
-    """The last 20 px of a streak are in saturated pixels, so that its end cannot be located to 2 px."""
+    """An end in saturated pixels has a large uncertainty.
+
+    The last 20 px of the streak are saturated, so the end cannot be located to 2 px.
+    """
     ends = np.array([[200.0, 210.0], [280.0, 270.0]])
     image = np.zeros((512, 512))
     deposit(image, ends[0] + np.linspace(0.0, 1.0, 2001)[:, None] * np.diff(ends, axis=0), 60_000.0, 1.0)

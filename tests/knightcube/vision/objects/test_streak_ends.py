@@ -52,7 +52,7 @@ def test_a_lines_length_comes_from_its_moments_whatever_its_width() -> None:
     signal = np.zeros((60, 120), dtype=np.float32)
     signal[20:25, 10:91] = 3.0
     regions = find_regions(signal > 0, signal, least_area=2)
-    # For whole pixels, the difference of the two second moments is (81^2 - 1 - (5^2 - 1))/12.
+    # For whole pixels, the two second moments differ by (81^2 - 1 - (5^2 - 1))/12.
     assert regions.length[0] == pytest.approx(np.sqrt(81.0**2 - 5.0**2))
     assert regions.flux[0] == pytest.approx(3.0 * 5 * 81)
 
@@ -66,7 +66,7 @@ def test_the_local_threshold_passes_normal_noise_at_its_own_rate() -> None:
     signal = np.random.default_rng(4).normal(0.0, 5.0, (700, 700)).astype(np.float32)
     passed = threshold_local(signal, np.full_like(signal, 5.0), 2.0).mean()
     # A normal variable exceeds 2 sigma with a probability of 2.275 %. About 54,000 of the correlated sums are
-    # independent.
+    # independent of each other.
     assert passed == pytest.approx(0.02275, abs=5.0 * np.sqrt(0.02275 / 54_000))
 
 
@@ -92,7 +92,7 @@ def test_hot_pixels_are_repaired_and_stars_are_left() -> None:
 
 
 def test_sums_after_subtraction_are_those_of_the_remaining_light() -> None:
-    """The test includes pixels at the corners and edges of the frame."""
+    """Sums after the subtraction of stars are sums of the remaining light, even at corners and edges."""
     generator = np.random.default_rng(9)
     image = generator.integers(0, 1000, (40, 50)).astype(np.float32)
     pixels = np.unique(np.append(generator.integers(0, image.size, 300), [0, 49, 50, image.size - 1]))
@@ -106,14 +106,14 @@ def test_sums_after_subtraction_are_those_of_the_remaining_light() -> None:
 def test_the_derivative_kernel_is_the_published_one_of_3_4() -> None:
     printed = np.array([[0.0466, 0, -0.0466], [0.3446, 0, -0.3446], [0.0466, 0, -0.0466]])
     kernel = np.outer(gaussian_kernel(0.5, 1), gaussian_derivative_kernel(0.5, 1))
-    # Equation 3.4 is written for convolution, which mirrors the kernel.
+    # Equation 3.4 is a convolution, which mirrors the kernel.
     np.testing.assert_allclose(kernel[:, ::-1], printed, atol=5.5e-5)
 
 
 def test_the_gradient_of_a_ramp_is_its_slope() -> None:
     y, x = np.mgrid[0:40, 0:50]
     gx, gy = gradient(3.0 * x - 2.0 * y, sigma=1.0)
-    # The kernels are truncated at three sigma, and 3 % of the derivative's weight lies beyond.
+    # The kernels end at three sigma, and 3 % of the weight of the derivative lies beyond.
     np.testing.assert_allclose(gx[8:-8, 8:-8], 3.0, rtol=0.03)
     np.testing.assert_allclose(gy[8:-8, 8:-8], -2.0, rtol=0.03)
 
@@ -247,7 +247,10 @@ def test_all_forms_find_the_same_bright_pixels_boxes_and_regions() -> None:
 @pytest.mark.parametrize("upright", [False, True])
 @pytest.mark.parametrize("half_width", [0, 3])
 def test_all_forms_find_the_same_corners_of_regions(half_width: int, upright: bool) -> None:
-    """The regions include a bright streak, noise peaks, and regions at the border of the frame."""
+    """The compiled and the numpy implementation find the same corners of regions.
+
+    The regions include a bright streak, noise peaks, and regions at the border of the frame.
+    """
     draw = np.random.default_rng(5)
     signal = 10.0 * ndimage.gaussian_filter(draw.normal(size=(40, 50)), 1.2)
     signal += 40.0 * np.exp(-0.5 * (np.arange(40)[:, None] - 14.0 - 0.3 * np.arange(50)) ** 2)

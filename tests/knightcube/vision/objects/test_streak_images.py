@@ -36,7 +36,7 @@ def test_slopes_of_light_are_those_of_small_moves() -> None:
     step = 1e-4 * share[:, None]
     for slope, axis in ((across, [1.0, 0.0]), (down, [0.0, 1.0])):
         moved = [spread_over(path + sign * step * axis, 40, 24, 1.0) for sign in (1.0, -1.0)]
-        # The tolerance is the light that the model omits (beyond 5 sigma from the path), divided by the step
+        # The tolerance is the light beyond 5 sigma from the path, which the model omits, divided by the step
         # of the difference.
         np.testing.assert_allclose(slope, (moved[0] - moved[1]) / 2e-4, atol=1e-5)
 
@@ -74,7 +74,7 @@ def test_paths_of_stars_rotate_with_the_sky() -> None:
 
 
 def _arcs(length: float, count: int, draw: np.random.Generator) -> FloatArray:
-    """Return paths (4, count, 2), px, of the given chord length with increasing curvature."""
+    """Return paths (4, count, 2), px, with the same chord length and increasing curvature."""
     along = draw.normal(size=2)
     along /= np.linalg.norm(along)
     part = np.linspace(-0.5, 0.5, count)[:, None]
@@ -108,7 +108,10 @@ def test_all_forms_return_the_same_paths_of_stars() -> None:
 
 @pytest.mark.parametrize("backward", [False, True])
 def test_all_forms_return_the_same_path_among_the_stars(backward: bool) -> None:
-    """The path begins at the first end even if the slower motion begins at the second end."""
+    """All implementations return the same path relative to the stars.
+
+    The path begins at the first end, even if the slower motion begins at the second end.
+    """
     ends = np.array([[200.0, 250.0], [290.0, 262.0]])[:: -1 if backward else 1]
     view = float(_CAMERA.pinhole.focal_length), *_CAMERA.pinhole.centre
     for rotation in (0.0 * _ROTATION, _ROTATION, -_ROTATION):

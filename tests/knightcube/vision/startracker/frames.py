@@ -22,7 +22,7 @@ NARROW = StarCameraModel(field_of_view=float(np.radians(12.0)))
 
 @dataclass(frozen=True)
 class SkyFrame:
-    """A frame and its truth.
+    """A frame with its true attitude, rate and stars.
 
     Attributes:
         attitude: attitude (4,) at mid-exposure, from ICRS to camera axes.
@@ -39,7 +39,7 @@ class SkyFrame:
     electrons: FloatArray
 
     def rate_bound(self, most: int = 30) -> float:
-        """Return the Cramer-Rao bound of the rate's magnitude from the `most` brightest stars, rad/s."""
+        """Return the Cramer-Rao bound (rad/s) of the rate's magnitude, from the `most` brightest stars."""
         camera = self.camera
         floor = camera.read_noise**2 + camera.dark_current * self.exposure + 1.0 / 12.0
         stars, light = self.stars[:most], self.electrons[:most]
@@ -50,15 +50,16 @@ class SkyFrame:
     def attitude_bound(self, most: int = 60) -> FloatArray:
         """Return the Cramer-Rao bound of the attitude covariance (3, 3) at mid-exposure, rad^2.
 
-        The bound uses the `most` brightest stars with independent positions. The shape of the point spread is
-        known, and errors of a constant rate are not correlated with the attitude at mid-exposure.
+        The bound uses the `most` brightest stars with independent positions. It assumes a known shape of the
+        point spread function, and a constant rate whose errors are not correlated with the attitude at
+        mid-exposure.
         """
         camera = self.camera
         floor = camera.read_noise**2 + camera.dark_current * self.exposure + 1.0 / 12.0
         motion = CameraMotion.steady(self.rate * self.exposure)
         total = np.zeros((3, 3))
         for star, light in zip(self.stars[:most], self.electrons[:most], strict=True):
-            # Rotation and point spread are followed by the parameters x, y, electrons and background.
+            # The parameters are rotation, point spread width, x, y, electrons and background.
             alone = star_information(camera.pinhole, motion, star, float(light), camera.psf_sigma, floor)[
                 4:, 4:
             ]
@@ -75,7 +76,7 @@ class SkyFrame:
 def _slope(camera: Pinhole, star: FloatArray) -> FloatArray:
     """Return the derivatives (2, 3), px/rad, of a star's pixel coordinates.
 
-    They are with respect to rotations about the camera axes.
+    The derivatives are with respect to rotations about the camera axes.
     """
     direction = camera.unit_vectors(star)
     step = 1e-5 * np.cross(np.eye(3), direction)
@@ -83,7 +84,7 @@ def _slope(camera: Pinhole, star: FloatArray) -> FloatArray:
 
 
 def sky() -> SkyIndex:
-    """Return the default index, whose epoch is that of the frames."""
+    """Return the default sky index, whose epoch is that of the frames."""
     return default_index()
 
 
@@ -94,7 +95,7 @@ def sky_frame(
     camera: StarCameraModel = NARROW,
     theta_deg: tuple[float, float] = (30.0, 90.0),
 ) -> SkyFrame:
-    """Return a random field of the real sky with streaks of about `streak_px` at the boresight.
+    """Return a random field of the real sky, with streaks of about `streak_px` px at the boresight.
 
     The angle of the rotation axis from the boresight is drawn between the two values of `theta_deg`.
     """

@@ -1,4 +1,4 @@
-"""Foregrounds and defects that are added to a frame of stars, as in photographs or from a worn sensor.
+"""Foregrounds and defects for frames of stars, as in photographs or from a worn sensor.
 
 Each function takes pixels (rows, columns) as floats, the brightness range of the stars in counts, and a
 random generator.
@@ -14,7 +14,7 @@ from knightcube.astro.arrays import FloatArray, Image
 
 Spoiler = Callable[[FloatArray, float, np.random.Generator], FloatArray]
 
-# Pixel-to-pixel texture of a foreground, relative to its brightness.
+# Texture of a foreground from pixel to pixel, relative to its brightness.
 _TEXTURE = 0.02
 
 
@@ -27,7 +27,7 @@ def spoilt(pixels: Image, kind: str, rng: np.random.Generator) -> Image:
 
 
 def _grid(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return y (rows, 1) and x (1, columns) of the pixels, from 0 to 1 down and across."""
+    """Return coordinates y (rows, 1) and x (1, columns) of pixels, from 0 to 1 downwards and rightwards."""
     rows, columns = frame.shape
     return np.linspace(0.0, 1.0, rows)[:, None], np.linspace(0.0, 1.0, columns)[None]
 

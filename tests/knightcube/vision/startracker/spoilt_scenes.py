@@ -36,7 +36,7 @@ class Scene:
 
 
 def rendered(frames: int, streak_px: float) -> Iterator[Scene]:
-    """Yield random frames of the simulated camera, with streaks of `streak_px` px, or points if it is 0."""
+    """Yield random frames of the simulated camera with streaks of `streak_px` px (0 px are points)."""
     for number in range(frames):
         scene = sky_frame(np.random.default_rng([_SEED, number]), streak_px, _EXPOSURE)
         boresight = attitude_matrix(scene.attitude)[2]
@@ -50,7 +50,7 @@ def photographed(folder: Path) -> Iterator[Scene]:
 
 
 def spoilt_scene(scene: Scene, kind: str, number: int) -> Scene:
-    """Return a scene with the foreground or defect `kind`, drawn with the seed `number`."""
+    """Return a frame with the foreground or defect `kind`, whose random seed is `number`."""
     rng = np.random.default_rng([_SEED, number, zlib.crc32(kind.encode())])
     return Scene(scene.source, spoilt(scene.pixels, kind, rng), scene.boresight, scene.field_deg)
 

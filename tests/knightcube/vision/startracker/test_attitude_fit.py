@@ -43,7 +43,10 @@ def directions(count: int, seed: int = 1) -> FloatArray:
 
 
 def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
-    """The fit starts with errors of two degrees and 3 %, and converges quadratically to rounding."""
+    """Attitude and scale of exact directions are found to rounding, from errors of two degrees and 3 %.
+
+    The fit converges quadratically.
+    """
     seen, quaternion = directions(12), normalise(np.array([0.3, -0.2, 0.5, 0.7]))
     matrix = attitude_matrix(quaternion)
     reference = stretched(seen, 1.03) @ matrix
@@ -67,9 +70,9 @@ def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_the_covariance_and_the_residuals_agree_with_many_fits(free_scale: bool) -> None:
-    """The mean chi-squares of 400 fits of 12 stars agree with their degrees of freedom.
+    """The mean chi-squares of 400 fits with 12 stars agree with their degrees of freedom.
 
-    These are 3 for the attitude, or 4 with the scale. For the residuals, they are 24 minus this number.
+    The attitude has 3 degrees of freedom, or 4 with the scale. The residuals have 24 minus this number.
     """
     draw = np.random.default_rng(2)
     seen, parameters = directions(12), 4 if free_scale else 3
@@ -105,7 +108,10 @@ def test_a_start_on_the_other_side_of_the_sky_diverges() -> None:
 def test_residuals_beyond_three_sigma_of_their_chi_square_increase_the_variances(
     excess: float, factor: float
 ) -> None:
-    """With 12 stars and 4 parameters, 20 degrees of freedom give a limit of 1 + 3 sqrt(2 / 20) = 1.949."""
+    """Residuals that exceed their chi-square by three sigma increase the variances.
+
+    12 stars and 4 parameters give 20 degrees of freedom, and a limit of 1 + 3 sqrt(2 / 20) = 1.949.
+    """
     squares = np.full(12, excess * 20.0 / 12.0)
     assert inflation(squares, 4) == pytest.approx(factor)
     assert inflation(np.array([50.0, 50.0]), 4) == 1.0, "two stars leave no residuals"
@@ -113,7 +119,7 @@ def test_residuals_beyond_three_sigma_of_their_chi_square_increase_the_variances
 
 
 def test_a_widened_fit_has_the_scatter_of_its_residuals() -> None:
-    """The assumed standard deviations are three times too small."""
+    """If the assumed standard deviations are three times too small, the covariance follows the residuals."""
     draw = np.random.default_rng(3)
     seen = directions(40)
     noisy = normalise(seen + 3.0 * SIGMA * draw.normal(size=(40, 3)))
@@ -160,7 +166,7 @@ CORNER = math.hypot(0.36, 0.36)
 
 
 def barrel(true: FloatArray, distortion: float) -> FloatArray:
-    """Return the directions (n, 3) imaged by a lens that moves the tangent t to t (1 + c (t / R)^2)."""
+    """Return the directions (n, 3) in the image of a lens that moves a tangent t to t (1 + c (t / R)^2)."""
     tangents = true[:, :2] / true[:, 2:]
     square = np.sum(tangents**2, axis=1, keepdims=True) / CORNER**2
     return np.asarray(
@@ -171,7 +177,7 @@ def barrel(true: FloatArray, distortion: float) -> FloatArray:
 def distorted_fit(
     seen: FloatArray, sky: FloatArray, sigma: float, first: int, far: float = 0.0
 ) -> DistortedFit | None:
-    """Return the fit that starts from the `first` stars nearest to the axis, with correct matches."""
+    """Return the fit that starts with the `first` stars nearest to the axis, whose matches are correct."""
     index = cast(SkyIndex, SimpleNamespace(stars=SimpleNamespace(direction=sky)))
     known = np.argsort(-seen[:, 2])[:first]
     field = StarField(seen, np.full(len(seen), sigma), (0.36, 0.36))

@@ -1,4 +1,4 @@
-"""Tests of the second fit with all catalogue stars: accuracy, covariance, and rejection."""
+"""Tests of the second fit, with all catalogue stars: accuracy, covariance, and rejection."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MILKY_WAY = 16
 
 @cache
 def _first(seed: int, streak_px: float = _STREAK_PX) -> tuple[SkyFrame, FrameSolution]:
-    """Return a frame whose streaks are nearly half the field long, and the solution of the first fit."""
+    """Return a frame with streaks of nearly half the field of view, and the solution of the first fit."""
     frame = sky_frame(np.random.default_rng([77, seed]), streak_px, _EXPOSURE, _CAMERA)
     motion = estimate_motion(frame.pixels, _CAMERA.pinhole, _EXPOSURE, _LIKELIHOOD, frame.rate, 0.0)
     prior = AttitudePrior(multiply(from_rotation_vector(np.array([2e-4, -1e-4, 1e-4])), frame.attitude), 3e-4)
@@ -58,7 +58,10 @@ def _rate_error(solution: FrameSolution, frame: SkyFrame) -> float:
 
 
 def test_the_second_fit_improves_attitude_and_rate() -> None:
-    """The rms errors are those of three frames in which undetected stars bias the first fit."""
+    """The second fit has smaller rms errors of attitude and rate than the first fit, over three frames.
+
+    In these frames, undetected stars bias the first fit.
+    """
     errors = []
     for seed in _SEEDS:
         frame, first = _first(seed)
@@ -82,7 +85,7 @@ def test_stars_rejected_because_of_hidden_stars_are_accepted_again() -> None:
 
 
 def test_the_errors_agree_with_the_covariance() -> None:
-    """The limit is the quantile 1 - 1e-3 of a chi-square with 9 degrees of freedom."""
+    """The normalised squared error is below the 99.9 % quantile of a chi-square with 9 degrees of freedom."""
     squares = 0.0
     for seed in _SEEDS:
         error, fix = _error(_second(seed), _first(seed)[0].attitude), _second(seed).fix
@@ -92,7 +95,10 @@ def test_the_errors_agree_with_the_covariance() -> None:
 
 
 def test_the_second_fit_needs_little_memory_in_the_milky_way() -> None:
-    """The worker's memory is limited, so that only close pairs of the 1200 stars are examined."""
+    """In the Milky Way, the second fit examines only close pairs of the 1200 stars, to save memory.
+
+    The memory of the worker is limited.
+    """
     frame, first = _first(_MILKY_WAY, 120.0)
     tracemalloc.start()
     try:
@@ -104,7 +110,10 @@ def test_the_second_fit_needs_little_memory_in_the_milky_way() -> None:
 
 
 def test_a_star_missing_in_the_catalogue_stays_untrusted() -> None:
-    """The second brightest identified star is removed from the catalogue."""
+    """A star that is missing in the catalogue is not trusted.
+
+    The second brightest of the identified stars is removed from the catalogue.
+    """
     frame, first = _first(_SEEDS[0])
     struck = int(np.sort(first.star[first.matched])[1])
     known = sky()
@@ -128,7 +137,11 @@ def test_a_star_missing_in_the_catalogue_stays_untrusted() -> None:
 
 
 def test_a_contradicting_second_rate_is_rejected() -> None:
-    """The first rate is wrong by 1 % with a small covariance, so that the correct second rate is rejected."""
+    """A second rate that contradicts the first rate is rejected.
+
+    In the test, the first rate is wrong by 1 % but has a small covariance, so the correct second rate is
+    rejected.
+    """
     frame, first = _first(_SEEDS[0])
     motion = first.motion
     assert motion is not None

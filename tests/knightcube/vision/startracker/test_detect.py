@@ -1,6 +1,6 @@
-"""Tests of detection: simulated stars are found, measured to the bound, and distinguished from other points.
+"""Tests of star detection: stars are found, measured to the bound, and distinguished from other points.
 
-Further tests concern detection near predicted positions, and the brightest detections in photographs.
+Further tests are of detection near predicted positions, and of the brightest detections in photographs.
 """
 
 from __future__ import annotations
@@ -297,7 +297,7 @@ def test_wrong_predictions_are_refused() -> None:
 
 
 def test_trailed_stars_are_measured_at_mid_exposure() -> None:
-    """For trails of 3 px on a sloping background, the errors agree with the covariance."""
+    """For trails of 3 px on a sloping background, the errors at mid-exposure agree with the covariance."""
     rng = np.random.default_rng(12)
     trail, squares, claims = np.array([2.5, 1.5]), [], []
     for _ in range(6):
@@ -316,20 +316,20 @@ def test_trailed_stars_are_measured_at_mid_exposure() -> None:
         off = found.points - TRAILED[found.prediction]
         squares += np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance), off).tolist()
         claims += found.sigma.tolist()
-    assert 0.7 < np.median(squares) < 2.3  # the median of chi-square with two degrees of freedom is 1.39
+    assert 0.7 < np.median(squares) < 2.3  # the median of a chi-square with two degrees of freedom is 1.39
     assert np.median(claims) < 0.03
 
 
 SKY = Path(__file__).parents[5].parent / "shared" / "data" / "sky"
 _TOLERANCE = 0.007
-"""Tolerance as a fraction of the frame's width, because the lens distortion is not corrected."""
+"""Tolerance, as a fraction of the frame's width. The lens distortion is not corrected."""
 _AMONG = 80
 
 pytestmark = pytest.mark.skipif(not SKY.is_dir(), reason="the photographs of ../shared/data/sky are missing")
 
 
 def catalogue_places(truth: dict[str, float], shape: tuple[int, ...]) -> FloatArray:
-    """Return the pixels of the brightest stars in the field, with the roll convention of cedar-solve."""
+    """Return the pixels of the brightest stars in the field, by the roll convention of cedar-solve."""
     ra, dec, roll = (np.radians(truth[name]) for name in ("ra", "dec", "roll"))
     boresight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -366,7 +366,7 @@ def test_nearly_all_of_the_twenty_brightest_detections_are_bright_catalogue_star
 
 
 def test_leaves_are_not_among_the_stars() -> None:
-    """The tree fills the upper right corner of the image."""
+    """Leaves of a tree, in the upper right corner of the image, are not detected as stars."""
     found = detect(read_image(SKY / "tree.jpg")).stars()
     in_tree = (found.points[:, 0] > 310.0) & (found.points[:, 1] < 310.0)
     assert np.count_nonzero(in_tree[:20]) <= 5

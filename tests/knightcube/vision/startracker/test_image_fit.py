@@ -24,7 +24,7 @@ _CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
 _ATTITUDE = np.array([0.5, -0.5, 0.5, 0.5])
 _ALONG_PX, _ACROSS_PX = 2.0, 0.1
 _TRIALS = 200
-# Quantiles at 1e-5 of a chi-square with 600 degrees of freedom, divided by 600.
+# Quantiles (1e-5 and 1 - 1e-5) of a chi-square with 600 degrees of freedom, divided by 600.
 _LOW, _HIGH = 0.77, 1.27
 
 
@@ -54,7 +54,7 @@ def _error(found: ImageFit) -> FloatArray:
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_exact_positions_give_the_exact_attitude_and_scale(free_scale: bool) -> None:
-    """If the scale is fitted, the assumed focal length is wrong by 1 %."""
+    """Exact positions give the exact attitude, and the exact scale if the focal length is wrong by 1 %."""
     points, covariance = _streaks(np.random.default_rng(1), 10)
     reference = _reference(points)
     scale = 1.01 if free_scale else 1.0
@@ -67,7 +67,11 @@ def test_exact_positions_give_the_exact_attitude_and_scale(free_scale: bool) -> 
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_elongated_errors_agree_with_the_covariance_and_beat_round_ones(free_scale: bool) -> None:
-    """The 200 fields of 12 stars are compared with fields of isotropic errors with the same mean variance."""
+    """The errors of 200 fields with elongated position errors agree with the covariance.
+
+    They are smaller than in fields of 12 stars whose position errors are isotropic and have the same mean
+    variance.
+    """
     rng = np.random.default_rng(2)
     mismatch, mine, rounds, scales = 0.0, 0.0, 0.0, 0.0
     for _ in range(_TRIALS):
@@ -99,8 +103,8 @@ def test_excess_scatter_of_the_stars_increases_the_covariance() -> None:
     ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
     assert sound.excess == 1.0
     assert wider.excess == pytest.approx(25.0, rel=0.5)
-    # The degrees of freedom are 24 - 3 in the covariance, which is that of the attitude. They are 24 - 4 in
-    # `excess`, because it also counts the scale.
+    # In the covariance, which is that of the attitude, the degrees of freedom are 24 - 3. In `excess`, which
+    # also accounts for the scale, they are 24 - 4.
     assert ratio == pytest.approx(wider.excess * (24 - 4) / (24 - 3) / 25.0, rel=1e-3)
 
 
@@ -119,7 +123,10 @@ def test_a_solver_of_wahbas_problem_gets_the_scatter_of_the_stars_too() -> None:
 
 
 def test_stars_that_disagree_are_rejected_and_the_covariance_stays_correct() -> None:
-    """Two of 14 stars are displaced by 6 px, which is sixty standard deviations across their streaks."""
+    """Stars that contradict the others are rejected, and the covariance remains correct.
+
+    Two of 14 stars are displaced by 6 px, sixty standard deviations across their streaks.
+    """
     rng = np.random.default_rng(4)
     mismatch = 0.0
     for _ in range(_TRIALS):
@@ -136,7 +143,10 @@ def test_stars_that_disagree_are_rejected_and_the_covariance_stays_correct() -> 
 
 
 def test_all_stars_are_kept_if_too_few_would_remain() -> None:
-    """One of four stars is wrong, but the data do not show which one."""
+    """If too few stars would remain, no star is rejected.
+
+    The data do not show which of four stars is wrong.
+    """
     rng = np.random.default_rng(5)
     points, covariance = rng.uniform(50.0, 970.0, (4, 2)), np.tile(0.01 * np.eye(2), (4, 1, 1))
     reference = _reference(points)
@@ -156,7 +166,10 @@ def test_stars_in_one_direction_do_not_determine_an_attitude() -> None:
 
 
 def test_stars_from_different_parts_of_the_sky_do_not_give_an_attitude() -> None:
-    """Two stars that are 90 deg apart are imaged side by side, which no attitude explains."""
+    """Stars from different parts of the sky, imaged side by side, do not give an attitude.
+
+    The two stars are 90 deg apart.
+    """
     points = np.array([[500.0, 500.0], [520.0, 500.0]])
     reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     with pytest.raises(AttitudeError):
@@ -164,7 +177,10 @@ def test_stars_from_different_parts_of_the_sky_do_not_give_an_attitude() -> None
 
 
 def test_an_unknown_lens_is_fitted_and_included_in_the_covariance() -> None:
-    """The optical axis is 25 px from the image centre, and the distortion is 2 % at the corner."""
+    """An unknown lens is fitted, and its uncertainty is included in the covariance.
+
+    The optical axis is 25 px from the image centre, and the distortion is 2 % at the corner.
+    """
     squares, off = [], []
     for number in range(12):
         found, truth = drawn("poor", number)
@@ -173,15 +189,15 @@ def test_an_unknown_lens_is_fitted_and_included_in_the_covariance() -> None:
         squares.append(error @ np.linalg.solve(found.fix.covariance, error) / 3.0)
         off.append(np.linalg.norm(error[:2]) * found.camera.focal_length)
     assert np.mean(squares) < 1.0
-    # A fit of the focal length alone has an error of 0.7 px.
+    # A fit of the focal length alone would have an error of 0.7 px.
     assert np.sqrt(np.mean(np.square(off))) < 0.2
 
 
 def test_an_unspecified_shutter_is_fitted_and_included_in_the_covariance() -> None:
-    """The shutter delay is random in 200 fields of 12 moving stars.
+    """An unknown delay of the shutter is fitted, and its uncertainty is included in the covariance.
 
-    One standard deviation of the delay shifts a star at the bottom of the frame by 1 px relative to a star at
-    the top.
+    The delay is random in 200 fields of 12 moving stars. One standard deviation shifts a star at the bottom
+    of the frame by 1 px relative to a star at the top.
     """
     rng = np.random.default_rng(6)
     known, unknown, delays = 0.0, 0.0, 0.0
@@ -204,7 +220,10 @@ def test_an_unspecified_shutter_is_fitted_and_included_in_the_covariance() -> No
 
 @pytest.mark.parametrize("scatter", [False, True])
 def test_equal_errors_of_bright_and_faint_stars_are_in_the_covariance(scatter: bool) -> None:
-    """In 200 fields, all positions have errors of 0.05 px, ten times the noise of the brightest stars."""
+    """The covariance includes errors that are equal for bright and faint stars.
+
+    In 200 fields, all positions have errors of 0.05 px, which is ten times the noise of the brightest stars.
+    """
     rng = np.random.default_rng(7)
     known, off, ideal = 0.0, 0.0, 0.0
     for _ in range(_TRIALS):
@@ -216,8 +235,8 @@ def test_equal_errors_of_bright_and_faint_stars_are_in_the_covariance(scatter: b
         known += float(error @ np.linalg.solve(found.fix.covariance, error))
         off += float(np.sum(error[:2] ** 2))
         ideal += float(np.sum(_error(_fit(seen, covariance + 0.05**2 * np.eye(2), reference))[:2] ** 2))
-    # Some of the brightest stars are rejected, so that the variance of the remaining stars is slightly too
-    # small. An excess that is not significant is not added either unless `scatter` is set.
+    # Some of the brightest stars are rejected, so the variance of the remaining stars is slightly too small.
+    # Without `scatter`, an excess that is not significant is not added either.
     assert known / (3.0 * _TRIALS) < (2.3 if scatter else 2.5)
     assert off < 1.5 * ideal
 
@@ -245,7 +264,7 @@ def test_fitting_the_scatter_costs_little_accuracy_with_correct_noise() -> None:
 def test_the_compiled_fit_equals_that_in_numpy(scale: bool, bends: int, delayed: bool) -> None:
     draw = np.random.default_rng([scale, bends, delayed])
     observed = _CAMERA.unit_vectors(draw.uniform(0.0, 1_023.0, (30, 2)))
-    # The stars are displaced by the errors of all parameters, and by noise.
+    # The stars are displaced by the errors of all parameters and by noise.
     reference = observed @ attitude_matrix(from_rotation_vector(np.array([0.01, -0.02, 0.03])))
     reference = reference + 1e-3 * draw.normal(size=reference.shape)
     reference /= np.linalg.norm(reference, axis=1, keepdims=True)

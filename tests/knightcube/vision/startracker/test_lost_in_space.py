@@ -1,4 +1,4 @@
-"""Tests of identification lost in space on synthetic star lists: identifications and refusals."""
+"""Tests of lost-in-space identification on synthetic star lists: identifications and refusals."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def _right(found: StarMatch, drawn: StarList) -> bool:
     "kind", configurations(), ids=lambda kind: f"{kind.field_deg}-{kind.noise_px}-{kind.false_stars}"
 )
 def test_every_configuration_of_the_issue_is_named(kind: ListKind) -> None:
-    """The lists are a small part of `python -m tests.studies.bench starid`."""
+    """The stars of each tested configuration are identified.
+
+    The lists are a small part of those of `python -m tests.studies.bench starid`.
+    """
     for seed in range(10):
         drawn = _drawn(kind, seed)
         assert _right(identify(drawn.field(), SKY), drawn), seed
@@ -94,7 +97,11 @@ def test_other_cameras_and_worse_detectors_are_supported(kind: ListKind) -> None
 
 @pytest.mark.parametrize(("false_stars", "least"), [(3, 6), (10, 6), (20, 5)])
 def test_false_stars_brighter_than_all_true_ones_do_not_hide_the_sky(false_stars: int, least: int) -> None:
-    """The lists are a small part of `python -m tests.studies.bench starid --hard`, with an unknown field."""
+    """False stars that are brighter than all true stars do not prevent the identification.
+
+    The lists are a small part of those of `python -m tests.studies.bench starid --hard`, with an unknown
+    field.
+    """
     right = 0
     for seed in range(6):
         drawn = _drawn(
@@ -131,9 +138,9 @@ def test_random_points_are_refused(known_deg: float | None) -> None:
 
 
 def test_a_refusal_takes_limited_time() -> None:
-    """On an idle machine, a refusal takes at most 20 ms in `tests.studies.bench starid`.
+    """A refusal takes a limited time, at most 20 ms in `tests.studies.bench starid` on an idle machine.
 
-    The test allows ten times this duration.
+    The test permits ten times this duration.
     """
     drawn = draw_random(ListKind(known_deg=None), 40, np.random.default_rng(99))
     field = drawn.field()
@@ -176,7 +183,10 @@ def test_a_camera_without_a_mirror_does_not_accept_mirror_images() -> None:
 
 
 def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
-    """The lists are chosen so that the fifth star is clearly fainter than the four brightest."""
+    """Four true stars without false stars are sufficient if the positions are accurate.
+
+    In the chosen lists, the fifth star is clearly fainter than the four brightest stars.
+    """
     named = 0
     for seed in range(20):
         drawn = _drawn(ListKind(noise_px=0.1, magnitude_error=0.0), seed)
@@ -189,10 +199,9 @@ def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
 
 @pytest.mark.parametrize(("field_deg", "known_deg"), [(12.0, 0.1), (28.0, None)])
 def test_the_covariance_is_honest(field_deg: float, known_deg: float | None) -> None:
-    """The squared error over its covariance has a mean of 3, as a chi-square with three degrees of freedom.
+    """The mean of the normalised squared error is 3, as of a chi-square with three degrees of freedom.
 
-    With an unknown field, the given standard deviations refer to the assumed field of 17 deg instead of the
-    true field.
+    If the field of view is unknown, the given standard deviations refer to the assumed field of 17 deg.
     """
     squares = []
     for seed in range(150):
@@ -203,12 +212,13 @@ def test_the_covariance_is_honest(field_deg: float, known_deg: float | None) -> 
         turn = attitude_matrix(found.fix.quaternion) @ attitude_matrix(drawn.attitude).T
         error = 0.5 * np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]])
         squares.append(error @ np.linalg.solve(found.fix.covariance, error))
-    # The mean of 150 chi-squares with three degrees of freedom scatters by sqrt(6 / 150) = 0.2.
+    # The mean of 150 chi-squares with three degrees of freedom has a standard deviation of sqrt(6 / 150) =
+    # 0.2.
     assert 2.3 < np.mean(squares) < 3.8
 
 
 def test_standard_deviations_too_small_by_half_are_detected() -> None:
-    """The covariance is increased if the residuals are too large."""
+    """If standard deviations are too small by half, large residuals increase the covariance."""
     drawn = _drawn(ListKind(field_deg=20.0, noise_px=0.5), 5)
     field = drawn.field()
     honest = identify(field, SKY)
@@ -233,15 +243,15 @@ def test_repeated_points_in_one_direction_are_not_identified() -> None:
 
 
 def test_the_triangles_of_neighbours_join_a_star_with_two_of_its_five_nearest() -> None:
-    """The stars lie on a great circle at increasing distances.
+    """The triangles join each star with two of its five nearest neighbours.
 
-    The nearest stars of each star can therefore be counted by hand.
+    The stars are on a great circle at increasing distances, so the neighbours can be counted by hand.
     """
     angle = np.cumsum(np.arange(1, 46)) * 1e-4
     direction = np.stack([np.sin(angle), np.zeros(45), np.cos(angle)], axis=1)
     field = StarField(direction, np.full(45, 1e-5), (0.2, 0.2))
     expected = set()
-    # Only the 40 brightest stars are used as centres of triangles.
+    # Only the 40 brightest stars are centres of triangles.
     for centre in range(40):
         near = sorted(range(45), key=lambda other: abs(angle[other] - angle[centre]))[1:6]
         expected |= {tuple(sorted((centre, a, b))) for a in near for b in near if a < b}

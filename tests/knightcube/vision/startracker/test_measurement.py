@@ -1,4 +1,4 @@
-"""Tests of the alternative centroids: positions of a star without noise, and the effect of each pixel."""
+"""Tests of the alternative centroids: noiseless star positions, and the effect of each pixel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _stars(flux: float) -> FloatArray:
 
 
 def _start(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centre of mass with zero derivatives, because the derivatives must not be used."""
+    """Return the centre of mass, with zero derivatives, because the derivatives must have no effect."""
     step = np.arange(-3.0, 4.0)
     total = clean.sum(axis=(1, 2))
     x, y = clean.sum(axis=1) @ step / total, clean.sum(axis=2) @ step / total
@@ -47,7 +47,7 @@ def test_the_slopes_are_those_of_finite_differences(method: str) -> None:
             changed[:, row, column] += sign * step
             moved.append(METHODS[method](changed, variance, start, WIDTH)[0])
         numeric = (moved[0] - moved[1]) / (2.0 * step)
-        # The derivatives assume constant weights of the parabola, although they depend on the pixels in
+        # The derivatives assume constant weights of the parabola. The weights depend on the pixels only in
         # second order.
         assert slopes[:, :, row, column] == pytest.approx(numeric, rel=0.15, abs=2e-8)
 

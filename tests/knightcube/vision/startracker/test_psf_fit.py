@@ -1,4 +1,4 @@
-"""Tests of windows around stars and of the noise model, on drawn pixels with known noise."""
+"""Tests of windows around stars, and of the noise model, on drawn pixels with known noise."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ def test_a_window_holds_the_counts_above_the_sky_and_marks_pixels_that_cannot_be
     assert len(windows) == 2
     assert windows.light.shape == windows.good.shape == (2, 5, 5)
     assert windows.light[0].tolist() == (pixels[3:8, 2:7] - 10.0).tolist()
-    # Pixels of 57 counts and more are saturated, but keep their counts.
+    # Pixels of 57 or more counts are saturated, but their counts are kept.
     assert windows.good[0].tolist() == (pixels[3:8, 2:7] < 57.0).tolist()
-    # Nine pixels of the second window, in the lower left corner, are in the frame, and all are saturated.
+    # Only nine pixels of the second window, in its lower left corner, are within the frame, and all nine are
+    # saturated.
     assert windows.light[1, :3, 2:].tolist() == (pixels[7:, :3] - 20.0).tolist()
     assert np.count_nonzero(windows.light[1]) == 9
     assert not windows.good[1].any()
@@ -53,7 +54,10 @@ def test_smoothing_spreads_a_point_as_one_two_one_on_both_axes() -> None:
 def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
     photon: float, mismatch: float
 ) -> None:
-    """The residuals have the variance s^2 + p m + q^2 m^2, which the fit has reduced by a fifth."""
+    """Photon noise and PSF mismatch are distinguished by their dependence on the light.
+
+    The residuals have the variance s^2 + p m + q^2 m^2, which the fit has reduced by a fifth.
+    """
     draw = np.random.default_rng(1)
     noise = draw.uniform(2.0, 4.0, 300)
     light = draw.uniform(0.0, 1.0, (300, 7, 7)) ** 3 * draw.uniform(50.0, 3000.0, (300, 1, 1))
@@ -64,13 +68,13 @@ def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
     found = measure_noise(residual, floor, leverage, light, noise, None)
     assert found.photon == pytest.approx(photon, rel=0.1, abs=0.02)
     assert found.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
-    # Hot pixels beyond five standard deviations are ignored.
+    # Hot pixels that differ by more than five standard deviations are ignored.
     spoilt = residual.copy()
     spoilt[:, 3, 3] += 40.0 * np.sqrt(true[:, 3, 3])
     other = measure_noise(spoilt, floor, leverage, light, noise, None)
     assert other.photon == pytest.approx(photon, rel=0.3, abs=0.1)
     if photon > 0.0:
-        # A known gain determines the photon noise, and the mismatch is the median over the stars.
+        # A known gain determines the photon noise. The mismatch is then the median over the stars.
         known = measure_noise(residual, floor, leverage, light, noise, 1.0 / photon)
         assert known.photon == pytest.approx(photon)
         assert known.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
@@ -85,7 +89,7 @@ def test_few_bright_pixels_do_not_determine_the_noise() -> None:
 
 
 def test_the_variance_of_a_pixel_is_the_sum_of_sky_photons_and_mismatch() -> None:
-    """A signal of 20 counts has the variance 3^2 (noise) + 0.5 * 20 (photons) + (0.1 * 20)^2 (mismatch).
+    """The variance of a pixel with 20 counts is 3^2 (noise) + 0.5 * 20 (photons) + (0.1 * 20)^2 (mismatch).
 
     Negative counts add no variance.
     """
@@ -105,7 +109,7 @@ def test_the_compiled_fit_equals_the_fit_in_numpy(count: int, length: float) -> 
     seen = light(offset, width, half, trail) * flux[:, None, None] + draw.normal(0.0, 10.0, (stars, 9, 9))
     seen[3, 4, 4] += 3_000.0  # a hot pixel
     good = draw.random(seen.shape) < 0.95
-    good[5], good[6, :, :5] = False, False  # a star without a usable pixel, and one at the frame's edge
+    good[5], good[6, :, :5] = False, False  # a star without usable pixels, and a star at the edge
     shift, share = zip(*path(trail), strict=True)
     start = np.column_stack([offset + 0.3, 0.8 * flux, np.zeros(stars), width + 0.2])
     assert_forms_agree(

@@ -45,9 +45,9 @@ def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> 
 
 
 def test_only_a_reach_below_the_useful_one_is_left_out() -> None:
-    """Half of the stars are random.
+    """Ranges of triangles that are too small to be useful are omitted, and all other ranges are unchanged.
 
-    The others are close together in regions with many or few bright stars.
+    Half of the stars are random. The other half are close together, in regions with many or few bright stars.
     """
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(2000, 2)
     both = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(2000)])
@@ -77,9 +77,10 @@ def test_the_triangles_are_those_of_enumeration() -> None:
 
 
 def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() -> None:
-    """A hundred stars within a few degrees are brighter than all others.
+    """Any circle contains triangles of its brightest stars, even beside a cluster.
 
-    Stars near the cluster therefore have low brightness ranks.
+    The hundred stars of the cluster are brighter than all other stars, so that stars nearby have low
+    brightness ranks.
     """
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(100, 2)
     direction = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(3000)])
@@ -96,9 +97,10 @@ def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() 
 
 
 def test_a_rotated_sky_has_the_same_triangles() -> None:
-    """A star is a corner only of triangles smaller than its range, the distance to a brighter neighbour.
+    """A rotated sky has the same triangles, despite rounding errors.
 
-    Rounding errors of this distance must not affect the choice of triangles.
+    A star is a corner only of triangles that are smaller than its range, the distance to a brighter
+    neighbour. Rounding errors of this distance must not change the choice.
     """
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
@@ -186,7 +188,10 @@ def test_loading_the_whole_index_takes_less_than_50_ms() -> None:
 
 
 def test_the_stars_move_to_another_epoch_by_their_proper_motion() -> None:
-    """Groombridge 1830, HIP 57939, moves by 7.06 arcsec per year."""
+    """At another epoch, the stars are displaced by their proper motion.
+
+    Groombridge 1830, HIP 57939, moves by 7.06 arcsec per year.
+    """
     sky = default_index()
     (star,) = np.flatnonzero(sky.stars.hip == 57939)
     later = sky.at(sky.stars.epoch + 10.0).stars.direction[star]

@@ -40,7 +40,10 @@ _ARCSECOND = np.radians(1.0 / 3600.0)
 
 
 def test_a_star_across_the_motion_is_displaced_by_the_constant_of_aberration() -> None:
-    """The constant is n a / (c sqrt(1 - e^2)), with n a = 29,784.69 m/s and e = 0.01670862 (IAU 1976)."""
+    """A star normal to the motion is displaced by the constant of aberration.
+
+    The constant is n a / (c sqrt(1 - e^2)), with n a = 29,784.69 m/s and e = 0.01670862 (IAU 1976).
+    """
     speed = 29_784.69 / np.sqrt(1.0 - 0.01670862**2)
     seen = apparent(np.array([[0.0, 0.0, 1.0]]), np.array([speed, 0.0, 0.0]))[0]
     assert np.arctan2(seen[0], seen[2]) == pytest.approx(20.49552 * _ARCSECOND, abs=1e-3 * _ARCSECOND)
@@ -54,7 +57,7 @@ def test_aberration_keeps_stars_ahead_and_behind_and_unit_lengths() -> None:
 
 
 def test_the_angle_to_the_apex_follows_the_half_angle_formula() -> None:
-    """The formula tan(theta'/2) = sqrt((1 - beta)/(1 + beta)) tan(theta/2) is exact (Einstein 1905)."""
+    """The angle to the apex is tan(theta'/2) = sqrt((1 - beta)/(1 + beta)) tan(theta/2) (Einstein 1905)."""
     beta = 0.5
     theta = np.array([0.3, 1.0, 2.0, 3.0])
     stars = np.stack([np.sin(theta), np.zeros(4), np.cos(theta)], axis=-1)
@@ -69,21 +72,27 @@ def test_an_impossible_velocity_is_refused() -> None:
 
 
 def test_the_earths_velocity_is_the_published_one() -> None:
-    """The expected value is that of ERFA's test of epv00 (barycentric, au per day) at MJD 53411.52501161."""
+    """The Earth's velocity (barycentric, au per day) is that of ERFA's test of epv00.
+
+    The date is MJD 53411.52501161.
+    """
     published = np.array([-0.01091874268116823295, -0.01246525461732861538, -0.005404773180966231279])
     found = earth_velocity(2_453_412.02501161) * DAY / ASTRONOMICAL_UNIT
     np.testing.assert_allclose(found, published, atol=1e-11)
 
 
 def test_the_earths_velocity_is_the_slope_of_the_suns_place_by_another_series() -> None:
-    """The tolerance is 0.1 % of 30 km/s, plus 16 m/s for the Sun's motion about the barycentre."""
+    """The Earth's velocity is the derivative of the Sun's position by another series.
+
+    The tolerance is 0.1 % of 30 km/s, plus 16 m/s for the motion of the Sun about the barycentre.
+    """
     for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
         before, after = sun_position(np.array([date - 0.5, date + 0.5]))
         assert np.linalg.norm(earth_velocity(date) - (before - after) / DAY) < 46.0
 
 
 def test_the_earth_is_opposite_the_sun() -> None:
-    """The expected Sun (au, J2000) on 1992 October 13.0 TD is that of Meeus, example 26.b."""
+    """On 1992 October 13.0 TD, the Earth is opposite to the Sun (au, J2000) of Meeus, example 26.b."""
     published = np.array([-0.93739691, -0.31316824, -0.13577924])
     place, _ = earth_from_sun(2_448_908.5)
     np.testing.assert_allclose(-place / ASTRONOMICAL_UNIT, published, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Tests of the attitude from frames with points, streaks, priors, uneven motion, or without stars."""
+"""Tests of the attitude from frames with points, streaks, priors or uneven motion, or without stars."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _solve(
     frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
 ) -> FrameSolution:
     rate = RatePrior(frame.rate, 1e-6)
-    # The simulated lens has no distortion, and only its focal length may be wrong.
+    # The simulated lens has no distortion, so only its focal length may be wrong.
     camera, settings = NARROW.pinhole, SolveSettings(uncalibrated_lens=False)
     return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
 
@@ -85,7 +85,10 @@ def test_a_frame_is_solved_lost_in_space_within_its_own_covariance(streak_px: fl
 
 
 def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
-    """The triangle that identifies the stars has its own scale, which is wrong by up to 0.1 %."""
+    """A calibrated lens is not changed by the identification lost in space.
+
+    The triangle that identifies the stars has its own scale, which is wrong by up to 0.1 %.
+    """
     for seed in range(3):
         found = _solve(sky_frame(np.random.default_rng([31, seed]), 40.0, 0.1))
         assert found.status is SolveStatus.SOLVED
@@ -102,7 +105,10 @@ def test_a_streaked_frame_gives_the_rate_and_a_frame_at_rest_does_not() -> None:
 
 
 def test_the_attitudes_of_many_frames_scatter_as_their_covariances_say() -> None:
-    """The limits are quantiles of chi-square at 1e-4, for the 36 degrees of freedom of twelve frames."""
+    """The squared errors of twelve frames are within the 1e-4 quantiles of chi-square.
+
+    The errors have 36 degrees of freedom.
+    """
     frames = [sky_frame(np.random.default_rng([13, number]), 0.0, 0.1) for number in range(12)]
     total = sum(_mismatch(_solve(frame, scale=_KNOWN_TO_A_PERCENT), frame.attitude) for frame in frames)
     assert 11.9 < total < 76.4
@@ -127,9 +133,10 @@ def test_a_wrong_prior_does_not_change_the_solution() -> None:
 
 
 def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
-    """The position of the brightest star is wrong by 1.2 px.
+    """An attitude that is far from its prior is not changed towards the prior.
 
-    Four stars agree on a roll that differs from the prior by 30 sigmas.
+    The position of the brightest star is wrong by 1.2 px. Four stars agree on a roll that differs from the
+    prior by 30 sigmas.
     """
     camera, sigma = Pinhole.from_field_of_view(512, 512, float(np.radians(20.0))), 1e-4
     prior = np.array([-0.40584763582055994, 0.7184116261147981, 0.029066639845090374, 0.5642052484779536])
@@ -157,7 +164,10 @@ def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
 def test_points_that_contradict_their_uncertainties_give_no_attitude_unless_most_of_them_match(
     claimed: float, false_stars: int, accepted: bool
 ) -> None:
-    """The 20 to 80 stars have position errors of 1 px, but the stated standard deviation is `claimed` px."""
+    """Points that contradict their stated uncertainty give an attitude only if most of them match.
+
+    The 20 to 80 stars have position errors of 1 px, but the stated standard deviation is `claimed` px.
+    """
     kind = ListKind(field_deg=20.0, faintest=5.5, noise_px=1.0, false_stars=false_stars, known_deg=0.0)
     answered = 0
     for seed in range(8):
@@ -175,7 +185,10 @@ def test_points_that_contradict_their_uncertainties_give_no_attitude_unless_most
 
 
 def test_stars_seen_as_two_points_each_widen_the_attitude_by_their_distance() -> None:
-    """Each star appears twice, 4 px on either side of its true position."""
+    """If each star appears as two points, the uncertainty of the attitude covers the distance of the points.
+
+    The points are 4 px on either side of the true position.
+    """
     kind = ListKind(field_deg=20.0, faintest=5.5, noise_px=0.1, false_stars=0, known_deg=0.0)
     part = np.array([3.2, -2.4])
     single: list[FloatArray] = []
@@ -199,7 +212,7 @@ def test_stars_seen_as_two_points_each_widen_the_attitude_by_their_distance() ->
     assert np.max(np.trace(single, axis1=1, axis2=2)) < 1.0
     turn = np.array([-part[1], part[0]])  # a shift of the image along x is a rotation about y
     for covariance in double:
-        # Other points are near by chance.
+        # The tolerance allows for other points that are nearby by chance.
         np.testing.assert_allclose(covariance, np.outer(turn, turn), rtol=0.05)
 
 
@@ -212,7 +225,10 @@ def test_noise_alone_shows_no_star() -> None:
 
 
 def test_points_that_are_not_stars_are_refused_with_the_reason() -> None:
-    """The points of a real frame are moved at random; they keep their flux, but match no part of the sky."""
+    """Points that are not stars are refused with a reason.
+
+    The points of a real frame are moved at random. They keep their flux, but match no part of the sky.
+    """
     rng = np.random.default_rng(17)
     pixels = rng.normal(100.0, 10.0, (1024, 1024))
     rows, columns = np.mgrid[-4:5, -4:5]
@@ -241,7 +257,10 @@ def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
 
 @pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
 def test_a_mirrored_photograph_is_solved_and_reported_as_mirrored() -> None:
-    """The attitude is that of the unmirrored image, and the positions are those of the given image."""
+    """A mirrored photograph is solved and reported as mirrored.
+
+    The attitude is that of the unmirrored image, and the positions are those of the given image.
+    """
     upright = read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")
     camera = type(NARROW.pinhole)(upright.shape[1], upright.shape[0], 5110.0)
     good, mirrored = (
@@ -261,7 +280,7 @@ def test_a_mirrored_photograph_is_solved_and_reported_as_mirrored() -> None:
 
 _EXPOSURE = 2.0
 _TIMES = _EXPOSURE * (np.array(NODES) - 0.5)
-# Time weights, from -1 to 1, of the three weightings: mean, ends, and least-squares parabola.
+# Weights as a function of time, from -1 to 1, of three weightings: mean, ends, and least-squares parabola.
 _EVEN = np.linspace(-1.0, 1.0, 401)
 _PARABOLA = np.linalg.pinv(np.stack([np.ones(401), _EVEN, _EVEN**2], axis=1))[0]
 _WEIGHTS = {
@@ -272,7 +291,7 @@ _WEIGHTS = {
 
 
 def _turns(*powers: float) -> FloatArray:
-    """Return rotations (4, 3) about x that are a polynomial of time without a constant term."""
+    """Return rotations (4, 3) about x that are polynomials of time without a constant term."""
     angle = sum(factor * _TIMES ** (power + 1) for power, factor in enumerate(powers))
     return np.outer(angle, [1.0, 0.0, 0.0])
 
@@ -281,9 +300,10 @@ def _turns(*powers: float) -> FloatArray:
 def test_the_attitude_error_by_a_steady_acceleration_is_its_integral(
     weighting: Weighting, part: float
 ) -> None:
-    """A rotation angle a t^2 / 2, with t from -T/2 to T/2, has the mean a T^2 / 24.
+    """The attitude error of a steady acceleration is the weighted mean of the rotation angle.
 
-    The mean of its values at the two ends is a T^2 / 8, and the middle of a fitted parabola is zero.
+    A rotation angle a t^2 / 2, with t from -T/2 to T/2, has the mean a T^2 / 24. The mean of its values at
+    both ends is a T^2 / 8, and the middle of a fitted parabola is zero.
     """
     acceleration = 0.3
     off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), np.zeros((3, 3)), _EXPOSURE)
@@ -307,7 +327,10 @@ def test_the_nodes_represent_the_whole_exposure(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_the_scatter_by_white_acceleration_agrees_with_the_covariance(name: str) -> None:
-    """In 4,000 random exposures, the acceleration is integrated twice. The variance is accurate to 10 %."""
+    """The attitude error of a white acceleration agrees with the covariance.
+
+    In 4,000 random exposures, the acceleration is integrated twice. The variance is accurate to 10 %.
+    """
     weighting, fine = _WEIGHTS[name]
     density, steps, trials = 0.03, 200, 4000
     step = 0.5 * _EXPOSURE / steps
@@ -340,9 +363,10 @@ def test_the_kind_of_motion_determines_the_time_weighting() -> None:
 def test_a_distorted_photograph_is_solved_within_its_claim_or_refused(
     name: str, aspect: float, shear: float, tangential: float
 ) -> None:
-    """The truth is the solution of the original photograph.
+    """A distorted photograph is solved within its uncertainty, or refused.
 
-    The distortion does not displace the image centre.
+    The truth is the solution of the original photograph, as the distortion does not displace the image
+    centre.
     """
     pixels = read_image(_PHOTOGRAPHS / name)
     rows, columns = pixels.shape

@@ -1,4 +1,4 @@
-"""Tests of the steps of the frame survey against independent computations, and on frames with defects."""
+"""Tests of the survey of a frame against independent computations, and on frames with defects."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_light_is_the_integral_over_each_pixel() -> None:
 
 
 def test_the_window_s_centre_is_that_of_the_printed_sums() -> None:
-    """Equations 16 to 20 are evaluated by loops over a window of a x a pixels with its border."""
+    """The centre of a window equals that of equations 16 to 20, evaluated by loops over a x a pixels."""
     a = 7
     window = np.random.default_rng(1).uniform(0.0, 50.0, (a, a))
     window[3, 3] += 500.0
@@ -153,7 +153,10 @@ def test_a_frame_with_a_foreground_or_defects_is_solved(kind: str) -> None:
 
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are missing")
 def test_photographs_with_a_foreground_or_defects_are_solved_and_never_wrongly() -> None:
-    """With a global noise estimate and without hot-pixel repair, only 1 of 8 frames was solved."""
+    """Photographs with a foreground or with defects are solved, and never wrongly.
+
+    With a global noise estimate, and without the repair of hot pixels, only 1 of 8 frames was solved.
+    """
     chosen = [s for s in photographed(PHOTOGRAPHS) if s.pixels.size < 800_000][:2]
     kinds = ("bright third", "hot 1 %")
     spoilt = [spoilt_scene(scene, kind, n) for kind in kinds for n, scene in enumerate(chosen)]

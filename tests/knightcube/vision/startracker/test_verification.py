@@ -1,4 +1,4 @@
-"""Tests of the bound on chance matches, of tracking from a prior, and of the verification."""
+"""Tests of the bound on matches by chance, of tracking from a prior, and of the verification."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def _chance(observed: int, spread: float) -> Chance:
 
 
 def test_the_bound_is_not_below_what_strewn_stars_show() -> None:
-    """Sky and image are random sets of ten stars in a unit square.
+    """Random star sets do not match by chance more often than the bound states.
 
-    All rotations and shifts at a known scale are tried. Every pair of image stars is aligned with every sky
-    pair of equal length, and the largest number of matches is counted. The frequency of five matches is
-    compared with the bound.
+    Sky and image are random sets of ten stars in a unit square. All rotations and shifts at a known scale are
+    tried: every pair of image stars is aligned with every sky pair of equal length, and the largest number of
+    matches is counted. The frequency of five matches is compared with the bound.
     """
     rng = np.random.default_rng(5)
     sigma, gate, stars, trials, reached = 0.004, 3.0, 10, 120, 0
@@ -135,9 +135,10 @@ def test_an_attitude_off_by_half_a_degree_does_not_verify() -> None:
 
 
 def test_few_stars_that_verify_near_a_prior_may_be_chance_in_the_whole_sky() -> None:
-    """The bound depends on the searched area.
+    """A few stars that verify an attitude near a prior may match by chance in the whole sky.
 
-    Four stars with large errors are sufficient in tracking, but not lost in space.
+    The bound depends on the searched area. Four stars with large errors are sufficient in tracking, but not
+    lost in space.
     """
     convinced = {"tracking": 0, "lost": 0}
     for seed in range(15):
@@ -174,5 +175,5 @@ def test_attitudes_that_are_not_numbers_match_no_star_in_any_form() -> None:
         table = SKY.stars.direction, SKY.coarse, *SKY.boxes
         given = field.direction, field.sigma, matrices, scales, *facts, expected, *table
         assert _first_match.numpy_form(*given)[0] == -1
-        # The interpreter cannot convert NaN to the index of a box.
+        # The interpreter cannot convert NaN to the index of a box of the star table.
         assert_forms_agree(_first_match, *given, interpreted=len(expected) > 0)

@@ -1,4 +1,4 @@
-"""Simulated stars imaged by lenses of which the star tracker knows only the field of view."""
+"""Simulated images of lenses of which the star tracker knows only the field of view."""
 
 from __future__ import annotations
 
@@ -30,12 +30,13 @@ _NOISE_PX = 0.1
 _FIELDS_DEG = 8.0, 30.0
 
 
-# Standard deviations of lens centre (px of 1024) and of distortion at the corner relative to the radius.
+# Standard deviations of the lens centre (px of 1024), and of the distortion at the corner relative to the
+# radius.
 LENSES = {"perfect": (0.0, 0.0), "usual": (10.0, 0.005), "poor": (25.0, 0.02)}
 
 
 def drawn_lens(kind: str, rng: np.random.Generator) -> Lens:
-    """Return a random lens of the given kind in LENSES."""
+    """Return a random lens of a kind in LENSES."""
     off, bent = LENSES[kind]
     field = math.radians(rng.uniform(*_FIELDS_DEG))
     focal_length = 0.5 * _PIXELS / math.tan(0.5 * field)
@@ -57,7 +58,7 @@ def of_the_middle(lens: Lens, attitude: FloatArray) -> FloatArray:
         lens.unit_vectors(middle + np.array([0.0, 1.0]))[0]
         - lens.unit_vectors(middle - np.array([0.0, 1.0]))[0]
     )
-    # The deviation of the two image axes from a right angle is divided equally between them, as in a fit.
+    # The deviation of the image axes from a right angle is divided equally between both axes, as in a fit.
     one, other = (side - z * (side @ z) for side in (right, down))
     x = one / np.linalg.norm(one) + np.cross(other / np.linalg.norm(other), z)
     x /= np.linalg.norm(x)
@@ -65,7 +66,7 @@ def of_the_middle(lens: Lens, attitude: FloatArray) -> FloatArray:
 
 
 def drawn(kind: str, number: int) -> tuple[FrameSolution, FloatArray]:
-    """Return the solution of a simulated image, and the true attitude (4,) of its centre."""
+    """Return the solution of a simulated image, and the true attitude (4,) of the image centre."""
     rng = np.random.default_rng([_SEED, number, *kind.encode()])
     lens, attitude = drawn_lens(kind, rng), normalise(rng.standard_normal(4))
     stars = catalogue.load()
