@@ -38,14 +38,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import UsageError
-from sim_hal.assembly import (
-    Hardware,
-    StarRenderer,
-    assemble,
-    emulated_camera,
-    fault_generator,
-    sky_objects,
-)
+from sim_hal.assembly import Hardware, StarRenderer, assemble, emulated_camera, fault_generator, sky_objects
 from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.serial_line import EmulatedSerialLine

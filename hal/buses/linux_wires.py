@@ -150,12 +150,7 @@ class PySerialPort:
                 raise TimeoutError("the output queue is full")
 
     def _open(self) -> serial.Serial:
-        return serial.Serial(
-            self._device,
-            self.baud_rate,
-            timeout=_READ_TIMEOUT_S,
-            exclusive=True,
-        )
+        return serial.Serial(self._device, self.baud_rate, timeout=_READ_TIMEOUT_S, exclusive=True)
 
     def _read(self) -> None:
         if self._failure:
@@ -231,11 +226,7 @@ class LinuxI2cBus:
     """Thread-safe I2C bus /dev/i2c-N, whose device file is reopened after a bus failure."""
 
     def __init__(
-        self,
-        device: int | str,
-        timeout_ns: int = 20_000_000,
-        patient: bool = False,
-        exclusive: bool = False,
+        self, device: int | str, timeout_ns: int = 20_000_000, patient: bool = False, exclusive: bool = False
     ) -> None:
         """Open a bus.
 

@@ -262,11 +262,7 @@ class UbloxReceiver:
     """Driver of a u-blox receiver, which implements `hal.interfaces.devices.GpsReceiver`."""
 
     def __init__(
-        self,
-        port: SerialPort,
-        clock: Clock,
-        period_ns: int = SECOND_NS,
-        earliest_ns: int = EARLIEST_NS,
+        self, port: SerialPort, clock: Clock, period_ns: int = SECOND_NS, earliest_ns: int = EARLIEST_NS
     ) -> None:
         """Prepare the driver. Raises OutOfRange for a period outside 0.1 to 60 s.
 

@@ -454,12 +454,7 @@ class BridgeCircuit:
     chip = None
 
     def __init__(
-        self,
-        address: int,
-        truth: CoilSettings,
-        generator: np.random.Generator,
-        noise: float,
-        supply: float,
+        self, address: int, truth: CoilSettings, generator: np.random.Generator, noise: float, supply: float
     ) -> None:
         """Create one bridge for each coil.
 

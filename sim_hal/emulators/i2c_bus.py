@@ -103,11 +103,7 @@ class _Fault:
 class EmulatedI2cBus:
     """An I2C bus (`hal.interfaces.wires.I2cBus`) with emulated chips, which is safe for several threads."""
 
-    def __init__(
-        self,
-        parts: Sequence[I2cPart] = (),
-        wait: Callable[[int], None] | None = None,
-    ) -> None:
+    def __init__(self, parts: Sequence[I2cPart] = (), wait: Callable[[int], None] | None = None) -> None:
         """Connect the chips.
 
         The function `wait`, if given, advances time by the timeout (ns) when the bus hangs.

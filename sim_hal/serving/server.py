@@ -28,13 +28,7 @@ from hal.buses.system import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import LATE_NS
 from knightcube.astro.arrays import FloatArray, Image
-from sim_hal.assembly import (
-    Hardware,
-    StarRenderer,
-    assemble,
-    fault_generator,
-    render_wide,
-)
+from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, render_wide
 from sim_hal.emulation import EmulatedWires
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.emulators.serial_line import PtyLine

@@ -113,8 +113,7 @@ def test_a_sensor_that_is_missing_at_the_start_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "counter"),
-    [((0.0, np.nan, 0.0), "not_finite"), ((700.0, 0.0, 0.0), "out_of_range")],
+    ("field", "counter"), [((0.0, np.nan, 0.0), "not_finite"), ((700.0, 0.0, 0.0), "out_of_range")]
 )
 def test_implausible_samples_are_counted_and_not_returned(
     field: tuple[float, float, float], counter: str

@@ -117,12 +117,7 @@ def test_a_sleeping_or_browned_out_chip_carries_no_current() -> None:
     assert rig.currents() == [0.0, 0.0, 0.0]
 
 
-@given(
-    a=PULSE,
-    b=PULSE,
-    begin=st.integers(0, 100_000_000),
-    span=st.integers(100_000, 68_100_000),
-)
+@given(a=PULSE, b=PULSE, begin=st.integers(0, 100_000_000), span=st.integers(100_000, 68_100_000))
 def test_the_chopped_charge_agrees_with_sampling_the_bridge(
     a: tuple[int, int], b: tuple[int, int], begin: int, span: int
 ) -> None:

@@ -44,11 +44,7 @@ STRUCTURES = {
     "v4l2_queryctrl": v4l2.QueryControl,
 }
 MEMBERS = [
-    (
-        "v4l2_buffer",
-        v4l2.Buffer,
-        ("bytesused", "flags", "timestamp", "sequence", "memory", "m", "length"),
-    ),
+    ("v4l2_buffer", v4l2.Buffer, ("bytesused", "flags", "timestamp", "sequence", "memory", "m", "length")),
     ("v4l2_pix_format", v4l2.PixelFormat, ("pixelformat", "field", "bytesperline", "sizeimage")),
     ("v4l2_capability", v4l2.Capability, ("card", "capabilities", "device_caps")),
     ("v4l2_format", v4l2.Format, ("fmt",)),

@@ -20,12 +20,7 @@ THESIS_COILS = (CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0), CoilWiring(4, 5,
 THESIS = CoilSettings(THESIS_COILS, supply_voltage=3.4, current_limit=0.148, stale_after=0.25)
 """Coil settings of the thesis (Sease 2013, ch. 5)."""
 UNEQUAL = dataclasses.replace(
-    THESIS,
-    coils=(
-        CoilWiring(0, 1, 23.0),
-        CoilWiring(3, 2, 17.0, sign=-1),
-        CoilWiring(8, 9, 25.0),
-    ),
+    THESIS, coils=(CoilWiring(0, 1, 23.0), CoilWiring(3, 2, 17.0, sign=-1), CoilWiring(8, 9, 25.0))
 )
 
 
@@ -39,8 +34,7 @@ class Wire:
         )
         self.monitor = EmulatedIna219(INA, clock.now_ns, self.circuit.mean_supply)
         self.bus = EmulatedI2cBus(
-            [self.chip, self.monitor],
-            wait=lambda span_ns: clock.sleep_until_ns(clock.now_ns() + span_ns),
+            [self.chip, self.monitor], wait=lambda span_ns: clock.sleep_until_ns(clock.now_ns() + span_ns)
         )
 
 

@@ -6,12 +6,7 @@ import math
 
 import pytest
 
-from hal.drivers.coils import (
-    counts_for,
-    current_step,
-    inputs_for,
-    largest_counts,
-)
+from hal.drivers.coils import counts_for, current_step, inputs_for, largest_counts
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON
 
 STEP = current_step(23.0, 3.4)

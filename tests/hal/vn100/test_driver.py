@@ -351,8 +351,7 @@ def test_impossible_values_are_counted_not_given(
 
 
 @pytest.mark.parametrize(
-    ("axis", "value", "not_finite"),
-    [(0, 36.0, 0), (2, -35.0, 0), (1, float("inf"), 1), (2, float("nan"), 1)],
+    ("axis", "value", "not_finite"), [(0, 36.0, 0), (2, -35.0, 0), (1, float("inf"), 1), (2, float("nan"), 1)]
 )
 def test_a_sample_of_which_only_the_rate_is_invalid_is_given_without_a_rate(
     axis: int, value: float, not_finite: int

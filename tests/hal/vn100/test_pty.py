@@ -32,9 +32,7 @@ COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "vn100"]
 def served(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     link = tmp_path / "vn100"
     process = subprocess.Popen(
-        [*COMMAND, "--rate-deg-s", "3", "--json", "--link", str(link)],
-        stdout=subprocess.PIPE,
-        text=True,
+        [*COMMAND, "--rate-deg-s", "3", "--json", "--link", str(link)], stdout=subprocess.PIPE, text=True
     )
     try:
         assert process.stdout is not None
@@ -254,13 +252,7 @@ def test_a_unit_that_is_unplugged_is_not_responding() -> None:
     "arguments", [["--period-s", "0"], ["--rate-deg-s", "nan"], ["--baud", "1200"], ["--foo"]]
 )
 def test_wrong_use_ends_with_status_2_and_no_traceback(arguments: list[str]) -> None:
-    done = subprocess.run(
-        [*COMMAND, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=20,
-        check=False,
-    )
+    done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert done.stdout == ""

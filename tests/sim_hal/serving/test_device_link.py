@@ -116,12 +116,7 @@ def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | Non
 def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     path = tmp_path / "facts.json"
     unit = {"lines": {"/dev/knightcube-imu": "/dev/ptmx"}, "coil_bus": "/dev/i2c-1", "camera": False}
-    gone = {
-        **unit,
-        "socket": str(tmp_path / "gone"),
-        "wide": [],
-        "utc_offset_ns": None,
-    }
+    gone = {**unit, "socket": str(tmp_path / "gone"), "wide": [], "utc_offset_ns": None}
     path.write_text(json.dumps(gone), encoding="utf-8")
     request = RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path)
     with path.open(encoding="utf-8") as held:

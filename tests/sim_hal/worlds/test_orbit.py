@@ -91,10 +91,7 @@ def test_mean_elements_written_as_an_orbit_keep_its_shape(seed: int) -> None:
     second = f"2 99999 {tilt:8.4f} {node:8.4f} 0010000 {perigee:8.4f}   0.0000 {rate:11.8f}    0"
     check = sum(int(c) if c.isdigit() else c == "-" for c in second) % 10
     orbit = OrbitSection(
-        altitude=altitude,
-        inclination_deg=tilt,
-        ascending_node_deg=node,
-        argument_of_perigee_deg=perigee,
+        altitude=altitude, inclination_deg=tilt, ascending_node_deg=node, argument_of_perigee_deg=perigee
     )
     found = misfit((first, f"{second}{check}"), orbit, "2026-03-20T12:00:00Z")
     assert "inclination" not in found
