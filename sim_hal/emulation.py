@@ -47,7 +47,7 @@ from sim_hal.settings import Simulation
 from sim_hal.worlds.world import BodyMotion, OrbitingWorld, World, orbiting
 
 if TYPE_CHECKING:
-    from sim_hal.emulators.gps import EmulatedGps, GpsErrors
+    from sim_hal.emulators.gps import EmulatedGps
     from sim_hal.emulators.power import EmulatedSolarCells
 
 _LINE_STREAM = 0x11E
@@ -225,20 +225,29 @@ def emulate_vn100(emulation: Emulation, unit: InertialUnitSection) -> Vn100Emula
     return emulator
 
 
-def gps_errors(emulation: Emulation) -> GpsErrors:
-    """Return the errors of the emulated GPS receiver."""
-    from sim_hal.emulators.gps import GpsErrors  # noqa: PLC0415 - see `sim_hal.assembly`
-
-    truth = emulation.section.orbit_devices
-    return GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
-
-
 def emulate_ublox(emulation: Emulation, gps: Gps) -> EmulatedGps:
     """Connect an emulated u-blox receiver to its serial line. Raises ConfigError if no orbit is simulated."""
     from sim_hal.emulators.gps import EmulatedGps  # noqa: PLC0415 - see `sim_hal.assembly`
 
+    return _receiver(emulation, gps, EmulatedGps)
+
+
+def emulate_nmea(emulation: Emulation, gps: Gps) -> EmulatedGps:
+    """Connect an emulated NMEA receiver to its serial line. Raises ConfigError if no orbit is simulated."""
+    from sim_hal.emulators.gps import EmulatedNmeaGps  # noqa: PLC0415 - see `sim_hal.assembly`
+
+    receiver = _receiver(emulation, gps, EmulatedNmeaGps)
+    receiver.obeys = False
+    return receiver
+
+
+def _receiver(emulation: Emulation, gps: Gps, kind: type[EmulatedGps]) -> EmulatedGps:
+    from sim_hal.emulators.gps import GpsErrors  # noqa: PLC0415 - see `sim_hal.assembly`
+
+    truth = emulation.section.orbit_devices
+    errors = GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
     world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)
-    return EmulatedGps(world, line, emulation.generator, gps_errors(emulation), emulation.start_ns)
+    return kind(world, line, emulation.generator, errors, emulation.start_ns)
 
 
 def emulate_ads1115(emulation: Emulation, section: SolarStringsSection) -> EmulatedSolarCells:
@@ -260,16 +269,6 @@ def emulate_ads1115(emulation: Emulation, section: SolarStringsSection) -> Emula
     for part in cells.parts:
         emulation.wires.i2c(section.bus).attach(part)
     return cells
-
-
-def emulate_nmea(emulation: Emulation, gps: Gps) -> EmulatedGps:
-    """Connect an emulated NMEA receiver to its serial line. Raises ConfigError if no orbit is simulated."""
-    from sim_hal.emulators.gps import EmulatedNmeaGps  # noqa: PLC0415 - see `sim_hal.assembly`
-
-    world, line = orbiting(emulation.world, "gps"), emulation.connect(gps.device, gps.baud_rate)
-    receiver = EmulatedNmeaGps(world, line, emulation.generator, gps_errors(emulation), emulation.start_ns)
-    receiver.obeys = False
-    return receiver
 
 
 def emulate_drv8830(emulation: Emulation, coils: Coils) -> BridgeCircuit:

@@ -206,7 +206,8 @@ _Answer = TypeVar("_Answer")
 
 I2C_RETRIES = 0x0701
 _TIMEOUT_UNIT_NS = 10_000_000
-_BLOCK_LIMIT = 32
+BLOCK_LIMIT = 32
+"""Maximum number of bytes in an SMBus block."""
 
 # Meanings of the kernel's fault codes (Documentation/i2c/fault-codes).
 _MEANING = {
@@ -279,7 +280,7 @@ class LinuxI2cBus:
 
     def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
         """Read `length` bytes, at most 32, from consecutive registers of a device."""
-        _check_length(length)
+        check_length(length)
         answer = self._transact(address, lambda bus: bus.read_i2c_block_data(address, register, length))
         if len(answer) != length:
             raise OSError(errno.EIO, f"{len(answer)} bytes, not {length}, from 0x{address:02x}, {self.name}")
@@ -287,7 +288,7 @@ class LinuxI2cBus:
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
         """Write at most 32 bytes to consecutive registers of a device."""
-        _check_length(len(values))
+        check_length(len(values))
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
@@ -371,9 +372,10 @@ def _how_to_find_a_bus() -> str:
     )
 
 
-def _check_length(length: int) -> None:
-    if not 1 <= length <= _BLOCK_LIMIT:
-        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to {_BLOCK_LIMIT}")
+def check_length(length: int) -> None:
+    """Raise ValueError for a number of bytes that does not fit into an SMBus block."""
+    if not 1 <= length <= BLOCK_LIMIT:
+        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to {BLOCK_LIMIT}")
 
 
 SPI_MODE, SPI_SPEED, SPI_MESSAGE = 0x40016B01, 0x40046B04, 0x40006B00

@@ -296,15 +296,10 @@ class PixelCoding:
         return columns if self.packing == "u1" else 2 * columns
 
     def image(self, data: npt.NDArray[np.uint8], columns: int, rows: int, stride: int) -> Pixels:
-        """Return the grey image (rows, columns), of uint8 or uint16, in a frame buffer.
+        """Return the grey image (rows, columns), of uint8 or uint16, in the bytes `data` (n,) of a frame.
 
-        Raises PixelError if the data are damaged, or an image of another size.
-
-        Args:
-            data: (n,) bytes of the frame.
-            columns: number of columns of the image.
-            rows: number of rows of the image.
-            stride: distance between the starts of two rows, bytes.
+        The starts of two rows are `stride` bytes apart. Raises PixelError if the data are damaged, or an
+        image of another size.
         """
         if self.is_compressed:
             return _decoded(data.tobytes(), columns, rows)

@@ -29,7 +29,6 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from threading import RLock
 from typing import Protocol, TypeVar
 
@@ -84,14 +83,7 @@ def wirings(
     signs: Sequence[int],
     limits: Sequence[float],
 ) -> Wirings:
-    """Return the wiring of the coils. Raises OutOfRange for an invalid resistance, sign or limit.
-
-    Args:
-        channels: PWM channels of the bridge inputs A and B for each coil.
-        resistance: resistance of each coil, ohm.
-        signs: +1 for each coil, or -1 for a coil whose leads are swapped.
-        limits: maximum current of each coil, A.
-    """
+    """Return the wiring of the coils from the attributes of each coil. Raises OutOfRange like CoilWiring."""
     return tuple(
         CoilWiring(a, b, ohm, sign, limit)
         for (a, b), ohm, sign, limit in zip(channels, resistance, signs, limits, strict=True)
@@ -159,12 +151,7 @@ def current_step(resistance: float, supply_voltage: float) -> float:
 
 
 def largest_counts(step: float, current_limit: float) -> int:
-    """Return the largest PWM count whose current does not exceed the limit (A), at most 4096.
-
-    Args:
-        step: mean current of one count, A.
-        current_limit: current limit, A.
-    """
+    """Return the largest count, at most 4096, within a limit (A), given the current `step` (A) of a count."""
     # The factor prevents rounding from reducing a limit that is an exact multiple of the step.
     return min(COUNTS, math.floor(current_limit / step * (1.0 + 1e-12)))
 
@@ -172,12 +159,8 @@ def largest_counts(step: float, current_limit: float) -> int:
 def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
     """Return the signed PWM count nearest to a mean current (A), and whether the current was limited.
 
-    Raises ValueError if the current is NaN.
-
-    Args:
-        current: mean current, A.
-        step: mean current of one count, A.
-        largest: largest permitted count.
+    The mean current of one count is `step` (A), and the largest permitted count is `largest`. Raises
+    ValueError if the current is NaN.
     """
     bound = largest * step
     if current > bound:
@@ -446,6 +429,9 @@ class PwmTorqueCoils:
         self._wire = threading.RLock()
         self._serving = False
         self._served = -1  # number of the last written request
+        # Newest state, and the values from which it was made.
+        self._state: CoilState
+        self._state_key: tuple[object, ...] = ()
 
     def start(self, patient: bool = False) -> None:
         """Configure the PWM chip with all outputs off.
@@ -530,21 +516,17 @@ class PwmTorqueCoils:
                 self._wire.release()
 
     def state(self) -> CoilState:
-        """Return the newest command and the last acknowledged output."""
+        """Return the newest command and the last acknowledged output; equal states share one object."""
         mailbox, outputs = self._mailbox, self._outputs
         with mailbox.lock:
-            return _state_of(
-                mailbox.command,
-                outputs.written,
-                self._signed,
-                outputs.written_ns,
-                mailbox.saturated,
-                mailbox.command_ns,
-                mailbox.stale,
-                outputs.faults,
-                outputs.error,
-                outputs.braked,
-            )
+            command, written = mailbox.command, outputs.written
+            flags = outputs.written_ns, mailbox.saturated, mailbox.command_ns, mailbox.stale
+            more = *flags, outputs.faults, outputs.error, outputs.braked
+            if (command, written, more) != self._state_key:
+                self._state_key = command, written, more
+                current = [counts * step for counts, step in zip(written, self._signed, strict=True)]
+                self._state = CoilState(np.array(command), np.array(current), *more)
+            return self._state
 
     def close(self) -> None:
         """Stop the job and set the coils to zero, while the shared bus stays open.
@@ -627,36 +609,6 @@ class PwmTorqueCoils:
                 self._served = number
                 if number == self._mailbox.number:
                     return
-
-
-@lru_cache(maxsize=4)
-def _state_of(
-    command: tuple[float, ...],
-    written: tuple[int, ...],
-    signed: tuple[float, ...],
-    written_ns: int,
-    saturated: bool,
-    command_ns: int,
-    stale: bool,
-    faults: int,
-    error: str,
-    braked: Axes,
-) -> CoilState:
-    """Return a cached driver state, so that several calls in a control cycle share one object.
-
-    The values `signed` (A) are the mean currents of one count, multiplied by the signs of the coils.
-    """
-    return CoilState(
-        command=np.array(command),
-        current=np.array([counts * step for counts, step in zip(written, signed, strict=True)]),
-        written_ns=written_ns,
-        saturated=saturated,
-        command_ns=command_ns,
-        stale=stale,
-        faults=faults,
-        error=error,
-        braked=braked,
-    )
 
 
 CONTROL, FAULT = 0x00, 0x01

@@ -117,18 +117,10 @@ class Ina219(PolledMonitor[PowerReading]):
         maximum_current: float = 0.8,
         averaged: int = 5,
     ) -> None:
-        """Start reading the monitor periodically.
+        """Start reading the monitor every `period_ns`.
 
-        Args:
-            bus: I2C bus of the monitor.
-            address: I2C address of the monitor.
-            clock: clock that runs the periodic job.
-            shunt_ohm: shunt resistance, ohm.
-            period_ns: period of reading, ns.
-            maximum_current: largest current to be measured, A.
-            averaged: number of conversions whose mean is a reading.
-
-        Raises OutOfRange for a shunt or a current outside the range of the chip.
+        The largest current to be measured is `maximum_current` (A), and a reading is the mean of `averaged`
+        conversions. Raises OutOfRange for a shunt or a current outside the range of the chip.
         """
         for quantity, value, unit in (("shunt", shunt_ohm, "ohm"), ("maximum current", maximum_current, "A")):
             if not 0.0 < value < math.inf:

@@ -264,14 +264,10 @@ class UbloxReceiver:
     def __init__(
         self, port: SerialPort, clock: Clock, period_ns: int = SECOND_NS, earliest_ns: int = EARLIEST_NS
     ) -> None:
-        """Prepare the driver. Raises OutOfRange for a period outside 0.1 to 60 s.
+        """Prepare the driver, which requests a fix every `period_ns` from the receiver on the open `port`.
 
-        Args:
-            port: open serial port.
-            clock: clock of the flight.
-            period_ns: period of the fixes that are requested, ns.
-            earliest_ns: earliest possible UTC, ns since 1970; an earlier date of the receiver is moved by
-                1024 weeks.
+        Dates before `earliest_ns` (ns since 1970) are moved by 1024 weeks. Raises OutOfRange for a period
+        outside 0.1 to 60 s.
         """
         if not 0.1 <= period_ns / SECOND_NS <= 60.0:
             raise OutOfRange(DEVICE, "period", period_ns / SECOND_NS, 0.1, 60.0, "s")
@@ -494,15 +490,11 @@ VALUE_SIZES = {1: 1, 2: 1, 3: 2, 4: 4}
 def reading_of(
     pvt: Pvt, arrival_ns: int, baud_rate: int, earliest_ns: int = EARLIEST_NS, length: int = PVT_LENGTH
 ) -> GpsReading:
-    """Return the reading of a NAV-PVT message. Raises OutOfRange for physically impossible values.
+    """Return the reading of a message with a payload of `length` bytes, received at `arrival_ns`.
 
-    Args:
-        pvt: content of the message.
-        arrival_ns: host time at which the last byte of the message was received, ns.
-        baud_rate: baud rate of the serial line.
-        earliest_ns: earliest possible UTC, ns since 1970; a date up to 1024 weeks earlier is moved forward by
-            1024 weeks, and any other date outside the 1024 weeks that follow counts as impossible.
-        length: length of the payload, bytes.
+    The earliest possible UTC is `earliest_ns`, ns since 1970. A date up to 1024 weeks earlier is moved
+    forward by 1024 weeks, and any other date outside the 1024 weeks that follow counts as impossible. Raises
+    OutOfRange for physically impossible values.
     """
     _require(
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),

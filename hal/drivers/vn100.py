@@ -248,17 +248,10 @@ class Recovery:
     def advance(
         self, now_ns: int, readings: int, sentences: Sequence[Sentence], packets: int, received: int
     ) -> None:
-        """Advance the recovery by one poll.
+        """Advance the recovery by one poll, in which `sentences` and a number of `readings` were received.
 
-        Args:
-            now_ns: current time, ns.
-            readings: number of readings received in this poll.
-            sentences: ASCII sentences received in this poll.
-            packets: number of valid packets since the start of the driver, including those with unknown
-                fields.
-            received: number of bytes received since the start of the driver.
-
-        Raises NotResponding if the port is lost.
+        Since the start of the driver, `received` bytes and `packets` valid packets, including those with
+        unknown fields, have been received. Raises NotResponding if the port is lost.
         """
         if self._reading_ns is None:
             self._reading_ns = now_ns
@@ -416,12 +409,9 @@ class ReadingConverter:
     """
 
     def __init__(self, settings: Vn100Settings, byte_ns: float, on_reset: Callable[[], None]) -> None:
-        """Use the given settings.
+        """Use the settings of the driver and the transmission time of one byte, `byte_ns`.
 
-        Args:
-            settings: settings of the driver.
-            byte_ns: transmission time of one byte on the serial line, ns.
-            on_reset: function that is called if the unit has restarted or has wrong settings.
+        The function `on_reset` is called if the unit has restarted or has wrong settings.
         """
         self.resets = 0
         self.out_of_range = 0
@@ -518,10 +508,7 @@ class ReadingConverter:
     def check_for_others(self, items: Sequence[BinaryPacket | AsciiLine], foreign: int, now_ns: int) -> None:
         """Detect a unit that sends an output that was not requested.
 
-        Args:
-            items: packets and lines received in this poll.
-            foreign: number of packets with unknown fields received in this poll.
-            now_ns: current time, ns.
+        In this poll, the packets and lines `items` and `foreign` packets with unknown fields were received.
         """
         count = foreign + sum(map(self._is_other, items))
         if count == 0:

@@ -329,12 +329,10 @@ class StreamParser:
     """
 
     def __init__(self, byte_ns: float = 0.0, longest: int = 512) -> None:
-        """Prepare the decoder.
+        """Prepare the decoder for packets of at most `longest` bytes, each of which is sent in `byte_ns`.
 
-        Args:
-            byte_ns: transmission time of one byte on the serial line, ns.
-            longest: maximum length of a packet, bytes; a small value limits the delay of a valid packet that
-                follows noise which resembles the start of a packet.
+        A small value of `longest` limits the delay of a valid packet that follows noise which resembles the
+        start of a packet.
         """
         self.byte_ns = byte_ns
         self.bytes_received = 0
@@ -348,14 +346,10 @@ class StreamParser:
         self._previous_ns = _LONG_AGO_NS
 
     def feed(self, arrival_ns: int, data: bytes) -> list[BinaryPacket | AsciiLine]:
-        """Return the packets and lines that are completed by received data, oldest first.
+        """Return the packets and lines that are completed by `data`, whose last byte arrived at `arrival_ns`.
 
         The arrival time of a packet or line is corrected for the transmission time of the bytes that follow
         it in `data`, but is never earlier than the arrival of the previous data.
-
-        Args:
-            arrival_ns: host time at which the last byte of `data` was received, ns.
-            data: received bytes.
         """
         self.bytes_received += len(data)
         buffer = self._buffer

@@ -64,13 +64,7 @@ class OutOfRange(DeviceError):
 
 
 def check_limits(device: str, holder: object, limits: Mapping[str, tuple[float, float, str]]) -> None:
-    """Raise OutOfRange for an attribute of `holder` that is NaN or outside its limits.
-
-    Args:
-        device: name of the device in the error message.
-        holder: object with the checked attributes.
-        limits: tuple (low, high, unit) by attribute name.
-    """
+    """Raise OutOfRange for an attribute of `holder` that is NaN or outside its `limits` (low, high, unit)."""
     for name, (low, high, unit) in limits.items():
         value = getattr(holder, name)
         if not low <= value <= high:

@@ -21,23 +21,19 @@ LATE_NS = 25_000_000
 
 
 class Ticker(Protocol):
-    """Short job that a clock runs periodically, in parallel with the control loop."""
+    """Short job that a clock runs periodically, in parallel with the control loop.
 
-    @property
-    def name(self) -> str:
-        """Name of the periodic job."""
+    Attributes:
+        name: name of the periodic job.
+        period_ns: period (ns) of the job, which the method `kick` can run earlier.
+        error: exception of the last run as text, or an empty text if the run succeeded.
+        served_ns: time (ns) at which a run last succeeded, initially the time of creation.
+    """
 
-    @property
-    def period_ns(self) -> int:
-        """Period (ns) of the job. The method `kick` can run the job earlier."""
-
-    @property
-    def error(self) -> str:
-        """Exception of the last run as text, or an empty text if the run succeeded."""
-
-    @property
-    def served_ns(self) -> int:
-        """Time (ns) at which a run last succeeded, initially the time at which the ticker was created."""
+    name: str
+    period_ns: int
+    error: str
+    served_ns: int
 
     def kick(self) -> None:
         """Run the job as soon as possible, without waiting for the next period."""

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Protocol
 
+from hal.buses.linux_wires import BLOCK_LIMIT, check_length
+
 _TIMEOUT_NS = 20_000_000
-_BLOCK_LIMIT = 32
-"""Maximum number of bytes in an SMBus block."""
 
 
 class I2cPart(Protocol):
@@ -151,12 +151,12 @@ class EmulatedI2cBus:
 
     def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
         """Read `length` bytes, at most 32, beginning at a register."""
-        _check_length(length)
+        check_length(length)
         return list(self._read(address, register, length))
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
         """Write up to 32 bytes, beginning at a register."""
-        _check_length(len(values))
+        check_length(len(values))
         self.send(address, bytes((register, *values)))
 
     def exchange(self, address: int, data: bytes, count: int) -> bytes:
@@ -299,11 +299,6 @@ def _flipped(data: bytes, fault: _Fault | None, first: int) -> bytes:
     return data[:index] + bytes((data[index] ^ fault.mask,)) + data[index + 1 :]
 
 
-def _check_length(length: int) -> None:
-    if not 1 <= length <= _BLOCK_LIMIT:
-        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to {_BLOCK_LIMIT}")
-
-
 _BLOCK, _OLD_I2C_BLOCK = 5, 6
 
 FUNCTIONS = 0x00000001 | 0x00FF0000 | 0x02000000 | 0x0C000000
@@ -339,8 +334,8 @@ def smbus(
 def _block(bus: EmulatedI2cBus, address: int, reading: bool, head: bytes, size: int, data: bytes) -> bytes:
     """Execute a block transfer; an SMBus block on the bus begins with its length, an I2C block does not."""
     # The obsolete transfer code for I2C block reads always reads a block of the maximum length.
-    length = _BLOCK_LIMIT if size == _OLD_I2C_BLOCK and reading else data[0]
-    if not 1 <= length <= _BLOCK_LIMIT:
+    length = BLOCK_LIMIT if size == _OLD_I2C_BLOCK and reading else data[0]
+    if not 1 <= length <= BLOCK_LIMIT:
         raise OSError(errno.EINVAL, f"a block of {length} bytes")
     if reading:
         (given,) = bus.transfer([Message(address, head), Message(address, count=length)])

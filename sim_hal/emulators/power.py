@@ -213,15 +213,19 @@ class SolarCellsModel:
         share = float(sunlit_share(position, sun)) * (ASTRONOMICAL_UNIT / distance) ** 2
         normals = self.normals @ body
         light = share * self._accepted(normals @ to_sun / distance)
-        light = light + self._earthlight(normals, position, sun)
-        noise = self.noise * generator.standard_normal(len(self.peaks))
-        # The diode of a solar string blocks reverse current.
-        return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
+        rays, ground, solid = _ground_in_view(position)
+        lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
+        earthlight = self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit)
+        return self._produced(light + earthlight, generator)
 
     def in_lamplight(self, lamp: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return the currents (n,), A, while a lamp shines onto the panel with the normal `lamp` (3,)."""
-        light = LAMP * (self.normals @ lamp > math.cos(math.radians(5.0)))
+        return self._produced(LAMP * (self.normals @ lamp > math.cos(math.radians(5.0))), generator)
+
+    def _produced(self, light: FloatArray, generator: np.random.Generator) -> FloatArray:
+        """Return the currents (n,), A, in the light (n,), relative to sunlight at normal incidence."""
         noise = self.noise * generator.standard_normal(len(self.peaks))
+        # The diode of a solar string blocks reverse current.
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
@@ -229,12 +233,6 @@ class SolarCellsModel:
         grazing = math.sin(self.grazing)
         dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
         return np.asarray(np.maximum(dimmed, 0.0))
-
-    def _earthlight(self, normals: FloatArray, position: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the Earth's light (n,), relative to sunlight, on strings with `normals` (n, 3), ICRS."""
-        rays, ground, solid = _ground_in_view(position)
-        lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
-        return np.asarray(self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit))
 
 
 def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
