@@ -1,6 +1,9 @@
-"""Tests of the assembled hardware: an IMU in free fall, and the coils' field at its magnetometer."""
+"""Tests of a simulation section and of the assembled hardware: IMU in free fall, field of the coils."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +15,14 @@ from flight.schema.document import ConfigError
 from flight.schema.sections import Config
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
+from sim_hal import settings
 from sim_hal.clock import SimClock
 from sim_hal.emulators.vn100_sensors import Vn100Sample
 from sim_hal.rig import build_lockstep
 from sim_hal.settings import FreeBodySection, ImuNoise, TipOff, Truth, Vector
 from sim_hal.worlds.world import BodyMotion
 from tests.support.flights import demo_config, demo_world
+from tests.support.section_defaults import defaults_of
 
 BIAS = (2e-6, -1e-6, 3e-6)
 
@@ -128,3 +133,9 @@ def test_by_default_the_magnetometer_does_not_feel_them() -> None:
     alone, _ = gauss(NONE, driven=False)
     beside, _ = gauss(NONE, driven=True)
     assert beside == pytest.approx(alone, abs=1e-9)
+
+
+def test_the_defaults_are_the_published_ones() -> None:
+    """A simulation without these keys uses the defaults, so a changed default changes the interface."""
+    published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
+    assert json.loads(json.dumps(defaults_of(settings))) == published

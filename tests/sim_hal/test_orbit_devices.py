@@ -27,6 +27,7 @@ from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.assembly import assemble, wide_model
 from sim_hal.clock import SimClock
 from sim_hal.emulation import EmulatedWires
+from sim_hal.emulators.gps import GpsErrors
 from sim_hal.emulators.power import SolarCellsModel
 from sim_hal.faults.schedule import parse, put
 from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
@@ -34,6 +35,7 @@ from sim_hal.settings import FaultEntry, SkySection
 from sim_hal.star_camera.objects import aberrated, sunlit_ground_angle, view
 from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld
+from tests.hal.gps.bench_line import bench
 from tests.sim_hal.faults.benches import bench_of
 from tests.support.flights import TEXT, demo_config, demo_world
 from tests.support.orbit_devices import UTC, at_first, orbit_config, orbit_world
@@ -354,3 +356,30 @@ def test_a_scheduled_fault_unplugs_the_serial_port_so_that_the_driver_is_refused
         lock.line.host.receive()
     lock.clock.sleep_until_ns(SECOND_NS)
     assert lock.line.host.receive()
+
+
+def test_without_satellites_the_solution_is_zero_and_its_accuracy_unknown() -> None:
+    gps = bench()
+    gps.fly(2.0)
+    found = gps.gps._measure(3 * SECOND_NS)
+    assert (found.fix, found.satellites, found.horizontal, found.speed_accuracy) == (3, 11, 1, 1)
+    gps.gps.blind = True
+    empty = gps.gps._measure(4 * SECOND_NS)
+    assert (empty.longitude, empty.latitude, empty.height, empty.velocity) == (0, 0, 0, (0, 0, 0))
+    assert (empty.fix, empty.flags, empty.satellites) == (0, 0, 0)
+    assert (empty.horizontal, empty.vertical, empty.speed_accuracy) == (2**32 - 1, 2**32 - 1, 20_000)
+    assert empty.date[-1] == found.date[-1] + 1, "the clock goes on"
+
+
+@pytest.mark.parametrize("walk_time", [1.0, 4.0])
+def test_the_walk_of_the_position_keeps_its_size_and_is_correlated_over_its_time(walk_time: float) -> None:
+    errors = GpsErrors(walk=3.0, walk_time=walk_time, noise=0.0, velocity_noise=0.0)
+    wandering, exact = bench(errors), bench()
+    off = []
+    for second in range(1, 501):
+        wrong, right = (one.gps._measure(second * SECOND_NS) for one in (wandering, exact))
+        off.append((wrong.height - right.height) * 1e-3)  # height error, m
+    walk = np.array(off)
+    correlation = float(walk[1:] @ walk[:-1] / (walk @ walk))
+    assert correlation == pytest.approx(math.exp(-1.0 / walk_time), abs=0.12)
+    assert float(np.sqrt(np.mean(walk**2))) == pytest.approx(3.0, rel=0.25)

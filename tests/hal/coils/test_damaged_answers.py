@@ -13,7 +13,7 @@ from hal.drivers.current_monitors import AdsSolarStrings, Ina219, StringWiring
 from hal.drivers.gps import NAV_PVT, UbxParser, frame, reading_of, unpack_pvt
 from hal.drivers.pca9685 import Pca9685
 from hal.interfaces.errors import DeviceError, OutOfRange
-from tests.hal.gps.fixes import PVT
+from tests.hal.gps.bench_line import PVT
 from tests.manual_clock import ManualClock
 from tests.support.damaged import Files, assert_one_line, chances, offer
 

@@ -1,4 +1,4 @@
-"""An emulated GPS receiver in orbit and its driver, connected by a serial line in memory."""
+"""An emulated GPS receiver in orbit with its driver on a serial line in memory, and a position fix."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.drivers.gps import UbloxReceiver
+from hal.drivers.gps import Pvt, UbloxReceiver
 from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock, TimedSimulation
@@ -43,3 +43,20 @@ def bench(errors: GpsErrors = EXACT, baud_rate: int = 115200) -> GpsBench:
     gps = EmulatedGps(body, line.device, np.random.default_rng(2), errors)
     clock.attach(TimedSimulation(body.advance_to, [gps]))
     return GpsBench(clock, body, line, gps, UbloxReceiver(line.host, clock))
+
+
+PVT = Pvt(
+    date=(2026, 3, 20, 12, 34, 56),
+    nano=-123_456,
+    valid=0b111,
+    fix=3,
+    flags=1,
+    satellites=9,
+    longitude=-1_234_567_890,
+    latitude=456_789_012,
+    height=500_123_456,
+    horizontal=2_500,
+    vertical=4_000,
+    velocity=(-7_123_456, 2_345_678, -123),
+    speed_accuracy=55,
+)

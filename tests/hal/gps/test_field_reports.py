@@ -33,8 +33,7 @@ from hal.interfaces.devices import GpsReading
 from hal.interfaces.errors import OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
-from tests.hal.gps.bench_line import bench
-from tests.hal.gps.fixes import PVT
+from tests.hal.gps.bench_line import PVT, bench
 
 INPUTS = Path(__file__).resolve().parents[4] / "shared/data/inputs"
 needs_inputs = pytest.mark.skipif(

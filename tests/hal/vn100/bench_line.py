@@ -1,4 +1,4 @@
-"""A driver and an emulated VN-100, connected by a serial line in simulated time."""
+"""An emulated VN-100 for several tests, alone or with its driver on a serial line in simulated time."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hal.drivers.vn100 import Vn100, Vn100Settings
+from hal.drivers.vn100_protocol import AsciiLine, BinaryPacket, Sentence, StreamParser, build
 from hal.interfaces.devices import ImuReading
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, attitude_map
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
+from sim_hal.emulators.vn100_sensors import PROFILES
 from sim_hal.worlds.world import BodyMotion, about_thread
 
 MISSION = Vn100Settings(
@@ -82,3 +84,35 @@ def bench_line(
     unit = Vn100Emulator(sense, line.device, rng, replace(unit_settings or Vn100EmulatorSettings()))
     clock.attach(Alone(unit))
     return BenchLine(clock, line, unit, Vn100(line.host, clock, settings))
+
+
+class Bench:
+    """An emulated VN-100 on a serial line, and a host that reads the bytes of the line."""
+
+    def __init__(self, unit: Vn100EmulatorSettings | None = None) -> None:
+        rng = np.random.default_rng(2)
+        self.now_ns = 0
+        self.line = EmulatedSerialLine(lambda: self.now_ns, 115200, rng)
+        self.unit = Vn100Emulator(
+            lambda t: about_thread(t, 0.3, 0.02, 4.5e-4),
+            self.line.device,
+            rng,
+            unit or Vn100EmulatorSettings(noise=PROFILES["none"]),
+        )
+        self.parser = StreamParser()
+
+    def run(self, seconds: float) -> list[BinaryPacket | AsciiLine]:
+        """Return all bytes that the VN-100 sends in a given time."""
+        self.now_ns += round(seconds * 1e9)
+        self.unit.advance(self.now_ns)
+        return [item for at, data in self.line.host.receive() for item in self.parser.feed(at, data)]
+
+    def exchange(self, line: bytes, seconds: float = 0.02) -> list[Sentence]:
+        """Return the sentences that arrive after a command was sent."""
+        self.line.host.send(line)
+        return [item.sentence for item in self.run(seconds) if isinstance(item, AsciiLine)]
+
+    def quiet(self) -> Bench:
+        """Pause the unit's asynchronous output."""
+        self.exchange(build("ASY", 0), 0.05)
+        return self

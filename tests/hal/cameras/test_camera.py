@@ -1,8 +1,10 @@
-"""Tests of pixel formats against the byte layouts in the kernel's documentation."""
+"""Tests of the camera service, which never lets the loop wait, of its frame sources, and of pixel formats."""
 
 from __future__ import annotations
 
 import io
+import itertools
+import threading
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,157 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from hal.drivers.camera import PIXEL_FORMATS, PixelError
-from hal.interfaces.errors import NotResponding, Refused
+from hal.buses.system import SystemClock
+from hal.drivers.camera import PIXEL_FORMATS, CameraCounts, FrameNumbers, PixelError, ServedCamera
+from hal.interfaces.devices import Frame
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 from tests.hal.cameras.ioctl_camera import IoctlCamera
-from tests.hal.cameras.rig import settled, video_rig
+from tests.hal.cameras.rig import EXPOSURE_NS, Rig, settled, video_rig
 from tests.manual_clock import ManualClock
+
+WAIT_S = 5.0
+
+
+class SlowCamera:
+    """A camera whose exposures hang until they are released."""
+
+    def __init__(self) -> None:
+        self.name = "slow"
+        self.counts = CameraCounts()
+        self.begun = threading.Event()
+        self.go = threading.Event()
+        self._frame: Frame | None = None
+
+    def open(self) -> None:
+        pass
+
+    def check(self, exposure_ns: int) -> None:
+        if exposure_ns < 0:
+            raise OutOfRange(self.name, "exposure", exposure_ns * 1e-9, 0.0, 1.0, "s")
+
+    def expose(self, exposure_ns: int, trigger_ns: int) -> None:
+        self.begun.set()
+        assert self.go.wait(WAIT_S)
+        self._frame = Frame(1, trigger_ns, exposure_ns, trigger_ns + exposure_ns, np.zeros((4, 4), np.uint8))
+
+    def collect(self) -> Frame | None:
+        frame, self._frame = self._frame, None
+        return frame
+
+    def close(self) -> None:
+        pass
+
+
+def test_neither_trigger_nor_poll_waits_for_a_camera_that_hangs() -> None:
+    device, clock = SlowCamera(), SystemClock()
+    camera = ServedCamera(device, clock)
+    camera.trigger(1_000_000)
+    assert device.begun.wait(WAIT_S)
+    # The job now waits inside the camera. If the job held a lock, the following calls would block forever.
+    camera.trigger(2_000_000)
+    assert camera.poll() is None
+    device.go.set()
+    deadline_ns = clock.now_ns() + round(WAIT_S * 1e9)
+    while (frame := camera.poll()) is None and clock.now_ns() < deadline_ns:
+        clock.sleep_until_ns(clock.now_ns() + 1_000_000)
+    assert frame is not None
+    assert frame.exposure_ns == 2_000_000
+    assert camera.counts.delivered == 1, "the first was abandoned"
+    camera.close()
+
+
+def test_a_closed_camera_answers_nothing() -> None:
+    camera = ServedCamera(SlowCamera(), SystemClock())
+    camera.close()
+    with pytest.raises(NotResponding, match="was closed"):
+        camera.trigger(1)
+    with pytest.raises(NotResponding, match="was closed"):
+        camera.poll()
+
+
+@pytest.mark.parametrize(
+    ("counts", "numbers"),
+    [
+        ([5, 6, 9], [5, 6, 9]),
+        ([98, 99, 0, 1], [98, 99, 100, 101]),
+        ([7, 7, 7], [7, 7, 7]),
+        ([7, 5, 8], [7, 5, 8]),
+        ([99, 0, 99, 0], [99, 100, 199, 200]),
+    ],
+)
+def test_frame_numbers_go_on_where_the_count_wraps(counts: list[int], numbers: list[int]) -> None:
+    frames = FrameNumbers(100)
+    assert [frames.number(count) for count in counts] == numbers
+
+
+def test_frame_numbers_go_on_where_the_camera_begins_again() -> None:
+    frames = FrameNumbers(100)
+    first = [frames.number(count) for count in (0, 1, 2)]
+    frames.begin_again()
+    assert first + [frames.number(count) for count in (0, 1)] == [0, 1, 2, 3, 4]
+
+
+PATIENCE_NS = 400_000_000
+
+
+def test_nothing_comes_untriggered(rig: Rig) -> None:
+    assert rig.source.poll() is None
+    assert rig.frame_within(PATIENCE_NS) is None
+
+
+def test_a_trigger_gives_exactly_one_frame_exposed_after_it(rig: Rig) -> None:
+    trigger_ns = rig.clock.now_ns()
+    frame = rig.next_frame()
+    assert frame.exposure_start_ns >= trigger_ns
+    assert frame.exposure_ns == EXPOSURE_NS
+    assert frame.exposure_start_ns + EXPOSURE_NS <= frame.arrival_ns <= rig.clock.now_ns()
+    assert rig.frame_within(PATIENCE_NS) is None, "one trigger, one frame"
+
+
+def test_pixels_are_rows_by_columns_and_whole_numbers(rig: Rig) -> None:
+    pixels = rig.next_frame().pixels
+    assert pixels.shape == rig.shape
+    assert pixels.dtype in (np.uint8, np.uint16)
+    assert pixels.flags.c_contiguous
+
+
+def test_sequence_numbers_only_grow(rig: Rig) -> None:
+    numbers = [rig.next_frame().sequence for _ in range(6)]
+    assert all(later > earlier for earlier, later in itertools.pairwise(numbers))
+
+
+def test_a_frame_keeps_its_pixels_when_others_follow(rig: Rig) -> None:
+    first = rig.next_frame().pixels
+    as_it_came = first.copy()
+    others = [rig.next_frame().pixels for _ in range(6)]
+    assert np.array_equal(first, as_it_came)
+    assert not all(np.array_equal(first, other) for other in others)
+
+
+def test_the_frame_after_a_second_trigger_is_the_seconds(rig: Rig) -> None:
+    rig.source.trigger(EXPOSURE_NS)
+    rig.wait(EXPOSURE_NS // 4)
+    second_ns = rig.clock.now_ns()
+    frame = rig.next_frame()
+    assert frame.exposure_start_ns >= second_ns
+    assert rig.frame_within(PATIENCE_NS) is None
+
+
+def test_closing_twice_is_safe(rig: Rig) -> None:
+    rig.source.trigger(EXPOSURE_NS)
+    rig.source.close()
+    rig.source.close()
+
+
+def test_a_camera_that_is_gone_does_not_answer_the_trigger(rig: Rig) -> None:
+    if rig.unplug is None:
+        pytest.skip("Aravis' Fake camera cannot be unplugged")
+    rig.next_frame()
+    rig.unplug()
+    rig.wait(20_000_000)
+    with pytest.raises(NotResponding):
+        rig.source.trigger(EXPOSURE_NS)
+
 
 BAYER = [name for name, coding in PIXEL_FORMATS.items() if coding.is_bayer]
 ORDERS = {"BA81": "BGGR", "GBRG": "GBRG", "GRBG": "GRBG", "RGGB": "RGGB"}
