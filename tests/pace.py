@@ -1,6 +1,6 @@
-"""Processor time, scaled to a standard machine, so that limits also hold on slow or busy machines.
+"""Processor time scaled to a standard machine, so that time limits hold on slow or busy machines.
 
-Each measurement is divided by the time of short vector additions just before and after it.
+Each measurement is divided by the time of short vector additions just before and after the measurement.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 
 Result = TypeVar("Result")
 _warm: set[str] = set()
-"""Names of the calls that this process has made."""
+"""Names of the calls that this process has already made."""
 ORDINARY_PACE_S = 4.5e-4
-"""Processor time (s) that `pace_s` returns on the two-core machines for which the limits are meant."""
+"""Processor time (s) that `pace_s` returns on the two-core machines for which the limits are stated."""
 
 
 def pace_s() -> float:
@@ -28,9 +28,9 @@ def pace_s() -> float:
 
 
 def warm_call(name: str, call: Callable[[], Result]) -> tuple[Result, float]:
-    """Return the result of `call` and its processor time (s), without the loading of code.
+    """Return the result of `call` and its processor time (s), which excludes the loading of code.
 
-    The first call of this `name` in a process loads modules and compiled kernels, so it is made twice.
+    The first call of a `name` in a process loads modules and compiled functions, so it is repeated.
     """
     if name not in _warm:
         _warm.add(name)
@@ -41,7 +41,7 @@ def warm_call(name: str, call: Callable[[], Result]) -> tuple[Result, float]:
 
 
 def ordinary_seconds(work: Callable[[], object], runs: int = 3) -> float:
-    """Return the smallest processor time (s) of several runs of `work`, scaled down on a slower machine."""
+    """Return the smallest processor time (s) of several runs of `work`, scaled to the standard machine."""
     spans = []
     for _ in range(runs):
         before = pace_s()

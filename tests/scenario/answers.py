@@ -1,4 +1,4 @@
-"""Replies to commands during a simulated flight, for several tests."""
+"""Replies to commands in a simulated flight, shared by several tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.flights import Rigged, fly
 
 
 class Script:
-    """A command channel that delivers given datagrams at given times and stores the replies."""
+    """A command channel that delivers given datagrams at given times, and stores the replies to them."""
 
     name = "socket"
 
@@ -51,6 +51,6 @@ def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
         for at, data in script:
             rigged.at(at, partial(channel.say, data))
 
-    # A timed command far in the future makes the rate group of commands run.
+    # A command scheduled far in the future makes the rate group of commands run.
     far = {"at": 1e6, "mode": "safe"}
     return fly(commanded(4.0, far), folder, prepare), channel

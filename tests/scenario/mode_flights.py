@@ -1,4 +1,4 @@
-"""Simulated flights through the modes: configurations with timed commands, and the entered modes."""
+"""Simulated flights through the modes: configurations with scheduled commands, and the entered modes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_
 def commanded(
     duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any
 ) -> TestbedConfig:
-    """Return the demonstration without camera, with timed commands and short timeouts."""
+    """Return the demonstration without a camera, with scheduled commands and short timeouts."""
     config = demo_config(duration, camera=False)
     timeline = tuple(CommandStep(**step) for step in steps)
     section = configuration.replace(config.modes, initial=initial, **{**BRIEF, **modes})
@@ -42,7 +42,7 @@ def modes_of(run: Run) -> list[Mode]:
 
 
 def entered(run: Run, mode: Mode, occurrence: int = -1) -> float:
-    """Return the mission time (s) at which a run entered a mode, by default for the last time."""
+    """Return the mission time (s) at which a run entered a mode, by default the last such time."""
     return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][occurrence]) * 1e-9
 
 
@@ -59,5 +59,5 @@ def true_angle(run: Run) -> FloatArray:
 
 
 def released(q2: float, rate: float) -> Simulation:
-    """Return the demonstration's world, in which the body is released at `q2` with `rate` (rad/s)."""
+    """Return the world of the demonstration with a body that is released at `q2` with `rate` (rad/s)."""
     return configuration.replace(demo_world(), release=Release(q2=q2, rate=rate))

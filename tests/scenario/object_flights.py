@@ -1,4 +1,4 @@
-"""Simulated flights with space objects in the camera's field, for several tests."""
+"""Simulated flights with space objects in the camera's field of view, shared by several tests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HELD = np.array([0.0, 0.2, 0.0, np.sqrt(0.96)])
 
 
 def flight_with_objects(folder: Path, objects: tuple[SkyObject, ...], duration: float = _DURATION) -> Run:
-    """Return the run of a body at rest that exposes a frame of 0.2 s each second."""
+    """Return the run of a body at rest whose camera exposes a frame of 0.2 s each second."""
     config = demo_config(duration)
     world = demo_world()
     assert config.camera is not None
@@ -34,7 +34,7 @@ def flight_with_objects(folder: Path, objects: tuple[SkyObject, ...], duration: 
 
 
 def _line(across_deg: float, rate_deg: float, towards_deg: float) -> LineOfSight:
-    """Return the line of sight to an object with an initial offset from the boresight along camera x."""
+    """Return the line of sight to an object that begins off the boresight along camera x."""
     angle = np.radians(across_deg)
     seen = np.array([np.sin(angle), 0.0, np.cos(angle)]) @ attitude_matrix(_HELD)
     return LineOfSight(
@@ -52,7 +52,7 @@ _BRIGHTNESS = (3.0, 4.5)
 
 
 def two_objects() -> tuple[SkyObject, ...]:
-    """Return an object on either side of the boresight."""
+    """Return two objects, one on either side of the boresight."""
     pairs = zip(_BRIGHTNESS, _LINES, strict=True)
     return tuple(SkyObject(magnitude=m, line_of_sight=line) for m, line in pairs)
 
@@ -61,7 +61,7 @@ _PIXEL = np.radians(20.0) / 1024
 
 
 def _place(line: LineOfSight, time: FloatArray) -> FloatArray:
-    """Return an object's true directions (n, 3), by definition of right ascension and position angle."""
+    """Return the true directions (n, 3) of an object, by definition of right ascension and position angle."""
     ra, dec = np.radians([line.right_ascension_deg, line.declination_deg])
     start = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])

@@ -1,4 +1,4 @@
-"""Configurations and worlds of short orbit runs for several tests."""
+"""Configurations and worlds of short orbit runs, shared by several tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TEXT = ORBIT.read_text(encoding="utf-8")
 
 
 def orbit_config(duration: float, **modes: object) -> OrbitConfig:
-    """Return the configuration without its wide cameras, which `test_wide_cameras` flies."""
+    """Return the configuration without horizon cameras, which only `test_wide_cameras` simulates."""
     config = configuration.replace(as_orbit(configuration.load(ORBIT)), wide_cameras=())
     section = configuration.replace(config.modes, **modes)
     return configuration.replace(config, duration=duration, modes=section)
@@ -41,7 +41,7 @@ def speed(run: Run) -> FloatArray:
 
 
 NEAR_REST = 0.00524
-"""Initial rate (rad/s), 0.3 deg/s, below the rate at which detumbling ends."""
+"""Initial rate (rad/s), 0.3 deg/s, which is below the rate at which detumbling ends."""
 
 
 DURATION, ACQUIRED = 62.0, 28.0
@@ -56,7 +56,7 @@ MUTE = FaultEntry(fault="gps: off", at=35.0, span=60.0)
 
 
 def skyward() -> Simulation:
-    """Return the world with body -y normal to the orbit; the star camera's boresight is 22 deg above -y."""
+    """Return a world with body -y normal to the orbit. The star camera's boresight is 22 deg above -y."""
     section = world(NEAR_REST, MUTE)
     craft = section.free_body
     assert craft is not None

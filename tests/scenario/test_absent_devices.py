@@ -1,4 +1,4 @@
-"""Tests that a board with a missing device waits in BOOT with zero coil current until the device appears."""
+"""Tests that a board waits in BOOT with zero coil current until all its devices are present."""
 
 from __future__ import annotations
 

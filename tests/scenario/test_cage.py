@@ -1,4 +1,4 @@
-"""Tests of a slew in the coil cage with the field almost along body x, where coil x has no useful torque."""
+"""Tests of a slew in the coil cage with the field nearly along body x, so that coil x has little torque."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _cage() -> tuple[Config, Simulation]:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return the first 40 s of a slew from q2 = 0.2, with a release rate of -0.1 rad/s, to q2 = -0.3."""
+    """Return the first 40 s of a slew from q2 = 0.2, with an initial rate of -0.1 rad/s, to q2 = -0.3."""
     config, section = _cage()
     return fly(config, tmp_path_factory.mktemp("cage"), section=section)
 
@@ -43,10 +43,13 @@ def test_the_slew_ends_where_it_should_by_both_coils(flown: Run) -> None:
 
 
 def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) -> None:
-    """By the table of `OrbitField`, the initial field, 0.225 mT, is 67 deg from -z. The body is at 23 deg."""
+    """The magnetometer measures the field of the cage, rotated by the attitude of the body.
+
+    By the table of `OrbitField`, the initial field of 0.225 mT is 67 deg from -z. The body is at 23 deg.
+    """
     field = flown["imu"]["field"][0].astype(float)
     assert np.hypot(field[0], field[2]) == pytest.approx(2.25e-4, rel=0.05)
-    # In the axes of the body, the direction of the field changes by the angle by which the body rotated.
+    # In body axes, the direction of the field changes by the angle of the body's rotation.
     towards = np.degrees(np.arctan2(field[0], -field[2]))
     assert towards == pytest.approx(67.0 + np.degrees(2.0 * np.arcsin(0.2)), abs=3.0)
 

@@ -1,4 +1,4 @@
-"""Tests that faulty or late camera frames and a slow worker are reported, and such frames are not used."""
+"""Tests that faulty or late camera frames and a slow worker are reported, and the frames are not used."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
 def test_what_is_late_is_reported_with_the_next_frame(
     fault: str, event: str, within: float, tmp_path: Path
 ) -> None:
-    """The camera exposes a frame every 2 s."""
+    """A late result is reported at the next frame. The camera exposes a frame every 2 s."""
     run = flown(tmp_path, "hold", fault)
     assert AT < event_time(run, event) < AT + within
     assert "task-failed" not in event_names(run)

@@ -1,4 +1,4 @@
-"""Tests that every command in flight is executed or refused, each time with an event and a reply."""
+"""Tests that each command in flight is executed or refused, with an event and a reply."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Tests that the coils are at zero within 0.1 s of a loss of control, and that control recovers.
+"""Tests that the coil current is zero 0.1 s after a loss of control, and that control recovers.
 
-Control is lost as soon as readings stop, are incomplete, or contradict the estimate. Control by detumbling,
-which uses only the magnetometer, is lost as soon as readings stop. The current of the simulated coil circuit
-is checked every millisecond after the fault.
+Control is lost if readings stop, are incomplete, or contradict the estimate. Detumbling, which uses only the
+magnetometer, is lost only if readings stop. The current of the simulated coil circuit is checked every
+millisecond after the fault.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SILENT_AT = 3.0
 WITHIN = 0.1
 CYCLE = 0.025
 ZERO = 1e-3
-"""Largest current (A) that counts as zero."""
+"""Largest current (A) that is accepted as zero."""
 
 Break = Callable[[Rigged], None]
 
@@ -48,15 +48,15 @@ def in_the_unit(alter: Callable[[Vn100Sample], Vn100Sample] | None) -> Break:
 
 
 def elsewhere(seen: Vn100Sample) -> Vn100Sample:
-    """Return a sensor sample that contradicts any estimate."""
+    """Return a reading that contradicts any estimate."""
     turn = from_rotation_vector(np.array([0.0, 0.2, 0.0]))
     return replace(seen, quaternion=multiply(turn, seen.quaternion), rate=seen.rate + 0.1)
 
 
 def shifted(seen: Vn100Sample, by: float) -> Vn100Sample:
-    """Return a sample with `by` added to rate (rad/s) and field.
+    """Return a reading with `by` added to the rate (rad/s) and to the field.
 
-    The field is altered too, because a missing rate alone does not end control.
+    The field is changed too, because control continues without a rate.
     """
     return replace(seen, rate=seen.rate + by, mag=seen.mag + by)
 
@@ -83,7 +83,7 @@ def slewing(duration: float) -> TestbedConfig:
         (thesis_config, -0.1, tuple(LOSSES)),
         (lambda duration: commanded(duration, initial="hold"), -0.1, tuple(LOSSES)),
         (slewing, -0.1, tuple(LOSSES)),
-        # Readings that the filter rejects suffice for detumbling.
+        # For detumbling, readings that the filter rejects are sufficient.
         (lambda duration: commanded(duration, initial="detumble"), 0.45, tuple(LOSSES)[:-1]),
     ],
     ids=["demonstration", "thesis", "hold", "slew", "detumble"],
@@ -91,7 +91,7 @@ def slewing(duration: float) -> TestbedConfig:
 def test_whatever_takes_the_readings_away_no_coil_carries_current_a_tenth_of_a_second_later(
     tmp_path: Path, configured: Callable[[float], TestbedConfig], rate: float, losses: tuple[str, ...]
 ) -> None:
-    # The worst cases are a loss just after a reading, and just after the start of a detumbling window.
+    # The worst cases are a loss just after a reading, and a loss just after the start of a detumbling window.
     begins = {name: 3.126 + 1.5 * place for place, name in enumerate(losses)}
     carried: dict[str, list[float]] = {name: [] for name in losses}
 
@@ -146,7 +146,10 @@ def test_a_hold_that_is_declared_impossible_ends_at_once(tmp_path: Path) -> None
 
 
 def test_with_the_planner_gone_and_no_readings_nothing_is_flown_to_its_end(tmp_path: Path) -> None:
-    """A planned path is tracked only while readings arrive; without readings no coil is driven."""
+    """If the readings stop, no coil is driven along a planned path, even without a planner.
+
+    A planned path is tracked only while readings arrive.
+    """
     run = fly(thesis_config(6.0), tmp_path, silence, planner_latency=0.9)
     assert run["plan"]["accepted"].tolist() == [1]
     assert currents(run, SILENT_AT - 0.5, SILENT_AT).max() > ZERO
@@ -165,10 +168,10 @@ def test_with_the_planner_gone_and_no_path_the_coils_stay_at_zero(tmp_path: Path
 def test_the_demonstration_is_completed_within_its_limits_after_five_seconds_without_the_unit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Control is lost in the middle of a step, which is the worst case.
+    """After five seconds without IMU readings, the demonstration is completed within its limits.
 
-    The limits of Sease 2013, Table 5.3, apply to the next step. The steady state is the last 10 s of each
-    step.
+    Control is lost in the middle of a step, which is the worst case. The limits of Sease 2013, Table 5.3,
+    apply to the next step. The steady state is the last 10 s of each step.
     """
     monkeypatch.setattr(report_steps, "STEADY_STATE_S", 10.0)
     config = demo_config(57.0, camera=False)

@@ -1,8 +1,9 @@
-"""Tests of the thesis's step demonstration with the documented command.
+"""Tests of the thesis's step demonstration, run by the documented command.
 
 The demonstration lasts 700 s, and is mostly at rest: each of its seven steps settles within 9 s, and the
-attitude is then held for 91 s. The tests fly the same steps every 30 s, with the same phase to the camera.
-An error that appears only after 210 s, or after 30 s at one target, is found by the command `make demo` only.
+attitude is then held for 91 s. In the tests, the same steps begin every 30 s, with the same phase relative to
+the camera frames. An error that appears only after 210 s, or after 30 s at one target, is found only by the
+command `make demo`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ ROOT = CONFIG.parents[1]
 STARTS = tuple(step.at for step in demo_config(700.0).steps)
 """Start times (s) of the demonstration's steps."""
 HELD = 30.0
-"""Interval (s) of the steps in these tests, of which the last `RESTING` s are rest."""
+"""Duration (s) of each step in these tests. The last `RESTING` s of a step are rest."""
 RESTING = 15.0
 PIXELS_PER_RAD = 2904.0
 LEAST_STREAK = 4.0
@@ -45,7 +46,7 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return the flight of the shipped configuration with all its steps, `HELD` s apart."""
+    """Return the flight of the shipped configuration with all its steps at intervals of `HELD` s."""
     folder = tmp_path_factory.mktemp("demonstration")
     text = re.sub(r"(?m)^duration: 700\.0", f"duration: {len(STARTS) * HELD}", TEXT)
     for index, start in enumerate(STARTS):
@@ -58,7 +59,7 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def summary(demonstration: Run) -> dict[str, Any]:
-    """Return the report, whose steady state is the last `RESTING` s of each step."""
+    """Return the report. The steady state of each step is its last `RESTING` s."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(steps, "STEADY_STATE_S", RESTING)
         return report.summarise(demonstration)
@@ -66,7 +67,7 @@ def summary(demonstration: Run) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def power(demonstration: Run) -> dict[str, float]:
-    """Return the mean powers (W) of the 700 s: each step lasts 70 s longer, at the power of its rest."""
+    """Return the mean powers (W) over 700 s. Each step then lasts 70 s longer, at the power of its rest."""
     coils = coil_power(demonstration)
     assert coils is not None
     measured = {
@@ -97,7 +98,10 @@ def test_it_is_flown_whole_with_every_cycle_and_no_alarm(demonstration: Run) -> 
 def test_it_keeps_within_table_5_3_on_the_true_attitude(
     summary: dict[str, Any], power: dict[str, float]
 ) -> None:
-    """Limits of Sease 2013, Table 5.3: 4.5 deg, 20 %, 8 s and 30 s, with a mean supply power below 0.10 W."""
+    """The true attitude stays within the limits of Sease 2013, Table 5.3: 4.5 deg, 20 %, 8 s and 30 s.
+
+    The mean supply power is below 0.10 W.
+    """
     assert summary["attitude_source"] == "truth"
     found, planner = summary["steps"], summary["planner"]
     assert planner["plans"] >= len(STARTS) * HELD / 5.0, "a plan every 5 s"
@@ -112,9 +116,10 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(
 
 @pytest.mark.slow
 def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any], power: dict[str, float]) -> None:
-    """The errors are those of the true attitude relative to the target, with all simulated noise.
+    """The demonstration is nearly as good as the physics permits, with all simulated noise.
 
-    R I^2 is compared with the true plant's optimum.
+    The errors are those of the true attitude relative to the target. R I^2 is compared with the optimum of
+    the true plant.
     """
     found = summary["steps"]
     assert max(step["steady_state_deg"] for step in found) <= 0.05
@@ -133,7 +138,10 @@ def test_no_coil_ever_carries_more_than_its_limit(demonstration: Run) -> None:
 
 @pytest.mark.slow
 def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
-    """Check the fraction of angle and rate errors within 3 sigma, and rms / sigma, in 8,200 cycles."""
+    """The errors of angle and rate agree with their sigmas in 8,200 cycles.
+
+    The test checks the fraction within 3 sigma, and rms / sigma.
+    """
     run = demonstration
     control = run["control"][200:]
     truth = run["truth"][200 : len(run["control"])]
@@ -148,12 +156,15 @@ def test_the_estimate_is_as_good_as_it_says(demonstration: Run) -> None:
 
 @pytest.mark.slow
 def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: Run) -> None:
-    """All 14 frames exposed in motion give a rate; six of the exposures begin at rest, with a step."""
+    """All 14 frames that are exposed in motion give a correct rate, which the filter uses.
+
+    Six of the exposures begin at rest and contain a step.
+    """
     _assert_streaks_right(demonstration, 14)
 
 
 def _assert_streaks_right(run: Run, moving: int) -> None:
-    """Assert that each frame exposed in motion gives an accepted rate within 1 % of the truth, and its sigma.
+    """Assert that each frame exposed in motion gives an accepted rate within 1 % and within its sigma.
 
     A chi-square per degree of freedom exceeds 2.1 (14 degrees of freedom) or 2.7 (6) with 1 % probability.
     """
@@ -175,7 +186,10 @@ def _assert_streaks_right(run: Run, moving: int) -> None:
 
 @pytest.mark.slow
 def test_every_frame_gives_an_attitude_that_the_estimate_takes(demonstration: Run) -> None:
-    """The first frame has streaks of 300 px, from the release at 0.1 rad/s."""
+    """Every frame gives an attitude that the filter accepts.
+
+    The first frame has streaks of 300 px, from the release at 0.1 rad/s.
+    """
     stars = demonstration["stars"]
     assert len(stars) == len(STARTS) * HELD / 5.0
     assert_solved(demonstration)
@@ -188,9 +202,9 @@ def test_every_frame_gives_an_attitude_that_the_estimate_takes(demonstration: Ru
 
 @pytest.mark.slow
 def test_the_star_attitudes_are_as_good_as_they_say(demonstration: Run) -> None:
-    """The mean normalised squared error has an upper bound.
+    """The mean normalised squared errors of star attitudes have an upper bound.
 
-    About the thread, the only axis that rotates, it also has a lower bound.
+    The error about the thread, the only axis that rotates, also has a lower bound.
     """
     error, covariance = star_errors(demonstration)
     about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])
@@ -204,7 +218,10 @@ def test_the_star_attitudes_are_as_good_as_they_say(demonstration: Run) -> None:
 
 @pytest.mark.slow
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
-    """The steps begin within exposures: the body is at rest for a part of them, and then accelerates."""
+    """A step within an exposure spoils no frame.
+
+    During such an exposure, the body is first at rest and then accelerates.
+    """
     config = demo_config(29.0)
     begun = tuple(
         configuration.replace(config.steps[0], at=at, q2=q2)
@@ -229,14 +246,17 @@ def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
 
 @pytest.mark.slow
 def test_the_bus_gives_the_same_charge_at_its_higher_voltage(summary: dict[str, Any]) -> None:
-    """The same current flows at 5 V (bus) and 3.4 V (coils). The bus monitor is read once a second."""
+    """The bus delivers the coils' charge at its higher voltage: 5 V instead of 3.4 V.
+
+    The bus monitor is read once a second.
+    """
     power = summary["power"]
     assert power["bus_average_w"] == pytest.approx(power["supply_average_w"] * 5.0 / 3.4, rel=0.05)
 
 
 @pytest.mark.slow
 def test_the_readme_states_the_power_that_is_measured(power: dict[str, float]) -> None:
-    """The README's mean powers (mW) at the coils, at the bus and as R I^2 must be the measured ones."""
+    """The README states the measured mean powers (mW) at the coils, at the bus and as R I^2."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     row = re.search(
         r"^\| average power from the supply.*\| 0\.10 W \| (.+) mW; (.+) mW \|$", text, re.MULTILINE

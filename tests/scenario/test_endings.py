@@ -1,4 +1,4 @@
-"""Tests that the coils are at zero however a run ends, which `tests.support.flights.fly` checks."""
+"""Tests that the coil current is zero after any end of a run, as `tests.support.flights.fly` checks."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def true_current(run: Run, since: float, until: float) -> FloatArray:
 
 
 def assert_whole(run: Run, duration: float = DURATION) -> None:
-    """Assert that all written packets are in the log, in order, up to the end of the run."""
+    """Assert that the log contains all written packets, in order, up to the end of the run."""
     for log in run.logs.values():
         assert log.intact
     assert len(run["control"]) == round(duration / 0.025)
@@ -43,7 +43,7 @@ def assert_whole(run: Run, duration: float = DURATION) -> None:
 
 
 def line(faults: LineFaults) -> Callable[[Rigged], None]:
-    """Return the function that disturbs the VN-100's serial line between BEGIN and END."""
+    """Return the function that disturbs the serial line of the VN-100 from BEGIN to END."""
 
     def prepare(rigged: Rigged) -> None:
         wire = rigged.lock.line.to_host
@@ -106,7 +106,7 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
     time = run["truth"]["time_ns"] * 1e-9
     error = np.degrees(np.abs(angle - 2 * np.arcsin(-0.3)))
     assert error[(time > 13.0) & (time < 14.0)].max() < 0.1
-    # The thread rotates the body by k theta / (2 J) t^2 = 0.17 deg in this second; the loop must stop this.
+    # Without control, the thread rotates the body by k theta / (2 J) t^2 = 0.17 deg in this second.
     assert error[time > 14.0].max() < 0.3
     assert error[time > 18.5].max() < 0.1
 
@@ -134,7 +134,7 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
         wire = rigged.lock.line.to_host
         rigged.at(BEGIN, lambda: setattr(wire, "faults", LineFaults(silent=True)))
         for k in range(100):
-            # Noise on the line needs no sender, so it arrives although the VN-100's bytes are lost.
+            # Noise on the line has no sender, so it still arrives if the VN-100's bytes are lost.
             def spark(k: int = k) -> None:
                 wire.faults = SOUND
                 wire.noise(40, rigged.lock.clock.now_ns(), 115200)
@@ -151,7 +151,10 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
 
 
 def test_a_unit_that_restarts_is_distinguished_from_noise_and_silence(tmp_path: Path) -> None:
-    """After its reset, the VN-100 sends its default ASCII lines, which are not readings."""
+    """A restart of the VN-100 is distinguished from noise and from silence.
+
+    After its reset, the VN-100 sends its default ASCII lines, which are not readings.
+    """
 
     def prepare(rigged: Rigged) -> None:
         host = rigged.lock.line.host
@@ -209,7 +212,10 @@ def test_a_bus_that_fails_is_reported_and_flown_again_when_it_is_back(tmp_path: 
 def test_a_chip_that_keeps_its_outputs_leads_the_estimate_astray_no_more_than_a_silent_one(
     tmp_path: Path,
 ) -> None:
-    """The chip acknowledges each write; for half a second the filter assumes currents that do not flow."""
+    """A PWM chip that keeps its outputs causes no larger error of the estimate than a chip that is silent.
+
+    The chip acknowledges each write. For half a second the filter assumes currents that do not flow.
+    """
     world = replace(demo_world(), faults=(FaultEntry(fault="pwm: stuck", at=1.55, span=3.0),))
     run = fly(demo_config(18.0, camera=False), tmp_path, section=world)
     names = event_names(run)
@@ -277,7 +283,10 @@ def test_a_frame_that_comes_late_is_not_accepted_as_fresh(tmp_path: Path, max_ag
 
 
 def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -> None:
-    """The loop stalls for 1 s: 40 slots are lost with one event and not made up; the currents decay."""
+    """A stall of the loop for 1 s gives one event and 40 lost slots, which are not made up.
+
+    The coil currents decay during the stall.
+    """
 
     def prepare(rigged: Rigged) -> None:
         camera, clock = rigged.lock.hardware.camera, rigged.lock.clock

@@ -22,7 +22,7 @@ SECOND = 1_000_000_000
 
 
 class Signs:
-    """Recorder of the mission times (s) of a flight's heartbeats."""
+    """Recorder of the mission times (s) of the heartbeats of a flight."""
 
     def __init__(self) -> None:
         self.fed: list[float] = []
@@ -37,7 +37,7 @@ class Signs:
 
 
 def failing(rigged: Rigged, since: float, until: float) -> None:
-    """Make the control task raise an exception in each cycle between two mission times (s)."""
+    """Make the control task raise an exception in each cycle from one mission time (s) to another."""
     host = rigged.lock.line.host
     receive = host.receive
 
@@ -117,7 +117,7 @@ def test_a_unit_that_sends_half_its_packets_is_slow(tmp_path: Path) -> None:
 
 
 def reading(memory: Callable[[float], float], rigged: Rigged) -> None:
-    """Check resources every 0.5 s, as if all processes together used `memory` bytes."""
+    """Check the resources every 0.5 s, as if all processes together used `memory` bytes."""
 
     def look(now_ns: int) -> ResourceSample:
         seconds = (now_ns - rigged.epoch_ns) / SECOND

@@ -1,4 +1,4 @@
-"""Tests that the `make` targets that start a flight work, with the commands of their recipes shortened."""
+"""Tests that the `make` targets that start a flight work, with shortened commands of their recipes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SECONDS = {"demo": 3, "cage": 3, "orbit": 3, "orbit-3u": 3, "object": 40}
 
 
 def commands_of(target: str) -> list[str]:
-    """Return the arguments of each `python -m flight` in the recipe of a target of the Makefile."""
+    """Return the arguments of each `python -m flight` in the recipe of a Makefile target."""
     recipe = re.search(rf"^{target}:.*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
     assert recipe is not None
     return re.findall(r"\$\(RUN\) -m flight (.*)", recipe.group(1))

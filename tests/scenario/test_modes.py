@@ -1,4 +1,4 @@
-"""Tests of each mode and each transition in lock-step, and of whether the coils are driven."""
+"""Tests of each mode and each transition in lock-step, and of the modes in which the coils are driven."""
 
 from __future__ import annotations
 
@@ -109,14 +109,17 @@ def test_a_slew_that_does_not_arrive_becomes_a_hold(tmp_path: Path) -> None:
 
 
 def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
-    """The body detumbles from 0.5 rad/s with coils x and z; the field is measured while the coils are off."""
+    """Detumbling reduces the rate monotonically, from 0.5 rad/s with the coils x and z.
+
+    The field is measured while the coils are off.
+    """
     run = fly(commanded(11.0, initial="detumble"), tmp_path, section=released(-0.68, 0.5))
     assert modes_of(run) == [Mode.BOOT, Mode.DETUMBLE]
     truth = run["truth"]
     time = truth["time_ns"] * 1e-9
     rate = truth["rate"][:, 1]
-    # One coil (0.096 A m^2 in 0.45 mT, on for 0.6 of the time) reduces the rate by 0.025 rad/s per second,
-    # and two coils by 1.4 times that.
+    # One coil (0.096 A m^2 in 0.45 mT, driven for 0.6 of the time) reduces the rate by 0.025 rad/s per
+    # second. Two coils reduce the rate 1.4 times faster.
     assert rate[time > 10.9].max() < 0.2
     windows = np.interp(np.arange(0.5, 11.0, 0.25), time, rate)
     assert np.diff(windows).max() < 2e-3
@@ -170,8 +173,8 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
     config = configuration.replace(config, guidance=configuration.replace(config.guidance, strategy=strategy))
     run = fly(config, tmp_path, prepare, section=released(-0.2, 0.0))
     assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
-    # In the demonstration the timeout starts at the end of its path, or after the same time without a path.
-    # In a hold it starts when the filter discards its estimate.
+    # In the demonstration, the timeout starts at the end of its path, or after the same time without a path.
+    # In a hold, the timeout starts when the filter discards its estimate.
     since = 10.0 if initial == "testbed-demo" else 4.0 + AttitudeFilter.REJECTIONS_TO_RESTART * CYCLE
     assert entered(run, Mode.SAFE) == pytest.approx(since + BRIEF["hold_patience"], abs=0.1)
     assert "hold-impossible" in event_names(run)
@@ -182,7 +185,10 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
 def test_what_the_demonstration_is_on_its_way_to_and_a_target_that_moves_are_not_impossible_to_hold(
     tmp_path: Path,
 ) -> None:
-    """For longer than a hold's timeout the error is 0.8 rad; the last target is at a distance of 0.68 rad."""
+    """A target that is being approached, or that moves, is not reported as impossible to hold.
+
+    The error is 0.8 rad for longer than the timeout of a hold. The last target is 0.68 rad away.
+    """
     config = configuration.replace(commanded(27.0), steps=(Step(at=0.0, q2=-0.2, rate=0.04),))
     run = fly(config, tmp_path)
     assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO]
@@ -241,7 +247,10 @@ def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
 def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
     tmp_path: Path, crashes: int, mode: Mode
 ) -> None:
-    """The stored state of each killed boot still states that the boot is running."""
+    """Too many recent crashes lead to SAFE, and one crash fewer does not.
+
+    A killed boot is recognised because its stored state still says that the boot is running.
+    """
     config = commanded(1.0)
     state = tmp_path / "state"
     for _ in range(crashes):
@@ -255,7 +264,7 @@ def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
 
 
 def keeper_of(folder: Path) -> StateKeeper:
-    """Return a new state keeper that stores its states in `folder`, as a flight creates it at its start."""
+    """Return a new state keeper, as a flight creates it at its start, that stores its states in `folder`."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
     return StateKeeper(

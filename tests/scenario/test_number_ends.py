@@ -22,7 +22,7 @@ from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 NEAR = (1 << 32) - 30
-"""Initial value of counters that exceed 32 bits within a second of control cycles."""
+"""Initial value of counters that exceed 32 bits within one second of control cycles."""
 FEW_LEFT = (1 << 32) - 3
 """Initial value of slower counters that exceed 32 bits during the run."""
 SLEWS = 64_535
@@ -44,7 +44,7 @@ def whole(packet: Packet) -> list[Field]:
 
 
 def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
-    """Make the log write an additional record for each integer field, with this field beyond its range."""
+    """Make the log write an additional record for each integer field, in which this field is out of range."""
     driven: Driven = {}
     for name in ("record", "time"):
         plain = getattr(Recorder, name)
@@ -121,7 +121,10 @@ def test_every_integer_of_an_orbit_may_pass_its_end(tmp_path: Path, monkeypatch:
 def test_counts_of_ten_years_neither_end_the_flight_nor_its_slews(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In three seconds each counter exceeds 32 bits, and slew numbers reach 65,535 or more."""
+    """Counts of ten years of flight end neither the flight nor its slews.
+
+    In three seconds each counter exceeds 32 bits, and slew numbers reach 65,535 or more.
+    """
     begin = RateGroup.begin
 
     def late(group: RateGroup, epoch_ns: int) -> None:

@@ -1,7 +1,7 @@
-"""Tests that a KnightCube finds an object in its frames, follows it, and keeps it while the camera is blind.
+"""Tests that a KnightCube finds an object, follows it, and predicts its motion while the camera is blind.
 
 The flight of `config/orbit_object_1u.yaml` renders frames, and runs image processing, tracking, planner and
-coils. The true motion of the object is integrated in this module.
+coils. This module integrates the true motion of the object.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from tests.support.short_arcs import flow
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_object_1u.yaml"
 DURATION, BLIND, GAP = 75.0, 48.0, 10.0
-"""Duration (s) of the run, and start and duration (s) of the camera's outage."""
+"""Duration (s) of the run, and start and duration (s) of the interval in which the camera is blind."""
 HALF_FIELD, PIXEL = 10.0, np.radians(20.0) / 512
 BORESIGHT = np.array([0.0, -1.0, 0.0])
 
@@ -43,7 +43,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def _shown(run: Run, times: FloatArray) -> FloatArray:
-    """Return the object's apparent directions (n, 3), corrected like those of stars, at times (n,), s."""
+    """Return the object's apparent directions (n, 3), corrected like star directions, at times (n,), s."""
     section = configuration.simulation_section(CONFIG.read_text(encoding="utf-8"), CONFIG.name, Simulation)
     assert section is not None
     start = section.objects[0].state
@@ -64,7 +64,7 @@ def _shown(run: Run, times: FloatArray) -> FloatArray:
 
 
 def _followed(run: Run) -> float:
-    """Return the mission time, s, at which the pursuit of the object began."""
+    """Return the mission time (s) at which the pursuit of the object began."""
     events = run["event"]
     (index,) = (k for k, name in enumerate(event_names(run)) if name == "object-followed")
     return float(events["time_ns"][index]) * 1e-9
@@ -89,7 +89,7 @@ def test_it_is_kept_in_the_field_and_followed_while_the_camera_is_off(flown: Run
     blind = (times[after] > BLIND) & (times[after] < BLIND + GAP)
     assert off[blind].max() < 4.0
     assert off[-1] < 4.0
-    # The body must rotate with the object while the camera is blind.
+    # The body must continue to rotate with the object while the camera is blind.
     turn = np.degrees(np.linalg.norm(truth["rate"][after][blind], axis=1))
     assert turn.min() > 0.3
 
@@ -105,7 +105,7 @@ def test_its_track_is_where_the_object_is_to_what_it_claims(flown: Run) -> None:
     claim = np.sqrt(0.5 * (xx + yy + zz))
     away = np.linalg.norm(track["direction"] - true, axis=1)
     assert claim.max() < 0.1 * PIXEL
-    # With two degrees of freedom, the expected mean of the normalised square is 2.
+    # With two degrees of freedom, the expected mean of the normalised squared error is 2.
     assert np.mean((away / claim) ** 2) < 4.0
 
 

@@ -1,4 +1,4 @@
-"""Tests that objects in flight are sighted, tracked and reported, and that an empty sky gives no track."""
+"""Tests that objects are detected, tracked and reported in flight, and that an empty sky gives no track."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.flights import demo_config, event_names, fly
 
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a flight with two objects in the field."""
+    """Return a flight with two objects in the field of view."""
     return flight_with_objects(tmp_path_factory.mktemp("tracked"), two_objects())
 
 
@@ -71,7 +71,7 @@ def test_a_sky_without_objects_has_no_track(tmp_path: Path) -> None:
 
 
 def test_the_measured_track_is_read_back_from_its_message(tracked: Run, tmp_path: Path) -> None:
-    """An independent reader of the standard finds the directions of the objects at their times."""
+    """An independent reader of the tracking data message finds the objects' directions at their times."""
     (path,) = write_tracking_data(tracked, tmp_path / "track.tdm")
     segments = path.read_text(encoding="ascii").split("META_START")
     assert len(segments) == 3
@@ -82,7 +82,7 @@ def test_the_measured_track_is_read_back_from_its_message(tracked: Run, tmp_path
 
 
 def _nearest_line(segment: str, zero: datetime) -> int:
-    """Return the index of the object to which a segment of the message belongs, with all of its data."""
+    """Return the index of the object to which all data of a segment of the message belong."""
     words = [row.split(" = ") for row in segment.splitlines() if " = " in row]
     header = {word[0]: word[1] for word in words if len(word[1].split()) == 1}
     assert (header["ANGLE_TYPE"], header["REFERENCE_FRAME"], header["TIME_SYSTEM"]) == (
@@ -105,7 +105,7 @@ def _nearest_line(segment: str, zero: datetime) -> int:
 
 
 def test_the_message_is_read_by_a_reader_of_other_authors(tracked: Run, tmp_path: Path) -> None:
-    """`ccsds-ndm` builds its objects from the standard's schema, and refuses content outside the schema."""
+    """The message is valid for `ccsds-ndm`, which builds its objects from the schema of the standard."""
     reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
     (path,) = write_tracking_data(tracked, tmp_path / "track.tdm")
     segments = reader.from_path(path).body.segment

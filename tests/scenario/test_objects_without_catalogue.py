@@ -1,4 +1,4 @@
-"""Tests that objects are tracked without a catalogue by the common motion of the stars."""
+"""Tests that objects are tracked without a star catalogue, by the common motion of the stars."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.flights import demo_config, demo_world, event_names, fly
 
 
 def flown(folder: Path, q2: float, seconds: float, tracker: StarTrackerSection | None = None) -> Run:
-    """Return a flight with two objects, that slews from q2 = 0.2 to `q2`."""
+    """Return a flight with two objects, which slews from q2 = 0.2 to `q2`."""
     config, world = demo_config(seconds), demo_world()
     assert config.camera is not None
     assert world.release is not None
@@ -51,7 +51,7 @@ def test_two_objects_are_tracked_through_a_slew_with_honest_claims(tmp_path: Pat
         claim = np.sqrt(0.5 * track["covariance"][:, :3].sum(axis=1))
         assert (away[own] < 3.5 * claim).all()
         assert claim.max() < 4.0 * _PIXEL, "the estimated attitude is known to some pixels"
-        # The object's rate is measured relative to the stars, so the attitude error does not affect it.
+        # The rate of the object is measured relative to the stars, so the attitude error does not matter.
         rate = np.degrees(np.linalg.norm(track["rate"], axis=1))
         sigma = np.degrees(np.sqrt(0.5 * track["rate_covariance"][:, :3].sum(axis=1)))
         assert (np.abs(rate - _LINES[own].rate_deg) < 3.5 * sigma).all()
@@ -63,7 +63,10 @@ def test_two_objects_are_tracked_through_a_slew_with_honest_claims(tmp_path: Pat
 def test_a_damaged_sky_index_leaves_detection_by_motion(
     tmp_path: Path,
 ) -> None:
-    """The file exists when the flight is opened, but its contents are not a sky index."""
+    """With a damaged sky index, objects are still detected by their motion.
+
+    The file exists when the flight is opened, but it does not contain a sky index.
+    """
     index = tmp_path / "sky.index"
     index.write_bytes(b"not an index")
     run = flown(tmp_path / "run", 0.2, 6.5, StarTrackerSection(index=str(index)))
@@ -75,7 +78,10 @@ def test_a_damaged_sky_index_leaves_detection_by_motion(
 
 @pytest.mark.slow
 def test_a_satellite_follows_an_object_without_a_star_catalogue(tmp_path: Path) -> None:
-    """A KnightCube with a coarse attitude rotates with an object that passes at 0.4 deg/s."""
+    """A satellite without a star catalogue follows an object that passes at 0.4 deg/s.
+
+    The attitude of the KnightCube is coarse.
+    """
     path, seconds = FOLDER / "orbit_object_1u.yaml", 57.0
     config = as_orbit(configuration.load(path))
     assert config.camera is not None

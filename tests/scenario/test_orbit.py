@@ -1,4 +1,4 @@
-"""Tests that a satellite in orbit detumbles by magnetometer, ends detumbling, and detumbles again."""
+"""Tests that a satellite detumbles by the magnetometer, ends detumbling, and then detumbles again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SILENT, MUTE = 20.0, 1.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Run a flight that begins with a tumble of 10 deg/s and whose IMU is silent during detumbling.
+    """Return a flight that begins with a tumble of 10 deg/s, and whose IMU is silent during detumbling.
 
     Detumbling ends at a rate above the configured tumble rate, so the flight soon detumbles again.
     """
@@ -74,7 +74,10 @@ def test_the_coils_are_at_zero_while_the_unit_is_silent(flown: Run) -> None:
 
 
 def test_the_coils_pause_while_the_magnetometer_measures(flown: Run) -> None:
-    """The magnetometer is read in the last 0.1 s of each coil pause of 0.2 s, after the current's decay."""
+    """The coils pause while the magnetometer measures.
+
+    The magnetometer is read in the last 0.1 s of each pause of 0.2 s, after the decay of the currents.
+    """
     time = flown["truth"]["time_ns"] * 1e-9
     began = entered(flown, Mode.DETUMBLE, 0)
     phase = (time - began) % 4.0

@@ -1,4 +1,4 @@
-"""Tests that a satellite acquires its attitude by star camera in a world that differs from its model."""
+"""Tests that a satellite acquires its attitude by star camera, in a world that differs from its model."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def settled(flown: Run) -> AttitudeErrors:
-    """Return the attitude errors, starting some frames after the acquisition."""
+    """Return the attitude errors from some frames after the acquisition on."""
     found = attitude_errors(flown)
     later = found.times > ACQUIRED
     return AttitudeErrors(found.times[later], found.error[later], found.sigma[later])
@@ -52,7 +52,10 @@ def test_its_star_camera_is_within_a_hundredth_of_a_degree_and_within_its_claim(
 def test_its_attitude_is_within_the_accuracy_of_the_mounting_and_within_its_claim(
     settled: AttitudeErrors,
 ) -> None:
-    """The mountings of the cameras are known to 0.1 deg about each axis."""
+    """The attitude error is within the accuracy of the mounting, and within the stated uncertainty.
+
+    The mountings of the cameras are known to 0.1 deg about each axis.
+    """
     angle = np.degrees(np.linalg.norm(settled.error, axis=1))
     assert np.sqrt(np.mean(angle**2)) < 0.15
     assert np.degrees(settled.sigma).max() < 0.06
@@ -65,7 +68,7 @@ def test_it_learns_the_biases_of_the_inertial_unit(flown: Run) -> None:
 
 
 def flown_bias(run: Run) -> np.ndarray:
-    """Return the IMU's mean gyro error (3,): its configured bias plus its random bias."""
+    """Return the mean gyro error (3,) of the IMU: its configured bias plus its random bias."""
     imu, truth = run["imu"], run["truth"]
     rates = [
         np.interp(imu["sample_time_ns"], truth["time_ns"], truth["rate"][:, axis].astype(float))
@@ -88,7 +91,10 @@ def test_the_report_shows_how_well_the_attitude_was_known(flown: Run, tmp_path: 
 
 @pytest.mark.parametrize("days", [3.0, -5.0])
 def test_a_wall_clock_that_is_days_off_is_corrected_by_the_first_fix(days: float, tmp_path: Path) -> None:
-    """The `run` packet is recorded a second time with the UTC of the GPS receiver."""
+    """The first GPS fix corrects a wall clock that is days off.
+
+    The packet `run` is recorded a second time, with the UTC of the GPS receiver.
+    """
     quiet = world(NEAR_REST, FaultEntry(fault=f"clock: stepped (by={86_400.0 * days})"))
     receiver = configuration.replace(quiet.orbit_devices, gps_start=3.0)
     config = configuration.replace(orbit_config(6.0), camera=None)

@@ -1,4 +1,4 @@
-"""Tests that a satellite with a known attitude points to its target, with coil pauses for the field."""
+"""Tests that a satellite with a known attitude points to its target, with pauses for the magnetometer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
 DURATION, SUNWARD = 52.0, 47.0
-"""Times (s): duration of the flight, and command of the mode SUN."""
+"""Duration (s) of the flight, and time (s) of the command of the mode SUN."""
 SPEED = 0.001
 """Largest initial body rate (rad/s), equal to the orbital rate."""
 WITHIN = 12.0
@@ -26,7 +26,7 @@ WITHIN = 12.0
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a flight from near rest; its target is the attitude at release, as an inertial target."""
+    """Return a flight that starts near rest. The target is the inertial attitude at the release."""
     section = skyward()
     assert section.free_body is not None
     attitude = section.free_body.release.attitude
@@ -61,7 +61,7 @@ def test_it_stays_near_its_target(flown: Run) -> None:
 
 
 def test_the_coils_act_and_pause_for_the_magnetometer(flown: Run) -> None:
-    """The coils are off for a tenth of the time, in pauses for the magnetometer."""
+    """The coils are driven, and are off for a tenth of the time in pauses for the magnetometer."""
     truth = flown["truth"]
     time = truth["time_ns"] * 1e-9
     inside = (time > entered(flown, Mode.POINT, 0) + 4.0) & (time < DURATION)
@@ -73,7 +73,7 @@ def test_no_step_of_the_coils_falls_into_an_exposure_while_it_points(flown: Run)
     packets = flown["attitude"]
     times, dipoles = packets["time_ns"].astype(np.int64), packets["dipole"]
     changed = np.abs(np.diff(dipoles, axis=0)).max(axis=1) > 0.0
-    after = times[1:][changed]  # first packets after steps of the commanded dipole; packets are 0.1 s apart
+    after = times[1:][changed]  # first packets after changes of the commanded dipole, 0.1 s apart
     frames = flown["streak"][flown["streak"]["exposure_start_ns"] > entered(flown, Mode.POINT, 0) * 1e9]
     assert len(frames) >= 3
     assert len(after) > 30

@@ -68,13 +68,13 @@ def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
     config, section = slewing(93.0, *faults)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pointing_law, "DAMPING_TIMEOUT", PATIENCE)
-        # The coil monitor is disabled, because no slew is planned with a single remaining coil.
+        # The coil monitor is disabled, because no slew is planned for a single remaining coil.
         patch.setattr(CoilMonitor, "available", property(lambda _: np.ones(3, dtype=bool)))
         return fly(config, tmp_path_factory.mktemp("crippled"), section=section)
 
 
 def at(run: Run, name: str) -> list[float]:
-    """Return the mission times (s) of all events of one name."""
+    """Return the mission times (s) of all events with a name."""
     return [float(event["time_ns"]) * 1e-9 for event in run["event"] if to_text(event["name"]) == name]
 
 
@@ -128,7 +128,10 @@ def test_a_body_that_leaves_its_path_is_held_still_and_planned_for_again(cripple
 
 @pytest.mark.slow
 def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Path) -> None:
-    """The remaining slew is planned again for the other two coils."""
+    """A slew during which a coil is isolated ends at its target.
+
+    The remaining slew is planned again for the other two coils.
+    """
     config, section = slewing(BEGIN + SLEW + AFTER, FaultEntry(fault="coil-x: open", at=1.0))
     run = fly(config, tmp_path, section=section)
     (begun,), (isolated,), (ended,) = (at(run, name) for name in ("slew-begun", "coil-broken", "slew-ended"))
@@ -136,13 +139,16 @@ def test_a_slew_during_which_a_coil_is_isolated_ends_at_its_target(tmp_path: Pat
     assert SLEW - 5.0 < ended - begun < SLEW + 5.0
     assert not {"astray", "planner-failed", "tumbling"} & set(event_names(run))
     arrived, there = part(run, ended, ended + 1.0), part(run, ended, ended + AFTER)
-    # A 3U slews to its target within 0.5 deg in 95 % of the flights (requirement).
+    # The requirement is that a 3U reaches its target within 0.5 deg in 95 % of the flights.
     assert np.degrees(angle_between(arrived["quaternion"], arrived["target"])).max() < 0.5
     assert np.degrees(angle_between(there["quaternion"], there["target"])).max() < 2.0
 
 
 def test_while_it_is_held_still_its_coils_only_take_energy(crippled: Run) -> None:
-    """Before the restart, star fixes were also available along the path."""
+    """While a body is damped, its coils only remove energy.
+
+    Before the restart of the flight, star fixes were also available along the path.
+    """
     lost = at(crippled, "astray")[0]
     around, truth = crippled["orbit_truth"], crippled["truth"]
     times, since = around["time_ns"] * 1e-9, truth["time_ns"] * 1e-9

@@ -1,4 +1,4 @@
-"""Tests that solar strings, one of them dead, give a coarse attitude without a camera."""
+"""Tests that solar strings, of which one is dead, give a coarse attitude without a camera."""
 
 from __future__ import annotations
 

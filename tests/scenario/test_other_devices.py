@@ -1,6 +1,6 @@
-"""Tests of simulated flights with devices other than those of the thesis: drivers on emulated chips.
+"""Tests of simulated flights with other devices than in the thesis, by drivers of emulated chips.
 
-The sensors of the first flight are read by CircuitPython's own drivers (extra `circuitpython`).
+In the first flight, CircuitPython's own drivers (extra `circuitpython`) read the sensors.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ duration: {duration}
 
 
 def flown(text: str, folder: Path, *expected: str, fault: str = "") -> Run:
-    """Fly a configuration in lock-step, and return its logs; only `expected` fault events may occur."""
+    """Return the logs of a flight in lock-step. No fault events except `expected` may occur."""
     path = folder / "config.yaml"
     path.write_text(text, encoding="utf-8")
     result = fly(RunRequest(path, folder / "run", faults=(fault,) if fault else ()))
@@ -72,7 +72,7 @@ def flown(text: str, folder: Path, *expected: str, fault: str = "") -> Run:
 
 
 def test_a_testbed_flies_on_circuitpython_drivers_and_bridges_with_an_i2c_interface(tmp_path: Path) -> None:
-    """The step reaches its target within 10 s; the angle comes from gravity and the magnetic field."""
+    """The step reaches its target within 10 s. Gravity and magnetic field give the angle."""
     pytest.importorskip("adafruit_icm20x")
     pytest.importorskip("adafruit_lis3mdl")
     run = flown(TESTBED, tmp_path)
@@ -104,7 +104,10 @@ def test_a_satellite_flies_with_a_sensor_on_spi_and_a_receiver_with_nmea_sentenc
 def test_a_magnetometer_of_its_own_carries_the_testbed_while_the_inertial_unit_is_off(
     tmp_path: Path,
 ) -> None:
-    """Without a camera, the coils pause at intervals, so that the magnetometer is undisturbed."""
+    """A separate magnetometer controls the testbed while the IMU is off.
+
+    Without a camera, the coils pause at intervals so that the magnetometer is undisturbed.
+    """
     pytest.importorskip("adafruit_lis3mdl")
     text = MAGNETOMETER.format(name="step_demo", duration=13.0)
     text = text.replace("wide_cameras: []\nsolar_strings: none\n", "steps: [{at: 0.0, q2: -0.1}]\n")

@@ -1,4 +1,4 @@
-"""Tests that a parameter table is used or refused as a whole in flight."""
+"""Tests that a flight uses or refuses a parameter table as a whole."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SPINS = "tumbling"
 
 
 def configured() -> dict[str, float]:
-    """Return the parameter table of the configuration."""
+    """Return the parameter table that the configuration defines."""
     config = commanded(4.0)
     sections = {"modes": config.modes, "health": config.health}
     return {
@@ -28,7 +28,7 @@ def configured() -> dict[str, float]:
 
 
 def load(changes: dict[str, float], replaced: int | None = None) -> bytes:
-    """Return the command packet that changes the configuration's parameter table."""
+    """Return the command packet that changes some values of the configured parameter table."""
     before = configured()
     crc = crc_of(list(before.values())) if replaced is None else replaced
     return CommandPacker().pack(LoadParameters(crc, tuple({**before, **changes}.values())), 5)
@@ -66,7 +66,10 @@ def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
 
 
 def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
-    """The configured value, which applies without a loaded table, is also within the command's bounds."""
+    """The ranges of the command are within the ranges of the configuration schema.
+
+    The configured values, which apply without a loaded table, are also within the ranges of the command.
+    """
     config = commanded(4.0)
     for (key, value), field in zip(configured().items(), PARAMETER_FIELDS, strict=True):
         assert field.valid is not None

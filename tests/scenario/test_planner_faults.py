@@ -1,6 +1,6 @@
-"""Tests that an invalid plan is not used: the last valid plan continues, and then its end point is held.
+"""Tests that an invalid plan is not used. The last valid plan continues, and then its end point is held.
 
-`test_strategies` flies the same configurations with a valid planner, without these alarms.
+In `test_strategies`, the same configurations fly with a valid planner and without these alarms.
 """
 
 from __future__ import annotations
@@ -92,7 +92,10 @@ def test_after_two_good_plans_only_bad_ones_come(
 def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil
 ) -> None:
-    """The first path ends at the target, so that holding its end is correct and gives no alarm."""
+    """With a goal horizon, one valid plan is sufficient to reach the target.
+
+    The first path ends at the target, so holding its end point is correct and gives no alarm.
+    """
     use_planner(
         monkeypatch, lambda job: plan_job.run(job) if job.number == 1 else spoil(job, plan_job.run(job))
     )
@@ -133,7 +136,10 @@ def test_a_planner_that_is_just_in_time_is_flown(tmp_path: Path) -> None:
 
 
 def test_an_infeasible_step_is_stretched_reported_and_flown(tmp_path: Path) -> None:
-    """A slew from q2 = +0.3 to rest at -0.3 needs more than 10 s with at most 0.148 A."""
+    """An infeasible step is reported, and flown with a longer duration.
+
+    A slew from q2 = +0.3 to rest at -0.3 needs more than 10 s with at most 0.148 A.
+    """
     steps = (Step(at=0.0, q2=0.3), Step(at=3.0, q2=-0.3))
     config = configuration.replace(demo_config(20.0, camera=False), steps=steps)
     run = fly(config, tmp_path, section=released(0.3, 0.0))

@@ -1,4 +1,4 @@
-"""Tests that the flight sheds loads when a much too small battery is low, and restores them after sunrise."""
+"""Tests that loads are shed while a much too small battery is low, and restored after sunrise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAMERA_PERIOD = 3.0
 
 @pytest.fixture(scope="module")
 def orbit(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a flight that detumbles at the limits of its coils, from an eclipse into sunlight."""
+    """Return a flight that detumbles at its coils' limits, from an eclipse into sunlight."""
     section = world(0.1745)
     assert section.free_body is not None
     start = configuration.replace(section.free_body.orbit, true_anomaly_deg=ANOMALY_DEG)

@@ -1,4 +1,4 @@
-"""Tests of flights in real time on the machine's clock, with devices and workers in separate processes."""
+"""Tests of flights in real time, with devices and workers in separate processes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ground.telemetry import Run, read_run
 from tests.support.flights import CONFIG, event_names
 
 ROOT = CONFIG.parents[1]
-# A frame is required only after 5 s, because the worker is slower on a busy machine.
+# A frame is required only after 5 s, because the worker is slow on a busy machine.
 DURATION = 12.0
 
 
@@ -42,7 +42,7 @@ def test_every_slot_was_run_or_counted(flown: Run) -> None:
     last = groups[groups["name"] == b"control"][-1]
     assert last["cycles"] + last["slips"] == round(DURATION * 40)
     assert len(flown["control"]) == last["cycles"]
-    # The bound holds for a busy machine; the benchmark has a tighter bound for an idle machine.
+    # The bound holds on a busy machine. The benchmark has a smaller bound for an idle machine.
     assert last["slips"] < 0.1 * DURATION * 40
 
 
@@ -53,7 +53,7 @@ def test_planner_and_vision_worked_beside_the_loop(flown: Run) -> None:
     assert outcomes == {("planner", "done"), ("vision", "done")}
     plans = flown["plan"]
     assert plans["accepted"][-1]
-    # On a busy machine a plan may be late; it is then reported and not flown.
+    # On a busy machine a plan may be late. A late plan is reported and not used.
     assert all(status.startswith(b"the plan is late") for status in plans["status"][plans["accepted"] == 0])
     assert to_text(flown["streak"]["status"][0]) == "rate"
 
@@ -94,7 +94,7 @@ def test_a_killed_flight_leaves_a_readable_log_and_no_processes(tmp_path: Path) 
 
 
 def _descendants(parent: int) -> list[int]:
-    """Return the descendants of the process `parent`, from the kernel's lists."""
+    """Return the descendants of the process `parent`, from the process lists of the kernel."""
     found: list[int] = []
     for task in Path(f"/proc/{parent}/task").glob("*/children"):
         for child in task.read_text().split():

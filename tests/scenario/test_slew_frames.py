@@ -1,4 +1,4 @@
-"""Tests that frames during a slew have suitable streak lengths, and no coil step within their exposure."""
+"""Tests that frames during a slew have suitable streak lengths, and that no coil switches during a frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STREAKS = 1.1
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return the first 85 s of a 3U's slew with a frame every 5 s."""
+    """Return the first 85 s of a slew of a 3U, with a frame every 5 s."""
     config, world = slew_frames.flight("orbit", SEED, ABOUT)
     first, second = config.targets
     config = configuration.replace(
@@ -38,7 +38,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def _streaked(run: Run) -> tuple[BoolArray, FloatArray]:
-    """Return whether the body was fast enough in each frame (n,), and the true star motion (n,), px."""
+    """Return for each frame whether the body was fast enough (n,), and the true star motion (n,), px."""
     config, _ = slew_frames.flight("orbit", SEED, ABOUT)
     assert config.camera is not None
     to_camera = attitude_matrix(np.array(config.camera.mounting))
@@ -50,7 +50,7 @@ def _streaked(run: Run) -> tuple[BoolArray, FloatArray]:
 
 
 def test_streaks_of_a_slew_are_long_enough_to_tell_the_rate_and_no_longer(flown: Run) -> None:
-    """Streaks are 5 to 100 px long; frames whose stars are points keep the usual exposure."""
+    """The streaks of a slew are 5 to 100 px long. Frames with point-like stars keep the usual exposure."""
     streaked, moved = _streaked(flown)
     exposure = flown["streak"]["exposure"]
     assert streaked.sum() >= 8
@@ -63,22 +63,23 @@ def test_streaks_of_a_slew_are_long_enough_to_tell_the_rate_and_no_longer(flown:
 def test_no_step_of_the_coils_falls_into_an_exposure_of_a_slew(flown: Run) -> None:
     packets = flown["attitude"]
     changed = np.abs(np.diff(packets["dipole"], axis=0)).max(axis=1) > 0.0
-    # First packets after steps of the commanded dipole.
+    # First packets after changes of the commanded dipole.
     after = packets["time_ns"].astype(np.int64)[1:][changed]
     frames = flown["streak"][flown["streak"]["exposure_start_ns"] > (BEGIN + 2.0) * 1e9]
     assert len(after) > 30
     for frame in frames:
         begin = int(frame["exposure_start_ns"])
         end = begin + round(float(frame["exposure"]) * 1e9)
-        # An exposure may end at the step, and a packet of that moment already has the new dipole.
+        # An exposure may end when the dipole changes, and a packet of this instant already has the new
+        # dipole.
         assert not ((after - 100_000_000 >= begin) & (after < end)).any()
 
 
 def test_their_rates_and_attitudes_enter_the_estimate(flown: Run) -> None:
     streaked, _ = _streaked(flown)
     frames, stars = flown["streak"][streaked], flown["stars"]
-    # One or two of ten crowded frames with streaks of 7 to 8 px give no rate, because overlapping streaks
-    # have no common motion.
+    # Of ten crowded frames with streaks of 7 to 8 px, one or two give no rate, because overlapping streaks do
+    # not have a common motion.
     assert np.mean([to_text(status) == "rate" for status in frames["status"]]) >= 0.8
     assert np.all(frames["accepted"][[to_text(status) == "rate" for status in frames["status"]]] == 1)
     of_streaks = np.isin(stars["sequence"], frames["sequence"])

@@ -1,4 +1,4 @@
-"""Tests of star attitudes in flight from real skies, with and without a known pointing direction."""
+"""Tests of star attitudes in flight from the real sky, with and without a known pointing direction."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LOST, _TRACKED = 0, 1
 
 
 def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
-    """Make the IMU silent between two mission times (s), by default from before the run to its end."""
+    """Make the IMU silent between two mission times (s), by default during the whole run."""
     wire = rigged.lock.line.to_host
 
     def silence() -> None:
@@ -34,7 +34,10 @@ def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
 
 
 def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
-    """Without the IMU, no estimate predicts or uses an attitude."""
+    """A flight without an estimate identifies the stars lost in space and starts the filter.
+
+    Without the IMU, no estimate predicts or uses an attitude.
+    """
     run = fly(demo_config(8.0), tmp_path, lambda rigged: unit_silent(rigged, 0.0, 4.0))
     assert_solved(run)
     assert run["stars"]["tracked"].tolist() == [_LOST, _TRACKED]
@@ -42,11 +45,12 @@ def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: 
 
 
 def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_tracked(tmp_path: Path) -> None:
-    """After ten seconds without frames and IMU, the filter's model cannot predict the camera's attitude.
+    """After ten seconds without frames and IMU, the first frame is solved lost in space.
 
-    The body has then swung freely, and is rotated back with the full torque of the coil. The IMU resumes
-    early enough that the rate changes by less than half in the next exposure of one second. A larger rate
-    change is beyond the motion fit.
+    The next frame is solved by tracking. The filter's model cannot predict the attitude of the camera. The
+    body has swung freely, and the full torque of the coil then rotates it back. The IMU resumes early enough
+    that the rate changes by less than half in the next exposure of one second. The motion fit does not permit
+    a larger change.
     """
 
     def prepare(rigged: Rigged) -> None:
@@ -66,7 +70,10 @@ def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_trac
 
 
 def test_a_camera_knocked_out_of_place_is_found_out_and_misleads_nobody(tmp_path: Path) -> None:
-    """The stars are identified in an unexpected direction; their attitude is refused and reported."""
+    """If the camera is displaced, its star attitudes are refused and reported.
+
+    The stars are identified in an unexpected direction.
+    """
 
     def knock(rigged: Rigged) -> None:
         camera = rigged.lock.hardware.camera

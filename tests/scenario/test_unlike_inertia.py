@@ -1,4 +1,4 @@
-"""Tests of coil monitoring in a tumble with an inertia that differs from the configured one."""
+"""Tests of coil monitoring in a tumble, with an inertia that differs from the configured inertia."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TWO_PERCENT_OFF = (0.0066, 0.0340, 0.0326)
 
 
 def _coils_and_sigma(flown: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the estimated gains (3,) of the coils at the end, and their standard deviations (3,)."""
+    """Return the final estimates (3,) of the coil gains, and their standard deviations (3,)."""
     last = flown["description"][-1]
     return np.diag(last["coils"].reshape(3, 3)), np.diag(last["coils_sigma"].reshape(3, 3))
 
@@ -37,7 +37,10 @@ def _flown(folder: Path, duration: float, fault: str) -> Run:
 
 
 def test_moments_two_percent_off_isolate_no_healthy_coil(tmp_path: Path) -> None:
-    """If the configured inertia were trusted, coils y and z would seem reversed, at 48 and 88 s."""
+    """If the moments of inertia are 2 % off, no healthy coil is isolated.
+
+    If the configured inertia were trusted, the coils y and z would seem reversed, at 48 and 88 s.
+    """
     found = coil_judgement(_flown(tmp_path, 95.0, ""), "")
     assert found["healthy_isolated"] == []
     assert found["healthy_suspected"] == found["healthy_corrected"] == []
@@ -58,7 +61,10 @@ def test_a_coil_reversed_in_the_tumble_is_soon_flown_with_its_sign_changed(tmp_p
 
 
 def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: Path) -> None:
-    """All three coils are driven at their limit, so that only the probe of single coils shows an open one."""
+    """An open coil is isolated in a tumble by the supply current.
+
+    All three coils are driven at their limit, so only a probe of single coils shows an open coil.
+    """
     found = coil_judgement(_flown(tmp_path, 12.0, "coil-y: open"), "y")
     assert found["isolated_s"] is not None
     assert found["isolated_s"] < 10.0
@@ -66,7 +72,10 @@ def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: 
 
 
 def test_a_sign_found_before_a_restart_is_used_from_the_start(tmp_path: Path) -> None:
-    """The stored gain matrix of the coils refers to corrected dipoles, so the correction is stored too."""
+    """The sign of a reversed coil that was found before a restart is used from the start.
+
+    The stored gain matrix of the coils refers to corrected dipoles, so the correction is stored too.
+    """
     config, world = configured("orbit_3u")
     state = replace(config.state, folder=str(tmp_path / "state"), period=1.0)
     config = replace(without_cameras(config, 20.0), state=state)

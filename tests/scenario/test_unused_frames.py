@@ -1,4 +1,4 @@
-"""Tests that a frame in motion without a rate or an attitude gives an event."""
+"""Tests that a frame in motion without a rate or without an attitude gives an event."""
 
 from __future__ import annotations
 

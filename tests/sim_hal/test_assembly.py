@@ -30,7 +30,7 @@ BIAS = (2e-6, -1e-6, 3e-6)
 def measured(
     imu: ImuNoise, seconds: float, world: str = "free_body", config: Config | None = None
 ) -> tuple[list[Vn100Sample], list[BodyMotion]]:
-    """Return the samples of the IMU at 40 Hz, and the true motion at each time."""
+    """Return the samples of the IMU at 40 Hz, and the true motion at the time of each sample."""
     body = FreeBodySection(release=TipOff(speed=0.02))
     section = reader.replace(demo_world(), world=world, free_body=body, imu=imu)
     lock = build_lockstep(config or demo_config(10.0, camera=False), section, None, SimClock())
@@ -59,7 +59,7 @@ def test_it_weighs_nothing_and_its_noise_is_the_data_sheets() -> None:
 
 def test_its_attitude_has_no_meaning_in_orbit_and_a_meaning_on_the_thread() -> None:
     def errors(world: str) -> FloatArray:
-        """Return the rotations (n, 4) from the body's attitude to the attitude that the IMU measures."""
+        """Return the rotations (n, 4) from the true attitude to the attitude that the IMU measures."""
         pairs = zip(*measured(ImuNoise(), 20.0, world), strict=True)
         more = [quaternion.multiply(quaternion.conjugate(t.quaternion), m.quaternion) for m, t in pairs]
         return np.array(more)
@@ -90,7 +90,7 @@ UNEQUAL: tuple[Vector, Vector, Vector] = ((5e-4, 1e-4, 0.0), (0.0, 4e-4, 0.0), (
 
 
 def gauss(coil_field: tuple[Vector, Vector, Vector], driven: bool) -> tuple[FloatArray, FloatArray]:
-    """Return the last field measured by the IMU at rest, gauss, and the coil currents, A."""
+    """Return the last field (gauss) that the IMU measures at rest, and the coil currents (A)."""
     section = configuration.replace(demo_world(), coil_field=coil_field, current_noise=0.0)
     lock = build_lockstep(demo_config(10.0, camera=False), section, None, SimClock())
     seen: list[FloatArray] = []
@@ -101,7 +101,8 @@ def gauss(coil_field: tuple[Vector, Vector, Vector], driven: bool) -> tuple[Floa
 
     lock.hardware.unit.alter = note
     if driven:
-        # Writes that wake the chip and drive input A of x for half, and B of z for a quarter of a period.
+        # Writes that wake the chip, and drive the input A of x for half a period and the input B of z for a
+        # quarter.
         lock.hardware.bus.write_i2c_block_data(0x40, 0x00, [0x20])
         lock.hardware.bus.write_i2c_block_data(0x40, 0x06, [0, 0, 0, 8])
         lock.hardware.bus.write_i2c_block_data(0x40, 0x1A, [0, 0, 0, 4])
@@ -136,6 +137,6 @@ def test_by_default_the_magnetometer_does_not_feel_them() -> None:
 
 
 def test_the_defaults_are_the_published_ones() -> None:
-    """A simulation without these keys uses the defaults, so a changed default changes the interface."""
+    """The published defaults do not change, because simulations omit keys that have a default."""
     published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
     assert json.loads(json.dumps(defaults_of(settings))) == published

@@ -1,4 +1,4 @@
-"""Tests of the emulated camera: triggers, readout, and each fault on frames of known pixels."""
+"""Tests of the emulated camera: triggers, readout, and each fault on frames with known pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EXPOSURE_NS, READOUT_NS, SCAN_NS = 100 * MS, 50 * MS, 20 * MS
 
 
 class Bench:
-    """A camera on a manual clock. Frame n has the value n in its first row, and 10 n in all other rows."""
+    """A camera on a manual clock. Frame n has the count n in its first row, and 10 n in all other rows."""
 
     def __init__(self) -> None:
         self.now_ns = 1000 * MS
@@ -45,7 +45,7 @@ class Bench:
         return done
 
     def frame(self) -> Frame | None:
-        """Trigger a frame and return it after its read-out."""
+        """Trigger a frame, and return it after its readout."""
         self.camera.trigger(EXPOSURE_NS)
         self.wait(EXPOSURE_NS + SCAN_NS + READOUT_NS)
         return self.camera.poll()

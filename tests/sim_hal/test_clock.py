@@ -1,4 +1,4 @@
-"""Tests that simulated time jumps, and that each due event occurs in order."""
+"""Tests that simulated time jumps to the next event, and that each due event occurs in order."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MS = 1_000_000
 
 
 class Beeper:
-    """A world in which something happens every 10 ms."""
+    """A world with an event every 10 ms."""
 
     def __init__(self, notes: list[tuple[str, int]]) -> None:
         self._notes = notes
@@ -87,7 +87,10 @@ def test_utc_is_the_label_of_the_start_plus_the_time_since() -> None:
 
 @pytest.mark.parametrize("clock", [SimClock(), SystemClock()])
 def test_a_job_that_raises_is_kept_as_an_error_and_runs_again(clock: SimClock | SystemClock) -> None:
-    """If a job's exception ended its thread, the device, such as the coils, would keep its last state."""
+    """If a job raises, the error is stored and the job runs again.
+
+    If the exception ended the thread of the job, a device such as the coils would keep its last state.
+    """
     runs = list[int]()
 
     def job() -> None:

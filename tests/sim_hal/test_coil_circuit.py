@@ -1,4 +1,4 @@
-"""Tests of coil currents from PWM outputs: the bridge's truth table, current errors, and the supply."""
+"""Tests of coil currents from PWM outputs: truth table of the bridge, current errors, and the supply."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
         (FULL_OFF, FULL_ON, -FULL),  # L H: V_supply, CCW
         (FULL_OFF, FULL_OFF, 0.0),  # L L: 0 V
         ((0, 1024), FULL_OFF, FULL / 4),
-        ((0, 2048), (1024, 3072), 0.0),  # states of the bridge: driven +, braking, driven -
-        ((0, 2048), (0, 1024), FULL / 4),  # both inputs high: braking
-        ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # a pulse across the end of the period
+        ((0, 2048), (1024, 3072), 0.0),  # phases of the bridge: positive, brake, negative
+        ((0, 2048), (0, 1024), FULL / 4),  # both inputs high: brake
+        ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # the pulse continues across the end of the period
     ],
 )
 def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current: float) -> None:
@@ -39,9 +39,9 @@ def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current
 
 
 def test_the_uncertainty_is_uniform_within_its_bound_and_drawn_at_each_command() -> None:
-    """The standard deviation is 3.5e-3/sqrt(3) A.
+    """The current error is uniform within 3.5 mA, and is drawn at each command.
 
-    2,000 random draws determine the standard deviation to within 8 % (5 sigma).
+    Its standard deviation is 3.5e-3/sqrt(3) A, which 2,000 random draws determine to within 8 % (5 sigma).
     """
     rig = Rig(uncertainty=3.5e-3)
     rig.coils.start()
@@ -100,7 +100,7 @@ def test_the_same_seed_gives_the_same_currents() -> None:
 
 
 def test_a_coil_whose_resistance_is_not_what_the_driver_believes() -> None:
-    """A duty for 0.1 A through 23 ohm gives 0.115 A through 20 ohm."""
+    """A coil of 20 ohm that the driver assumes to have 23 ohm carries 0.115 A instead of 0.1 A."""
     rig = Rig()
     truth = replace(THESIS, coils=(CoilWiring(0, 1, 20.0), *THESIS_COILS[1:]))
     circuit = CoilCircuit(rig.wire.chip, truth, np.random.default_rng(1), rig.clock.now_ns, uncertainty=0.0)
@@ -121,7 +121,10 @@ def test_a_sleeping_or_browned_out_chip_carries_no_current() -> None:
 def test_the_chopped_charge_agrees_with_sampling_the_bridge(
     a: tuple[int, int], b: tuple[int, int], begin: int, span: int
 ) -> None:
-    """The reference samples the middle of 20,000 slices; each edge may be wrong by one slice."""
+    """The charge of chopped currents agrees with samples of the bridge.
+
+    The reference samples the middle of 20,000 slices. Each edge may be wrong by one slice.
+    """
     period = 20_000_000.0
     chopping = Chopping(0, 0, period, ((Bridge(a, b), 0.148),))
     count = 20_000
@@ -151,7 +154,10 @@ def test_the_supply_is_chopped_and_its_mean_over_whole_periods_is_the_sum_of_mag
 
 
 def test_a_single_conversion_of_the_chopped_current_is_off_by_up_to_18_percent() -> None:
-    """A conversion of 68.1 ms includes up to 4 pulses, 3.4 on average (`hal.drivers.current_monitors`)."""
+    """A single ADC sample of the chopped current is off by up to 18 %.
+
+    A sample of 68.1 ms contains up to 4 pulses, and 3.4 pulses on average (`hal.drivers.current_monitors`).
+    """
     rig = Rig()
     rig.coils.start()
     rig.command(0.05, 0.0, 0.0)

@@ -12,7 +12,7 @@ CYCLE = 2 * 68_100_000
 
 
 class Part:
-    """One emulated monitor with constant inputs."""
+    """An emulated current monitor with constant inputs."""
 
     def __init__(self, volts: float, amps: float, shunt_ohm: float) -> None:
         self.clock = ManualClock()
@@ -25,11 +25,11 @@ class Part:
         return self.inputs
 
     def write(self, register: int, word: int) -> None:
-        """Write one word, big-endian."""
+        """Write a 16-bit word, big-endian."""
         self.chip.write(INA, bytes((register, word >> 8, word & 0xFF)))
 
     def read(self, register: int) -> int:
-        """Read one word, big-endian."""
+        """Read a 16-bit word, big-endian."""
         self.chip.write(INA, bytes((register,)))
         return int.from_bytes(self.chip.read(2), "big")
 
@@ -40,7 +40,10 @@ def test_power_on_values() -> None:
 
 
 def test_the_worked_example_of_the_data_sheet() -> None:
-    """The example (SBOS448) has 10 A in 2 mohm at 11.98 V, with LSBs of 1 mA and 20 mW."""
+    """The registers have the values of the data sheet's worked example (SBOS448).
+
+    The example has 10 A in 2 mohm at 11.98 V, with LSBs of 1 mA and 20 mW.
+    """
     part = Part(11.98, 10.0, 0.002)
     part.write(0x00, 0x019F)
     part.write(0x05, 0x5000)
@@ -49,7 +52,7 @@ def test_the_worked_example_of_the_data_sheet() -> None:
     assert part.read(0x02) == 0x5D98 | 0b10  # the table of the data sheet omits the ready bit
     assert part.read(0x04) == 0x2710
     assert part.read(0x03) == 0x1766
-    assert part.read(0x02) == 0x5D98  # reading the Power register has cleared the ready bit
+    assert part.read(0x02) == 0x5D98  # the read of the Power register has cleared the ready bit
 
 
 def test_current_and_power_are_zero_while_calibration_is_void() -> None:
@@ -73,7 +76,7 @@ def test_overflow_of_the_mathematics_is_flagged() -> None:
 @pytest.mark.parametrize(
     ("config", "millivolts", "word"),
     [
-        (0x019F, 40.0, 0x0FA0),  # full scale of each range, from the data sheet's shunt tables
+        (0x019F, 40.0, 0x0FA0),  # full scale of each range, by the shunt tables of the data sheet
         (0x019F, 50.0, 0x0FA0),
         (0x099F, 80.0, 0x1F40),
         (0x119F, 160.0, 0x3E80),
@@ -99,8 +102,8 @@ def test_conversion_times_of_the_data_sheet(code: int, microseconds: int) -> Non
 
 
 def test_fewer_bits_give_coarser_steps() -> None:
-    part = Part(5.0, 0.0123, 0.1)  # 1.23 mV = 123 steps of 12 bits
-    part.write(0x00, 0x0007)  # 9 bits
+    part = Part(5.0, 0.0123, 0.1)  # 1.23 mV is 123 steps at 12 bits
+    part.write(0x00, 0x0007)  # resolution of 9 bits
     part.clock.advance(2 * 84_000)
     assert part.read(0x01) == 120
 
@@ -145,7 +148,10 @@ def steps(volts: float, amps: float, config: int, shunt_ohm: float = 0.1) -> tup
 
 @pytest.mark.parametrize(("bits", "step"), [(0, 8), (1, 4), (2, 2), (3, 1)])
 def test_shunt_and_bus_have_the_resolution_of_their_own_code(bits: int, step: int) -> None:
-    """By SBOS448 Table 5, codes give 9 to 12 bits; BADC is bits 7 to 10, SADC bits 3 to 6."""
+    """Shunt and bus have the resolutions of their own codes, 9 to 12 bits (SBOS448, Table 5).
+
+    BADC is bits 7 to 10, and SADC is bits 3 to 6.
+    """
     volts, amps = 1003 * 4e-3, 1003 * 10e-6 / 0.1
     coarse = round(1003 / step) * step
     assert steps(volts, amps, 0x3800 | bits << 7 | 0b0011 << 3 | 0b111) == (1003, coarse)
@@ -162,7 +168,7 @@ def test_averaged_conversions_have_12_bits() -> None:
     (0x399F, 33.0, 8000), (0x199F, -1.0, 0),
 ])  # fmt: skip
 def test_the_bus_range_is_16_or_32_v(config: int, volts: float, word: int) -> None:
-    """Bit 13 (BRNG, SBOS448) selects a full scale of 16 V or 32 V, in steps of 4 mV."""
+    """The bus range is 16 V or 32 V by bit 13 (BRNG, SBOS448), in steps of 4 mV."""
     assert steps(volts, 0.0, config)[1] == word
 
 
@@ -170,7 +176,10 @@ def test_the_bus_range_is_16_or_32_v(config: int, volts: float, word: int) -> No
     ("mode", "spent_ns"), [(0b101, 276_000), (0b110, 8_510_000), (0b111, 276_000 + 8_510_000)]
 )
 def test_a_cycle_converts_what_the_mode_names(mode: int, spent_ns: int) -> None:
-    """The shunt has code 2 (276 us), the bus code 12 (8.51 ms); the other register keeps its content."""
+    """A cycle converts only the inputs that the mode names, and the other register keeps its content.
+
+    The shunt has code 2 (276 us), and the bus has code 12 (8.51 ms).
+    """
     part = Part(4.0, 0.1, 0.1)
     part.write(0x00, 0x1800 | 12 << 7 | 2 << 3 | mode)
     part.clock.advance(spent_ns - 1)
@@ -213,7 +222,10 @@ def test_a_read_beyond_the_word_gives_the_level_of_the_idle_bus() -> None:
 
 
 def test_a_negative_current_is_shown_in_current_and_as_a_positive_power() -> None:
-    """Current is in two's complement: -0.1 A in 0.1 ohm is -1000 steps, also with calibration 4096."""
+    """The register Current is signed (two's complement), and the register Power is positive.
+
+    A current of -0.1 A in 0.1 ohm is -1000 steps, also with the calibration 4096.
+    """
     part = Part(4.0, -0.1, 0.1)
     part.write(0x05, 0x1000)
     part.clock.advance(CYCLE)

@@ -40,7 +40,7 @@ SERVE = {
 
 
 def _values(words: str) -> dict[str, Any]:
-    """Return the values of the parsed options of a command line."""
+    """Return the values of a command line's options after parsing."""
     values = vars(_parser().parse_args(words.split()))
     del values["command"]
     return values

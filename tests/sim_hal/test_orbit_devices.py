@@ -1,4 +1,4 @@
-"""Tests of the devices in orbit, read by the flight drivers in lock-step."""
+"""Tests of the devices in orbit, which the flight drivers read in lock-step."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def opened(lock: LockStep, stack: ExitStack) -> Rig:
 
 
 def shot(lock: LockStep, number: int = 0) -> Frame | None:
-    """Return the frame of a wide camera half a second after its trigger."""
+    """Return the frame of a horizon camera half a second after its trigger."""
     camera = lock.hardware.orbit.wide[number]
     camera.trigger(5_000_000)
     lock.clock.sleep_until_ns(lock.clock.now_ns() + SECOND_NS // 2)
@@ -88,7 +88,7 @@ def test_the_strings_are_read_over_the_coils_bus(lock: LockStep) -> None:
         lock.clock.sleep_until_ns(2 * SECOND_NS)
         reading = strings.latest()
         assert reading is not None
-        assert reading.currents.max() > 0.25  # one of six faces is always within 55 deg of the Sun
+        assert reading.currents.max() > 0.25  # one of the six faces is always within 55 deg of the Sun
         assert strings.error() == ""
 
 
@@ -135,7 +135,7 @@ def test_faults_reach_the_drivers(lock: LockStep) -> None:
         strings = opened_device("solar_strings", orbit_config(), rig, stack)
         assert strings is not None
         found = fixes(lock, rig, stack, 6)
-        # The sub-satellite point moves by 7.1 km in a second.
+        # The point below the satellite moves by 7.1 km in a second.
         jumps = np.diff([fix.position for fix in found if fix.valid], axis=0)
         assert sorted(np.linalg.norm(jumps, axis=1))[-1] > 4e4
         assert "check its power" in strings.error()
@@ -196,7 +196,7 @@ def test_impossible_devices_are_refused(old: str, new: str, complaint: str) -> N
 
 
 def star_frame(boresight: FloatArray) -> Frame:
-    """Return a frame of the star camera along a direction, ICRS."""
+    """Return the frame of a star camera that looks along a direction (ICRS)."""
     lock = looking(boresight, camera=True)
     frames = lock.hardware.camera
     assert frames is not None
@@ -234,7 +234,7 @@ def test_the_dark_earth_hides_the_stars_behind_it() -> None:
 def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironment]:
     """Return the rotation (3, 3) from ICRS to a camera's axes, and the environment of its satellite.
 
-    The satellite is on the x axis of ICRS. The boresight is `limb_deg` outside the Earth's limb.
+    The satellite is on the x axis of ICRS. The boresight is `limb_deg` deg outside the Earth's limb.
     """
     around = at_first()._replace(position=(7e6, 0.0, 0.0), sun=tuple(sun.tolist()), sunlit=1.0)
     angle = math.pi - math.asin(EARTH_RADIUS / 7e6) - math.radians(limb_deg)
@@ -245,7 +245,7 @@ def edge_on(limb_deg: float, sun: FloatArray) -> tuple[FloatArray, OrbitEnvironm
 PINHOLE = Pinhole.from_field_of_view(200, 200, math.radians(20.0))
 ABOVE = np.array([1.0, 0.0, 0.0])
 SIDES = np.array([0.0, -1.0, 0.0])
-"""Sun direction above the side of the Earth that is not visible to the camera."""
+"""Sun direction above that side of the Earth which is not visible to the camera."""
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,10 @@ SIDES = np.array([0.0, -1.0, 0.0])
 def test_the_baffle_and_the_field_exclude_the_limb_of_the_sunlit_earth(
     limb_deg: float, excluded_deg: float, blinded: bool
 ) -> None:
-    """The corner of the field is 14 deg from the boresight."""
+    """The sunlit Earth spoils a frame if its limb is within the baffle's cone or the field of view.
+
+    The corner of the field is 14 deg from the boresight.
+    """
     sky = SkySection(sun_exclusion_deg=30.0, earth_exclusion_deg=excluded_deg)
     assert view(PINHOLE, *edge_on(limb_deg, ABOVE), sky)[0] == blinded
     assert not view(PINHOLE, *edge_on(limb_deg, SIDES), sky)[0], "the near side of the Earth is dark"
@@ -277,7 +280,8 @@ def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
     position = np.array(around.position)
     assert sunlit_ground_angle(position, ABOVE, to_camera[2]) == pytest.approx(math.radians(25.0), abs=1e-9)
     assert sunlit_ground_angle(position, -ABOVE, to_camera[2]) == math.pi
-    # If the Sun is at the satellite's horizon, the lit ground begins 6 deg (0.1 rad) from the point below it.
+    # If the Sun is at the horizon of the satellite, the sunlit ground begins 6 deg (0.1 rad) from the point
+    # below the satellite.
     ground = EARTH_RADIUS * np.array([math.cos(0.1), math.sin(0.1), 0.0])
     away = ground - position
     expected = math.acos(away @ to_camera[2] / float(np.linalg.norm(away)))
@@ -287,7 +291,10 @@ def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
 
 
 def test_aberration_moves_the_stars_towards_the_velocity() -> None:
-    """Aberration is 20.5 arcsec at 29.8 km/s across the line of sight, and zero along it."""
+    """Aberration displaces the stars towards the velocity.
+
+    It is 20.5 arcsec at 29.8 km/s normal to the line of sight, and zero along the line of sight.
+    """
     attitude = quaternion.IDENTITY[None, :]
     moved = aberrated(attitude, np.array([29_800.0, 0.0, 0.0]))
     star = quaternion.attitude_matrix(moved)[0] @ [0.0, 0.0, 1.0]
@@ -315,9 +322,10 @@ def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
 
 
 def test_a_slow_start_shifts_no_device_in_time() -> None:
-    """In real time the clock advances while the devices are built.
+    """A slow start does not shift the time of any device.
 
-    In this test it advances by half a second per reading.
+    In real time the clock advances while the devices are built. In this test the clock advances by half a
+    second per reading.
     """
     clock = itertools.count(10 * SECOND_NS, SECOND_NS // 2)
     wires = EmulatedWires(clock.__next__, 1, orbit_config().coils.bus)
@@ -378,7 +386,7 @@ def test_the_walk_of_the_position_keeps_its_size_and_is_correlated_over_its_time
     off = []
     for second in range(1, 501):
         wrong, right = (one.gps._measure(second * SECOND_NS) for one in (wandering, exact))
-        off.append((wrong.height - right.height) * 1e-3)  # height error, m
+        off.append((wrong.height - right.height) * 1e-3)  # error of the height, m
     walk = np.array(off)
     correlation = float(walk[1:] @ walk[:-1] / (walk @ walk))
     assert correlation == pytest.approx(math.exp(-1.0 / walk_time), abs=0.12)

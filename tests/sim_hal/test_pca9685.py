@@ -1,4 +1,4 @@
-"""Tests of the emulated PCA9685 against the NXP data sheet; each test states its rule."""
+"""Tests of the emulated PCA9685 against the NXP data sheet. Each test states its rule."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ADDRESS = 0x41
 
 
 class Bench:
-    """One chip on a bus, in its state after power-on."""
+    """A chip on a bus, in its state after power-on."""
 
     def __init__(self) -> None:
         self.clock = ManualClock()
@@ -20,15 +20,15 @@ class Bench:
         self.bus = EmulatedI2cBus([self.chip])
 
     def write(self, register: int, *values: int) -> None:
-        """Write registers in one transaction."""
+        """Write consecutive registers in one transaction."""
         self.bus.write_i2c_block_data(ADDRESS, register, values)
 
     def read(self, register: int, count: int = 1) -> list[int]:
-        """Read registers in one transaction."""
+        """Read consecutive registers in one transaction."""
         return self.bus.read_i2c_block_data(ADDRESS, register, count)
 
     def wake(self) -> None:
-        """Wake the chip with auto-increment and let its oscillator start."""
+        """Wake the chip with auto-increment, and wait for its oscillator."""
         self.write(0x00, 0x20)
         self.clock.advance(500_000)
 
@@ -106,7 +106,7 @@ def test_all_led_registers_write_all_channels(bench: Bench) -> None:
         (0x1000, 0x0000, 1.0),  # full ON
         (0x1000, 0x1000, 0.0),  # full OFF has precedence over full ON
         (409, 1228, 819 / 4096),  # data sheet example 1: 10 % delay, 20 % duty
-        # data sheet example 2: 90 % delay, 90 % duty, beyond the end of the period
+        # data sheet example 2: 90 % delay, 90 % duty, which continues in the next period
         (3685, 3275, 3686 / 4096),
         (0, 4095, 4095 / 4096),
         (4095, 0, 1 / 4096),
@@ -127,7 +127,10 @@ def test_equal_counts_are_noted_as_a_violation(bench: Bench) -> None:
 
 
 def test_sleep_stops_the_outputs_and_restart_brings_them_back(bench: Bench) -> None:
-    """RESTART is set by sleep while a channel runs, and cleared by a write (data sheet 7.3.1.1)."""
+    """Sleep stops the outputs, and a write of RESTART starts the outputs again (data sheet 7.3.1.1).
+
+    RESTART is set by sleep while a channel runs, and is cleared by a write.
+    """
     bench.wake()
     bench.write(0x06, 0, 0, 0, 0x08)
     bench.write(0x00, 0x30)

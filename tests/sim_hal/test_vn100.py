@@ -199,7 +199,7 @@ def test_every_binary_field_of_a_vn100_can_be_had_and_agrees_with_the_others() -
     assert values["attitude.linear_accel_ned"] == pytest.approx([0.0, 0.0, 0.0], abs=1e-5)
     assert values["attitude.mag_ned"] == pytest.approx([4.5, 0.0, 0.0], abs=1e-5)
     yaw, pitch, roll = np.radians(values["common.yaw_pitch_roll"])
-    # Euler angles 3-2-1 rotate the axes about z, then y, then x.
+    # The Euler angles (3-2-1) rotate the axes about z, then about y, then about x.
     (cz, cy, cx), (sz, sy, sx) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     turn_z = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
     turn_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
@@ -355,7 +355,7 @@ LARGEST: dict[int, tuple[tuple[int, ...], ...]] = {
     82: ((0, 1), (0, 2), (0, 1), (0, 1), (0, 1)),
     85: ((0, 25),) * 5 + ((0, 3),) * 5,
 }
-"""Smallest and largest value of each field, up to the first gap in the valid range."""
+"""Smallest and largest value of each field, up to the first gap in its valid values."""
 
 
 @pytest.mark.parametrize(
@@ -499,7 +499,7 @@ def test_a_flipped_bit_changes_one_field_and_is_checked() -> None:
     assert FIELD_BITS == 16
     file = RegisterFile()
     with pytest.raises(UnitError, match="07"):
-        file.flip(7, 7)  # 40 ^ 128 is 168 Hz, which the unit does not have
+        file.flip(7, 7)  # 40 ^ 128 is 168 Hz, an invalid rate
     assert file.read(7) == ("168",)
     file.flip(7, FIELD_BITS)
     assert file.read(7) == ("168",), "a register with one field has no second field"
@@ -516,7 +516,7 @@ NOISELESS = Vn100EmulatorSettings(noise=PROFILES["none"])
 
 
 def angles(bench: Bench, register: int = 8) -> list[float]:
-    """Return yaw, pitch and roll in degrees."""
+    """Return yaw, pitch and roll (deg)."""
     (answer,) = bench.exchange(build("RRG", register))
     return [float(text) for text in answer.fields[1:4]]
 
@@ -538,14 +538,17 @@ def command(bench: Bench, *words: object) -> tuple[str, ...]:
     ],
 )
 def test_factory_settings_of_the_filters_registers(register: int, default: str) -> None:
-    """Names, lengths and defaults are those of VectorNav UM001 and of the SDK's classes."""
+    """Names, lengths and factory settings of filter registers are those of VectorNav UM001 and the SDK."""
     bench = Bench().quiet()
     assert command(bench, "RRG", register) == ("RRG", str(register), *default.split(","))
 
 
 @pytest.mark.parametrize("register", [36, 38, 50, 51])
 def test_what_is_written_is_echoed_kept_and_saved(register: int) -> None:
-    """The commands are those of the SDK: numbers with six decimals, and register numbers with two digits."""
+    """Written values are echoed, kept and saved.
+
+    The commands are those of the SDK: numbers with six decimals, and register numbers with two digits.
+    """
     bench = Bench().quiet()
     length = {36: 9, 38: 9, 50: 3, 51: 3}[register]
     values = [f"{0.5 * k + 0.25:f}" for k in range(length)]
@@ -561,7 +564,10 @@ def test_what_is_written_is_echoed_kept_and_saved(register: int) -> None:
 
 @pytest.mark.parametrize("register", [239, 240])
 def test_linear_acceleration_has_its_registers_in_body_and_ned_axes(register: int) -> None:
-    """At rest it is zero; as in UM001's example, degrees, m/s^2 and rad/s have 3, 3 and 6 decimals."""
+    """Registers give the linear acceleration in body and NED axes, which is zero at rest.
+
+    As in UM001's example, values in degrees, m/s^2 and rad/s have 3, 3 and 6 decimals.
+    """
     bench = Bench().quiet()
     (answer,) = bench.exchange(build("RRG", register))
     assert len(answer.fields) == 1 + 9
@@ -576,13 +582,14 @@ def test_tare_and_initial_heading_turn_the_attitude_about_the_vertical() -> None
     bench = Bench(NOISELESS).quiet()
     turning = angles(bench)
     assert command(bench, "TAR") == ("TAR",)
-    # The body rotates at 0.02 rad/s during two exchanges of 20 ms.
+    # During two exchanges of 20 ms each, the body rotates at 0.02 rad/s.
     assert angles(bench) == pytest.approx([0.0, *turning[1:]], abs=0.1)
     assert command(bench, "SIH", "+045.000") == ("SIH", "+045.000")
     assert angles(bench) == pytest.approx([45.0, *turning[1:]], abs=0.1)
     command(bench, "SIH", "-120", "30", "20")
     assert angles(bench, 239) == pytest.approx([-120.0, *turning[1:]], abs=0.1)
-    # Quaternion (scalar last) of 60 deg about the vertical; VectorNav's quaternion rotates body into NED.
+    # Quaternion (scalar last) of a rotation by 60 deg about the vertical. VectorNav's quaternion rotates body
+    # into NED.
     command(bench, "SIH", 0, 0, 0.5, 0.866025)
     assert angles(bench, 240) == pytest.approx([60.0, *turning[1:]], abs=0.1)
     bench.exchange(build("RST"), 1.5)

@@ -1,4 +1,4 @@
-"""Tests of messages and noise of the emulated VN-100 against VectorNav UM001 v2.43 ch. 4 and 5."""
+"""Tests of messages and noise of the emulated VN-100, by VectorNav UM001 v2.43, ch. 4 and 5."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ MAG, ACCEL, RATE = (0.21, -0.05, 0.43), (0.5, -0.25, -9.7), (0.011, -0.022, 0.03
 
 
 def rotation(axis: int, angle: float) -> np.ndarray:
-    """Return the matrix of a change of axes by `angle` about one of them."""
+    """Return the matrix of a rotation of the axes by `angle` about one axis."""
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
     matrix = np.eye(3)
     matrix[i, i] = matrix[j, j] = math.cos(angle)
@@ -62,7 +62,7 @@ def about(axis: int, angle: float) -> np.ndarray:
 
 
 def data(interval: float = 0.02) -> MessageData:
-    """Return the data of a tilted unit in motion."""
+    """Return the data of a unit that is tilted and moves."""
     attitude = multiply(about(0, ROLL), multiply(about(1, PITCH), about(2, YAW)))
     sample = Vn100Sample(attitude, np.array(RATE), np.array(MAG), np.array(ACCEL))
     return MessageData(123_456_789, sample, 0x0A5, interval, 21.5, 99.25)
@@ -118,9 +118,10 @@ def test_an_ascii_output_has_the_values_of_the_manual(header: str) -> None:
 
 @pytest.mark.parametrize(("header", "length"), [("YMR", 122), ("QMR", 135), ("YPR", 38), ("QTN", 51)])
 def test_a_sentence_has_the_length_that_its_formats_give(header: str, length: int) -> None:
-    """`$VNxxx` has 6 bytes, `*XX` and the line end 5; a value has its width and a comma.
+    """The length of a sentence follows from the formats of its values.
 
-    The widths are 8 (angles, field), 9 (quaternion), 7 (acceleration) and 10 (rate).
+    `$VNxxx` has 6 bytes, `*XX` and the line end have 5 bytes, and a value has its width plus a comma. The
+    widths are 8 (angles, field), 9 (quaternion), 7 (acceleration) and 10 (rate).
     """
     (output,) = (output for output in REPORTS if output.header == header)
     assert output.length() == length
@@ -179,7 +180,10 @@ def test_a_binary_field_has_the_quantity_of_its_name(key: tuple[int, int]) -> No
 
 
 def test_the_profiles_have_the_figures_of_thesis_and_data_sheet() -> None:
-    """The noise is 0.0035 deg/s, 140 uG and 0.14 mg per sqrt(Hz); angle errors are 0.5, 0.5 and 2 deg rms."""
+    """The noise profiles have the values of the thesis and the data sheet.
+
+    The noise is 0.0035 deg/s, 140 uG and 0.14 mg per sqrt(Hz). The angle errors are 0.5, 0.5 and 2 deg rms.
+    """
     thesis, sheet, none = PROFILES["thesis"], PROFILES["datasheet"], PROFILES["none"]
     assert (thesis.attitude_bound, thesis.rate_bound) == (1.75e-3, 1.75e-4)
     assert (sheet.attitude_bound, sheet.rate_bound, thesis.rate_density, thesis.gyro_bias) == (0, 0, 0, 0)
@@ -205,7 +209,7 @@ MOTION = BodyMotion(
 def sensors(
     profile: NoiseProfile, bias: tuple[float, ...] = (0.0, 0.0, 0.0), free_fall: bool = False
 ) -> Sensors:
-    """Return sensors that are aligned with the body."""
+    """Return sensors whose axes are aligned with the body."""
     generator = np.random.default_rng(5)
     made = Sensors(generator, profile, IDENTITY, IDENTITY, np.array(bias), free_fall)
     made.restart()

@@ -33,14 +33,17 @@ def attitude() -> FloatArray:
 
 
 def sun() -> FloatArray:
-    """Return a Sun direction 24 deg from the zenith, in the top camera's field, with a sunlit limb."""
+    """Return a Sun direction 24 deg from the zenith, in the field of view of the top camera.
+
+    The limb is sunlit.
+    """
     zenith = POSITION[0] / np.linalg.norm(POSITION[0])
     towards = zenith + 0.45 * np.array([0.0, 0.6, 0.8])
     return np.asarray(towards / np.linalg.norm(towards))
 
 
 def frame_of(camera: WideCamera, seed: int) -> Image:
-    """Return the frame of a camera of the suite."""
+    """Return the frame of one of the four cameras."""
     looking = multiply(np.array(camera.mounting), attitude())
     scene = EarthScene(POSITION[0], looking / np.linalg.norm(looking), ASTRONOMICAL_UNIT * sun())
     return render(MODEL, scene, np.random.default_rng(seed))
@@ -73,14 +76,18 @@ def sights() -> dict[str, VectorObservation]:
 
 
 def off(fix: AttitudeFix) -> FloatArray:
-    """Return the attitude error (3,), rad."""
+    """Return the attitude error (3,) as a rotation vector (rad)."""
     return rotation_vector(multiply(attitude(), conjugate(fix.quaternion)))
 
 
 def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, VectorObservation]) -> None:
-    """The Sun is 24 deg off the vertical, so the rotation about it is 2.5 times less accurate, as claimed."""
+    """One exposure of four cameras determines the attitude.
+
+    The Sun is 24 deg off the vertical, so the rotation about the vertical is 2.5 times less accurate, as
+    stated.
+    """
     fix = weighted_fit(list(sights.values()))
     error = off(fix)
     assert np.max(np.abs(np.degrees(error))) < 0.15
-    # 99.9 % quantile of chi-square with 3 degrees of freedom.
+    # 99.9 % quantile of a chi-square with 3 degrees of freedom.
     assert error @ np.linalg.solve(fix.covariance, error) < 16.3

@@ -41,10 +41,11 @@ def test_a_sloping_background_is_followed_within_its_sampling_error() -> None:
     pixels = np.rint(slope + rng.normal(0.0, 12.0, slope.shape)).astype(np.uint16)
     background = estimate_background(pixels)
     error = background.map(background.level) - slope
-    # The error is 12/16 counts for 256 samples per block. The worst of 64 blocks may have six times this
-    # error.
+    # With 256 samples per block, the error is 12/16 counts. The largest error of 64 blocks may be six times
+    # this error.
     assert np.abs(error[:, 32:-32]).max() < 4.5
-    # The slope spans 12.8 counts within a block of 64 px, which would make the noise sqrt(12^2 + 12.8^2/12).
+    # Within a block of 64 px, the slope changes the counts by 12.8, which would increase the noise to
+    # sqrt(12^2 + 12.8^2/12).
     assert background.stray_light
     assert background.noise.mean() == pytest.approx(12.0, rel=0.03)
 
@@ -127,7 +128,7 @@ SPIRAL = (np.hypot(Y - 100, X - 75) + np.arctan2(Y - 100, X - 75) * 6.0 / np.pi)
         (X + Y) % 40 < 3,
         (X % 7 < 2) | (RNG.random((200, 150)) < 0.02),
         SPIRAL,
-        X % 149 == 0,  # regions at the end of one row and the start of the next must not be joined
+        X % 149 == 0,  # the end of a row and the start of the next row are not neighbours
     ],
 )
 def test_regions_are_scipys_numbered_by_their_first_pixels(mask: BoolArray) -> None:
@@ -191,7 +192,10 @@ def test_weights_interpolate_between_block_centres_and_are_constant_beyond() -> 
 
 
 def test_moments_are_those_of_a_uniform_line_on_any_side_of_a_point_spread() -> None:
-    """The line is 12 px long and diagonal, and each of its 12,001 points is spread evenly over 1 px^2."""
+    """The moments of a region are those of a uniform line in any direction, blurred by a point spread.
+
+    The line is 12 px long, and each of its 12,001 points is spread evenly over 1 px^2.
+    """
     rng = np.random.default_rng(5)
     along = np.linspace(-6.0, 6.0, 12_001)
     spread = rng.normal(0.0, 0.8, (2, len(along)))
@@ -199,7 +203,7 @@ def test_moments_are_those_of_a_uniform_line_on_any_side_of_a_point_spread() -> 
     x, y = 40.0 + along * np.sqrt(0.5) + spread[0], 30.0 + along * np.sqrt(0.5) + spread[1]
     light = np.full(len(along), 2.0)
     owner = np.zeros(len(along), dtype=np.int64)
-    # The second region has counts in one pixel only, and the third region has zero counts.
+    # In the second region only one pixel has counts, and in the third region no pixel has counts.
     both = np.append(owner, [1, 2])
     found = moments(both, np.append(x, [7.0, 9.0]), np.append(y, [8.0, 9.0]), np.append(light, [4.0, 0.0]), 3)
     assert found.flux.tolist() == pytest.approx([24_002.0, 4.0, 0.0])
@@ -224,11 +228,11 @@ def test_the_line_of_second_moments_has_their_length_and_direction() -> None:
 @pytest.mark.parametrize(
     ("neighbours", "hot"),
     [
-        ([0.0] * 8, True),  # one bright pixel alone
-        ([17.9, 17.9, *[0.0] * 6], True),  # 15 % of 100 counts plus three sigmas of 1 count are 18 counts
+        ([0.0] * 8, True),  # a single bright pixel
+        ([17.9, 17.9, *[0.0] * 6], True),  # 15 % of 100 counts plus three sigmas of 1 count is 18 counts
         ([18.1, 18.1, *[0.0] * 6], False),
-        ([90.0, *[0.0] * 7], True),  # two bright pixels alone
-        ([90.0, 15.9, *[0.0] * 6], True),  # third pixel below 15 % of the brightest pixel plus one sigma
+        ([90.0, *[0.0] * 7], True),  # two bright pixels without bright neighbours
+        ([90.0, 15.9, *[0.0] * 6], True),  # a third pixel below 15 % of the brightest plus one sigma
         ([90.0, 16.1, *[0.0] * 6], False),
     ],
 )
@@ -306,7 +310,10 @@ def test_levels_between_counts_and_beyond_the_type_compare_as_numbers_do() -> No
 @pytest.mark.parametrize("size", [1, 2, 24, 25, 64, 255])
 @pytest.mark.parametrize("sigma", [0.0, 0.4, 3.0, 500.0])
 def test_the_compiled_moments_of_blocks_equal_those_in_numpy(size: int, sigma: float) -> None:
-    """Integer counts with little noise are equal in many pixels, and each block has a bright object."""
+    """The compiled moments of blocks equal those of numpy.
+
+    With little noise, many pixels have equal integer counts. Each block contains a bright object.
+    """
     draw = np.random.default_rng([size, round(10 * sigma)])
     values = np.round(draw.normal(100.0, sigma, (3, 4, size)))
     values[:, :, size // 2 :] += draw.choice([0.0, 3_000.0], (3, 4, 1))
@@ -348,7 +355,10 @@ def test_the_compiled_reduction_of_a_frame_equals_that_in_numpy(dtype: type[np.g
 
 
 def test_the_compiled_moments_of_regions_equal_those_in_numpy() -> None:
-    """One region has no pixels, and one has only pixels without light."""
+    """The compiled moments of regions equal those of numpy.
+
+    One region has no pixels, and one region has only pixels without light.
+    """
     draw = np.random.default_rng(7)
     owner = draw.integers(0, 5, 300)
     light = np.where(owner == 2, 0.0, draw.uniform(0.0, 90.0, 300))

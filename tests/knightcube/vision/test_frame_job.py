@@ -1,4 +1,4 @@
-"""Tests of the image-processing worker's job, which must never return a wrong rate or attitude."""
+"""Tests of the job of the image-processing worker, which must never return a wrong rate or attitude."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ESTIMATORS: list[LikelihoodSettings | StreakEstimator] = [
     LikelihoodSettings(saturation=65_535),
     CornerEstimator(StreakSettings()),
 ]
-# Rotation angle (rad) about the boresight that moves the frame's corner by one pixel.
+# Angle (rad) of a rotation about the boresight that moves the corner of the frame by one pixel.
 _RIGHT = 1.0 / NARROW.pinhole.half_diagonal / NARROW.pinhole.focal_length
 
 
@@ -82,9 +82,10 @@ def test_every_branch_gives_the_right_attitude_and_its_method(
 def test_a_streaked_frame_without_a_known_rate_is_solved(
     estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
-    """Without a rate prior, the sign of the rotation is unknown.
+    """A frame with streaks and without a known rate is solved.
 
-    The attitude at mid-exposure does not depend on the sign of the rotation.
+    Without a prior rate, the sign of the rotation is unknown. The attitude at mid-exposure does not depend on
+    this sign.
     """
     frame = _frame(40.0)
     found = run(replace(_job(frame, estimator), rate_prior=None))

@@ -24,8 +24,8 @@ from tests.support.limb_frames import camera_model, finder_settings
 
 SUN, NADIR = np.array([-0.59, 0.13, 0.80]), np.array([0.66, -0.62, -0.42])
 SHARES = np.array([0.14, 0.14, 0.83, 0.61, 0.15, 0.11])
-"""Currents relative to peak currents, with the Earth opposite to the Sun, so that it illuminates +x and
--y."""
+"""Currents of the strings relative to their peak currents. The Earth is opposite to the Sun, so it
+illuminates +x and -y."""
 CAMERA = MountedCamera(Pinhole.from_field_of_view(64, 64, 1.0), np.array([0.0, 0.0, 0.0, 1.0]))
 POSITION, SUNWARD = np.array([-4e6, 4e6, -3.9e6]), np.array([0.2, 0.3, 0.9])
 
@@ -42,7 +42,7 @@ def attitude() -> FloatArray:
 
 
 def off_deg(sigma: float) -> float:
-    """Return the error (deg) of the solar strings' Sun direction, with an attitude known to `sigma` rad."""
+    """Return the error (deg) of the Sun direction from strings, with an attitude known to `sigma` rad."""
     knowledge = HorizonKnowledge(position=POSITION, attitude=RoughAttitude(attitude(), sigma))
     dark = np.zeros((64, 64), dtype=np.uint8)
     found = run(HorizonCameraJob({0: dark}, (CAMERA,), knowledge, (SolarStringModel(), SHARES))).sun

@@ -40,7 +40,7 @@ def _begun(field_deg: float = 20.0) -> Pinhole:
 
 
 def _lens(rng: np.random.Generator, begun: Pinhole) -> Lens:
-    """Return a lens that differs from the initial camera by about 2 %, 10 px and some corner distortion."""
+    """Return a lens that differs from the initial lens by about 2 %, 10 px and some corner distortion."""
     return Lens(
         begun.columns,
         begun.rows,
@@ -54,7 +54,10 @@ def _lens(rng: np.random.Generator, begun: Pinhole) -> Lens:
 def _frames(
     rng: np.random.Generator, lens: Lens, count: int, stars: int, wrong: float = 0.0, noise: float = 0.1
 ) -> tuple[list[MatchedFrame], FloatArray]:
-    """Return frames at random attitudes (count, 4), with a fraction `wrong` of the matches swapped."""
+    """Return frames at random attitudes (count, 4).
+
+    In the fraction `wrong` of the matches, stars are exchanged.
+    """
     frames, attitudes = [], []
     for _ in range(count):
         attitude = normalise(rng.normal(size=4))
@@ -100,7 +103,8 @@ def test_without_a_prior_the_stars_alone_give_the_same_lens() -> None:
     assert _squared_error(found, truth) < chi2.ppf(0.9999, 5)
     assert found.sigma["centre_x"] < 1.0
     assert found.degrees == 10 * 40 * 2 - 5 - 30
-    # The error across the axis is 0.1 px/sqrt(40), and the error about the boresight is larger.
+    # The attitude error about axes normal to the boresight is 0.1 px/sqrt(40). The error about the boresight
+    # is larger.
     assert np.max(angle_between(found.attitudes, attitudes)) < 5.0 / truth.focal_length
 
 
@@ -127,7 +131,10 @@ def test_the_wrong_matches_are_reported() -> None:
 
 
 def test_a_lens_far_from_the_initial_lens_is_found() -> None:
-    """The initial focal length is wrong by 8 %, and the distortion is 40 px at the corners."""
+    """A lens far from the initial lens is found.
+
+    The initial focal length is wrong by 8 %, and the distortion at the corners is 40 px.
+    """
     rng = np.random.default_rng(85)
     begun = _begun()
     truth = Lens(1024, 1024, 1.08 * begun.focal_length, (540.0, 490.0), -1.0, 0.5)
@@ -148,7 +155,7 @@ def test_one_narrow_frame_does_not_determine_centre_and_distortion() -> None:
 
 
 def test_the_covariance_with_a_prior_agrees_with_the_errors() -> None:
-    """For lenses drawn from the prior and two narrow frames each, the error agrees with the covariance."""
+    """For lenses drawn from the prior, with two narrow frames each, the errors agree with the covariance."""
     rng = np.random.default_rng(87)
     prior = LensPrior(0.01, 8.0, 0.1, 0.2)
     runs, errors = 40, 0.0
@@ -182,7 +189,7 @@ def test_standard_deviations_that_are_too_small_increase_the_covariance() -> Non
 
 
 def test_the_derivatives_are_those_of_the_projection() -> None:
-    """If all derivatives are correct, one step of the fit from near the truth has a quadratic error."""
+    """The derivatives are correct: one step of the fit from near the truth leaves a quadratic error."""
     rng = np.random.default_rng(89)
     truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3, 0.02, -0.03, 0.04, 0.05)
     frames, attitudes = _frames(rng, truth, 2, 20, noise=1e-9)
@@ -219,7 +226,10 @@ def test_the_terms_that_the_stars_show_are_fitted_and_others_stay_zero(shape: di
 
 
 def test_the_lens_of_mirrored_images_is_that_of_the_images_as_they_are() -> None:
-    """Left and right are swapped in the image and in the sky."""
+    """The lens of mirrored images is that of the images as given.
+
+    Image and sky have left and right swapped.
+    """
     lens = Lens(1000, 800, 1500.0, (490.0, 410.0), -0.1, 0.02, 0.01, 0.02, 0.05, -0.04)
     unused = (np.ones(9, dtype=bool),)
     found = Calibration(lens, np.eye(9), (), np.zeros((1, 4)), unused, 1.0, 1, 0.2, 0.1)
@@ -272,7 +282,7 @@ def test_each_standard_deviation_has_the_name_of_its_parameter() -> None:
 
 
 def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, float]:
-    """Return the error of each key of `camera.accuracy`, as the configuration schema describes it."""
+    """Return the error of each key of `camera.accuracy`, as the configuration schema defines it."""
     lens = found.calibration.lens
     square = (math.hypot(*begun.centre) / lens.focal_length) ** 2
     corner = [
@@ -289,7 +299,7 @@ def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, flo
 
 @pytest.mark.parametrize(("field_deg", "count", "stars"), [(20.0, 1, 40), (12.0, 1, 15), (20.0, 3, 20)])
 def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: int, stars: int) -> None:
-    """Omitted terms contribute to the accuracy, because the change of the fit without them is an error."""
+    """The accuracy of a lens includes the omitted terms, because the fit changes without them."""
     rng, begun = np.random.default_rng(61), _begun(field_deg)
     ratios: dict[str, list[float]] = {"focal_length": [], "centre": [], "distortion": []}
     for _ in range(12):
@@ -304,7 +314,10 @@ def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: i
 
 
 def test_an_undetermined_term_is_omitted_whatever_its_fitted_value() -> None:
-    """In a narrow image, the fitted k2 has half its prior standard deviation and is meaningless."""
+    """A term that is not determined is omitted, whatever its fitted value is.
+
+    In a narrow image, the fitted k2 is half its prior standard deviation and has no meaning.
+    """
     rng, begun = np.random.default_rng(62), _begun(6.0)
     for _ in range(5):
         truth = _lens(rng, begun)
@@ -337,7 +350,10 @@ def test_missing_distortion_and_an_undetermined_centre_are_omitted() -> None:
 
 @pytest.mark.parametrize(("share", "known"), [(0.45, True), (0.55, False)])
 def test_the_distortion_is_stated_if_it_is_below_half_of_the_prior(share: float, known: bool) -> None:
-    """The expected displacement of a corner is that by k1 = 1 and k2 = 3 at a squared tangent of 0.25."""
+    """The distortion is stated if its uncertainty is below half of the prior uncertainty.
+
+    The expected displacement of a corner is that for k1 = 1 and k2 = 3 at a squared tangent of 0.25.
+    """
     lens = Lens(1024, 1024, 2.0 * math.hypot(511.5, 511.5), (511.5, 511.5), 0.0, 0.0)
     corner = math.hypot(1.0 * 0.25, 3.0 * 0.25**2)
     covariance = np.diag([0.0, 4.0, 4.0, (share * corner / 0.25) ** 2, *[0.0] * 5])

@@ -1,4 +1,4 @@
-"""Tests of the lens from solved frames: accuracy, covariance, a changed lens, and its use in a frame.
+"""Tests of the lens estimate from solved frames: accuracy, covariance, a changed lens, and its use.
 
 Star positions are computed with the true lens by `Lens.project`, not with the equations under test.
 """
@@ -108,7 +108,10 @@ def nees(known: LensKnowledge, camera: TrueCamera) -> float:
 
 @pytest.mark.parametrize("scale_error", [0.0, 0.05])
 def test_ten_frames_shrink_an_honest_covariance_of_the_lens(scale_error: float) -> None:
-    """The normalised error squared has six degrees of freedom, or five with an exact focal length."""
+    """Ten frames reduce the covariance of the lens, which agrees with the errors.
+
+    The normalised squared error has six degrees of freedom, or five with an exact focal length.
+    """
     found, sigmas = [], []
     for seed in range(5):
         rng = np.random.default_rng((31, seed))
@@ -118,11 +121,11 @@ def test_ten_frames_shrink_an_honest_covariance_of_the_lens(scale_error: float) 
         assert known.contradictions == 0
         found.append(nees(known, camera))
         sigmas.append(known.sigma / known.spread)
-    # The mean of 5 chi-squares of 5 or 6 degrees of freedom has a standard deviation of at most 1.6.
+    # The mean of five chi-squares with 5 or 6 degrees of freedom has a standard deviation of at most 1.6.
     assert 1.5 < np.mean(found) < 10.5
-    # A shift d of the axis displaces a star at a corner, 400 px from the axis, by only 0.05 d. With 250 stars
-    # of 0.05 px, the error of the axis is therefore at least 0.06 px, and some tenths of a pixel with unknown
-    # distortion.
+    # A shift d of the optical axis displaces a star at a corner, 400 px from the axis, by only 0.05 d. With
+    # 250 stars of 0.05 px, the error of the axis is at least 0.06 px, and some tenths of a pixel if the
+    # distortion is unknown.
     shrunk = np.median(sigmas, axis=0)
     assert np.all(shrunk[[1, 2]] < 0.25)
     assert shrunk[9] < 0.01
@@ -180,7 +183,7 @@ def test_frames_that_cannot_teach_change_nothing() -> None:
     rng = np.random.default_rng(71)
     camera, known = TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN)
     assert known.update(*frame_of(camera, known, rng, stars=5)) is known
-    # Without the direction of the rotation, the effect of an unknown line time has an unknown sign.
+    # If the direction of the rotation is unknown, the effect of an unknown line time has an unknown sign.
     ambiguous = frame_of(camera, known, rng, status=StreakStatus.AMBIGUOUS)
     assert known.update(*ambiguous) is known
 
@@ -225,16 +228,16 @@ def test_the_camera_of_the_streak_fit_images_like_the_learned_lens(k1: float, k2
     simple = DistortedPinhole.of(lens)
     ideal = Pinhole(640, 480, 1800.0).project(lens.unit_vectors(pixels))
     off = np.hypot(*(simple.distorted(ideal) - pixels).T)
-    # The remainder of the fourth power is at most 0.13 of the second term, which displaces corners by 0.9 px.
+    # The term of fourth power is at most 0.13 of the second term, which displaces corners by 0.9 px.
     assert off.max() < (1e-6 if k2 == 0.0 else 0.15)
     still = CameraMotion.steady(np.zeros(3))
     assert np.allclose(positions(simple, still, pixels, np.zeros(200)), pixels, atol=1e-6)
 
 
 def test_the_accuracy_of_the_lens_contains_the_scatter_of_the_corner() -> None:
-    """The stated distortion is the relative error of the distance of an image corner from the optical axis.
+    """The stated accuracy of the distortion equals the scatter of an image corner for random lenses.
 
-    The test computes this error from random lenses.
+    This accuracy is the relative error of the distance of an image corner from the optical axis.
     """
     rng = np.random.default_rng(111)
     known: Any = learned(TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN, scale_error=0.02), rng, 5)
@@ -253,14 +256,17 @@ def test_the_configured_axis_shows_the_same_direction_through_the_learned_lens()
     shown = lens.unit_vectors(np.array([DESCRIBED.centre]))[0]
     assert np.allclose(attitude_matrix(turn) @ [0.0, 0.0, 1.0], shown, atol=1e-12)
     assert abs(turn[2]) < 1e-15, "no rotation about the boresight"
-    # The two stars are near the axis, where the estimated lens changes directions only by its scale.
+    # Both stars are near the axis, where the estimated lens changes directions only by its scale.
     pixels = np.array(DESCRIBED.centre) + np.array([[40.0, 0.0], [0.0, -40.0]])
     there = lens.unit_vectors(pixels) @ attitude_matrix(turn)
     assert np.allclose(there[:, :2] / there[:, 2:], (pixels - DESCRIBED.centre) / 1790.0, atol=2e-5)
 
 
 def test_rate_and_attitude_of_a_frame_are_in_the_axes_of_the_configured_lens() -> None:
-    """A star at the configured axis has the same direction in the body as without an estimated lens."""
+    """Rate and attitude of a frame are in the axes of the configured lens.
+
+    A star at the configured optical axis has the same direction in the body as without an estimated lens.
+    """
     rng = np.random.default_rng(121)
     camera = TrueCamera(Lens(640, 480, 1800.0, (324.0, 236.0)))
     known = learned(camera, LensKnowledge.of(DESCRIBED, KNOWN), rng, 12)
@@ -276,7 +282,7 @@ def test_rate_and_attitude_of_a_frame_are_in_the_axes_of_the_configured_lens() -
     assert found.solution is not None
     assert found.solution.fix is not None
     seen = attitude_matrix(found.solution.fix.quaternion) @ star
-    # The axis, estimated to a fraction of a pixel, is 5.7 px from its configured position.
+    # The optical axis, estimated to a fraction of a pixel, is 5.7 px from its configured position.
     assert np.allclose(seen, [0.0, 0.0, 1.0], atol=1.5 / 1800.0)
     assert found.motion.rate is not None
     turned = attitude_matrix(found.solution.fix.quaternion) @ attitude_matrix(true).T @ rate

@@ -1,6 +1,6 @@
-"""Tests that recorded results of Sun sensing, solar strings, lens calibration and frame jobs are repeated.
+"""Tests that Sun directions, solar strings, lens calibration and frame jobs give their recorded results.
 
-The new results must equal the recorded ones to five digits.
+The new results must equal the recorded results to five digits.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def test_the_star_tracker_is_as_recorded() -> None:
 
 
 def check_sun(name: str) -> None:
-    """Compare the Sun direction found in a camera's frame with the record."""
+    """Compare the Sun direction in a camera's frame with the recorded direction."""
     model, settings = CAMERAS[name]
     scene = random_sun_scene(np.random.default_rng(21), model)
     pixels = render(model, scene, np.random.default_rng(22))
@@ -94,7 +94,7 @@ def test_the_coarse_sun_of_solar_strings_is_as_recorded() -> None:
 
 
 def matched(lens: Lens, count: int, wrong: float) -> list[MatchedFrame]:
-    """Return frames of matched stars, of which a fraction is wrong."""
+    """Return frames of matched stars. A fraction of the matches is wrong."""
     rng = np.random.default_rng(24)
     frames = []
     for _ in range(count):

@@ -23,9 +23,10 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 
 def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray, FloatArray, int, int]:
-    """Return errors (n,) rad, normalised squared errors (n,), and the numbers of two wrong decisions.
+    """Return errors (n,), rad, normalised squared errors (n,), and two numbers of wrong decisions.
 
-    The first number is of sunlit readings that were judged dark, the second of dark readings that were not.
+    The first number counts sunlit readings that were judged dark. The second number counts dark readings that
+    were judged sunlit.
     """
     generator = np.random.default_rng(seed)
     errors, squares, false_dark, false_light = [], [], 0, 0
@@ -52,15 +53,16 @@ def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray
 def test_the_coarse_sun_is_accurate_to_a_few_degrees_with_its_covariance(
     nadir_known: bool, limit: float
 ) -> None:
-    """The readings are from 400 random positions and attitudes.
+    """The coarse Sun direction is accurate to a few degrees, and agrees with its covariance.
 
-    Each string has a gain error of 2 %, and the albedo is 0.3.
+    The readings are from 400 random positions and attitudes. Each string has a gain error of 2 %, and the
+    albedo is 0.3.
     """
     errors, squares, false_dark, false_light = _reading(5, nadir_known)
     assert len(errors) > 250
     assert np.degrees(np.sqrt(np.mean(errors**2))) < limit
     assert np.mean(squares) < 2.3
-    assert np.percentile(squares, 95) < 6.0  # 95 % quantile for two degrees of freedom
+    assert np.percentile(squares, 95) < 6.0  # 95 % quantile of chi-square with two degrees of freedom
     assert false_dark == 0
     assert false_light == 0
 
@@ -80,9 +82,9 @@ def test_ideal_strings_obey_the_cosine_law_and_give_the_exact_direction() -> Non
 
 
 def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_the_view_factor() -> None:
-    """Close above the subsolar point, the Earth has a view factor of (R/r)^2 from the plate.
+    """The Earth light on a plate that faces the subsolar point is the albedo times the view factor (R/r)^2.
 
-    The mean solar cosine of the visible ground is one to within a few per cent at 200 km.
+    At an altitude of 200 km, the mean solar cosine of the visible ground is within a few per cent of one.
     """
     position = np.array([EARTH_RADIUS + 200e3, 0.0, 0.0])
     model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0)
@@ -91,14 +93,17 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
     view = (EARTH_RADIUS / position[0]) ** 2
     assert currents[0] == pytest.approx(1.0, abs=1e-4)
     assert currents[3] == pytest.approx(0.3 * view, rel=0.05)
-    # A plate perpendicular to the ground receives at most half of this light, equally on all four sides.
+    # A plate that is vertical receives at most half of this light, and equally on all four sides.
     sides = currents[[1, 2, 4, 5]]
     assert np.ptp(sides) < 2e-3
     assert 0.2 * currents[3] < sides.mean() < 0.5 * currents[3]
 
 
 def test_an_unknown_nadir_gives_the_mean_and_the_covariance_of_all_directions_and_albedos() -> None:
-    """The readings are simulated for 200,000 random nadir directions and albedos."""
+    """If nadir is unknown, the Sun direction has the mean and the covariance over all nadirs and albedos.
+
+    The readings are simulated for 200,000 random nadir directions and albedos.
+    """
     generator = np.random.default_rng(11)
     directions = generator.standard_normal((200_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -121,7 +126,10 @@ def test_in_eclipse_the_solar_strings_report_darkness() -> None:
 
 
 def test_currents_that_no_sun_direction_explains_are_uncertain() -> None:
-    """One string has 1.5 times the largest possible current, or opposite faces have full currents."""
+    """Currents that no Sun direction explains give an uncertain Sun.
+
+    One string has 1.5 times the largest possible current, or opposite faces have full currents.
+    """
     towards = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
     good = np.maximum(STRINGS.normals @ towards, 0.0)
     assert coarse_sun(good, STRINGS).status is CoarseSunStatus.FOUND
@@ -143,7 +151,7 @@ def test_wrong_currents_and_strings_are_refused() -> None:
 
 
 def _cameras() -> list[MountedCamera]:
-    """Return the cameras of UW: three sides 120 deg apart and the top (Meller et al., section 4.2)."""
+    """Return the cameras of UW: three side cameras 120 deg apart and a top camera (Meller et al., 4.2)."""
     angles = np.radians([0.0, 120.0, 240.0])
     sides = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
     down = np.array([0.0, 0.0, -1.0])
@@ -164,7 +172,10 @@ def test_the_camera_that_has_the_sun_is_read_first() -> None:
 
 
 def test_a_sun_between_two_fields_is_possible_in_the_nearest_only() -> None:
-    """The Sun is 2 deg beyond the edge of a field of view, and the coarse Sun has an error of 3 deg."""
+    """If the Sun is between two fields of view, only the nearest camera may show it.
+
+    The Sun is 2 deg beyond the edge of a field of view, and the coarse Sun has an error of 3 deg.
+    """
     towards = np.array([np.cos(np.radians(35.5)), np.sin(np.radians(35.5)), 0.0])
     basis = np.array([[-towards[1], towards[0], 0.0], [0.0, 0.0, 1.0]])
     sun = CoarseSun(CoarseSunStatus.FOUND, towards, basis, np.radians(3.0) ** 2 * np.eye(2))

@@ -32,7 +32,7 @@ def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) ->
     assert solution
     assert (solution.status, solution.reason) == ("solved", "")
     error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))
-    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # chi-square of 3, 0.1 %
+    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # 99.9 % of chi-square with 3 degrees
     assert np.linalg.norm(error[:2]) < 15.0 * ARCSECOND
     assert solution.field_of_view_deg == pytest.approx(12.0, abs=0.01)
     assert not solution.mirrored
@@ -59,9 +59,10 @@ print(*found.quaternion, *found.covariance.ravel(), len(found.stars))
 
 @pytest.mark.slow
 def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_path: Path) -> None:
-    """The test program ends if a numpy implementation, which is slow, silently replaces a compiled one.
+    """The compiled implementations alone give the same attitude.
 
-    In a new clone the program first compiles for up to a minute of processor time.
+    The test program ends if a slow numpy implementation silently replaces a compiled one. In a new clone the
+    program first compiles for up to a minute of processor time.
     """
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     np.save(tmp_path / "image.npy", resting.pixels)
@@ -77,7 +78,7 @@ def test_the_compiled_forms_alone_give_the_same_attitude(resting: SkyFrame, tmp_
 
 
 def test_right_ascension_declination_and_roll_are_those_of_the_quaternion(resting: SkyFrame) -> None:
-    """The boresight is the third row of the attitude matrix, and north is up if the roll is zero."""
+    """The boresight is the third row of the attitude matrix, and north is up at zero roll."""
     solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
     x, y, z, w = solution.quaternion
     boresight = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
@@ -135,9 +136,9 @@ def test_a_wrong_field_of_view_is_refused_with_the_searched_fields(resting: SkyF
 
 
 def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> None:
-    """A pixel with three equal colour values has this value as luminance."""
+    """A colour image has the solution of its luminance. Three equal colour values are the luminance."""
     colours = np.repeat(resting.pixels[..., None], 4, axis=2)
-    colours[..., 3] = 7  # transparency
+    colours[..., 3] = 7  # the alpha channel
     tracker = StarTracker(fov_deg=12.0)
     grey = tracker.solve(resting.pixels)
     for image in (colours, colours[..., :3], colours[..., :1]):
@@ -147,14 +148,17 @@ def test_a_colour_image_has_the_solution_of_its_luminance(resting: SkyFrame) -> 
 def test_wide_stars_of_a_large_image_are_solved_in_sums_of_pixels(
     resting: SkyFrame, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Large photographs have stars of several pixels, and correlated noise of neighbouring pixels."""
+    """Images with stars of several pixels are solved in sums of pixels.
+
+    Large photographs have such stars, and the noise of neighbouring pixels is correlated.
+    """
     spread = gaussian_filter(np.kron(resting.pixels.astype(float), np.ones((3, 3))), 3.0)
     image = np.rint(spread[1:-1, 1:-1]).astype(np.uint16)
     tracker = StarTracker(fov_deg=12.0)
     solution = tracker.solve(image)
     assert solution, "the sums of 3 x 3 px leave two pixels at each side"
     error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))
-    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # chi-square of 3, 0.1 %
+    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # 99.9 % of chi-square with 3 degrees
     assert solution.sky_map is not None
     places = solution.sky_map.pixels(solution.stars.directions)
     np.testing.assert_allclose(places, solution.stars.points - solution.stars.residuals, atol=1e-6)
@@ -180,7 +184,10 @@ def test_a_predicted_attitude_is_used_and_a_wrong_one_does_no_harm(resting: SkyF
 
 
 def test_the_date_corrects_aberration_by_at_most_its_constant(resting: SkyFrame) -> None:
-    """The frame is simulated without aberration, so that a date changes the attitude by 20.5" at most."""
+    """A date changes the attitude by at most the constant of aberration, 20.5".
+
+    The frame is simulated without aberration.
+    """
     tracker = StarTracker(camera=resting.camera.pinhole)
     plain = tracker.solve(resting.pixels)
     naive, aware = datetime(2026, 7, 2, 12), datetime(2026, 7, 2, 12, tzinfo=UTC)

@@ -1,6 +1,6 @@
-"""Tests of the Sun direction on simulated frames with and without the Sun, also from several cameras.
+"""Tests of the Sun direction from simulated frames of one or several cameras, with and without the Sun.
 
-Solar strings choose the camera to read, and give the direction if no camera finds the Sun.
+Solar strings select the camera that is read. If no camera finds the Sun, they give the Sun direction.
 """
 
 from __future__ import annotations
@@ -40,15 +40,16 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 @cache
 def _campaign(name: str) -> Outcome:
-    """Return the outcome for frames with the Sun."""
+    """Return the results for frames with the Sun."""
     return frames_with_sun(name, 12, seed=11)
 
 
 @pytest.mark.parametrize(("name", "limit"), [("logarithmic", 0.005), ("linear", 0.01)])
 def test_the_sun_is_found_to_hundredths_of_a_degree_wherever_it_stands(name: str, limit: float) -> None:
-    """A pixel spans 0.15 deg, and the core of the Sun's disc is saturated in both cameras.
+    """The Sun is found to hundredths of a degree at any position in the frame.
 
-    The test uses twelve frames of seed 11.
+    A pixel is 0.15 deg, and the core of the Sun's disc is saturated in both cameras. The test uses twelve
+    frames of seed 11.
     """
     outcome = _campaign(name)
     assert outcome.statuses["found"] + outcome.statuses["partial"] >= 11
@@ -57,7 +58,10 @@ def test_the_sun_is_found_to_hundredths_of_a_degree_wherever_it_stands(name: str
 
 @pytest.mark.parametrize("name", ["logarithmic", "linear"])
 def test_the_covariance_is_honest(name: str) -> None:
-    """The mean of 12 chi-squares with two degrees of freedom is below 4.3 in 99.9 % of cases."""
+    """The normalised squared errors agree with the covariance.
+
+    The mean of 12 chi-squares with two degrees of freedom is below 4.3 in 99.9 % of cases.
+    """
     squares = _campaign(name).squares
     assert np.mean(squares) < 4.3
     assert max(squares) < 25.0
@@ -65,7 +69,7 @@ def test_the_covariance_is_honest(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(CAMERAS))
 def test_no_sun_is_found_in_frames_without_the_sun(name: str) -> None:
-    """The frames show limb, clouds and hot pixels.
+    """No Sun is found in frames that show limb, clouds and hot pixels.
 
     The frames of the overexposed camera also show large saturated clouds.
 
@@ -76,7 +80,7 @@ def test_no_sun_is_found_in_frames_without_the_sun(name: str) -> None:
 
 
 def _space_scene(ray: FloatArray) -> EarthScene:
-    """Return a scene that looks away from the Earth, with the Sun along `ray` (3,) in camera axes."""
+    """Return a scene that shows no Earth, with the Sun along `ray` (3,) in camera axes."""
     position = (6.378e6 + LOW) * np.array([0.0, 0.0, 1.0])
     attitude = pointing(np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
     empty = EarthScene(position, attitude, position + ASTRONOMICAL_UNIT * np.array([0.0, 0.0, 1.0]))
@@ -90,7 +94,10 @@ def _frame_at(x: float, y: float, model: EarthCameraModel, seed: int = 1) -> tup
 
 
 def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_edge() -> None:
-    """The disc has a radius of 11 px, and its centre is 2 px inside or outside of the frame."""
+    """A Sun at the edge is found, with a covariance that is larger normal to the edge.
+
+    The disc has a radius of 11 px, and its centre is 2 px inside or outside of the frame.
+    """
     model, settings = CAMERAS["linear"]
     whole, _ = _frame_at(200.0, 300.0, model)
     entire = find_sun(whole, model.lens, settings).sun
@@ -103,13 +110,16 @@ def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_
         assert solution.sun is not None
         assert solution.sun.sigma > 1.2 * entire.sigma
         off = solution.sun.basis @ truth
-        # Limit that one in a thousand cases exceeds.
+        # Limit that is exceeded in one of a thousand cases.
         assert off @ np.linalg.solve(solution.sun.tangent_covariance, off) < 14.0
         assert np.degrees(np.hypot(*off)) < 0.06
 
 
 def test_the_sun_is_found_in_the_corners_of_a_field_of_92_deg() -> None:
-    """In the corners, a pinhole stretches the disc to 1.7 times its width, but not the blur around it."""
+    """The Sun is found in the corners of a field of 92 deg.
+
+    In the corners, a pinhole widens the disc to 1.7 times its width, but not the blur around the disc.
+    """
     model = wide_model(WideCamera(columns=512, rows=512, field_of_view_deg=92.0))
     for number, (x, y) in enumerate(
         [(36.0, 40.0), (51.0, 479.0), (470.0, 38.5), (466.2, 470.7), (256.0, 30.0)]
@@ -131,9 +141,9 @@ def test_the_same_sun_is_found_in_twelve_bits() -> None:
 
 
 def test_a_sun_that_blooms_over_whole_columns_is_refused() -> None:
-    """The charge of the Sun spreads over a whole column, so that the patch is not round.
+    """A Sun that blooms over a whole column is refused, because its patch is not round.
 
-    The remedy is a shorter exposure.
+    The message recommends a shorter exposure.
     """
     blooming = replace(CAMERAS["linear"][0], blooming=True)
     frame, _ = _frame_at(300.3, 240.8, blooming)
@@ -154,7 +164,7 @@ def test_without_settings_the_camera_is_a_linear_one() -> None:
 
 
 def test_few_pixels_are_read() -> None:
-    """A third of the rows are read first, and then all rows around the Sun."""
+    """Few pixels are read: at first every third row, and then all rows around the Sun."""
     frame, _ = _frame_at(250.0, 250.0, MODEL)
     solution = find_sun(frame, MODEL.lens, SETTINGS)
     rows = solution.pixels_read / 512
@@ -179,7 +189,10 @@ def _disc_frame(radius: float, x: float = 256.0, y: float = 200.0) -> Image:
 
 
 def test_a_ragged_rim_increases_the_covariance() -> None:
-    """The radius of a disc varies with five periods around its edge, by 0 and by 0.3 px."""
+    """A ragged edge of the disc increases the covariance.
+
+    The radius of the disc varies with five periods around its edge, by 0 or 0.3 px.
+    """
     y, x = np.mgrid[0:512, 0:512] - np.array([200.0, 256.0])[:, None, None]
     around = np.sin(5.0 * np.arctan2(y, x))
     sizes = []
@@ -226,7 +239,7 @@ WIDE_MODEL = EarthCameraModel.fuga15d(seed=1)
 JOINT_SETTINGS = SunSettings()
 DARK = np.full((512, 512), 8, dtype=np.uint8)
 TURNS = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0]])
-"""Mountings of three cameras as rotation vectors from body axes to camera axes."""
+"""Mountings of three cameras, as rotation vectors (rad) from body axes to camera axes."""
 MOUNTED = [MountedCamera(WIDE_MODEL.lens, from_rotation_vector(turn)) for turn in TURNS]
 
 
@@ -239,7 +252,7 @@ def seen() -> tuple[EarthScene, Image]:
 
 
 def _in_body(scene: EarthScene, number: int = 1) -> FloatArray:
-    """Return the true Sun (3,) in body axes for a scene of one camera."""
+    """Return the true Sun direction (3,), body axes, in the scene of one camera."""
     return MOUNTED[number].in_body(sun_direction(scene))
 
 
@@ -276,7 +289,10 @@ def test_the_solar_strings_give_the_direction_if_no_camera_finds_the_sun(
 
 
 def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthScene, Image]) -> None:
-    """The image with the Sun is from a camera whose field of view only just includes the coarse direction."""
+    """A reflection far from the strings' Sun direction is not taken as the Sun.
+
+    The image with the Sun is from a camera whose field of view only just includes the coarse direction.
+    """
     scene, frame = seen
     true = MOUNTED[0].in_body(np.array([0.0, np.sin(0.5), np.cos(0.5)]))
     assert float(true @ _in_body(scene, 0)) < np.cos(0.3)
@@ -288,7 +304,10 @@ def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthS
 
 
 def test_a_sun_cut_by_the_frames_edge_has_a_larger_covariance(seen: tuple[EarthScene, Image]) -> None:
-    """The error of a truncated disc is equal in every frame, up to 0.03 deg for a sigma of 0.007 deg."""
+    """The covariance of a Sun that the edge truncates is larger.
+
+    The error of a truncated disc is the same in every frame, up to 0.03 deg for a sigma of 0.007 deg.
+    """
     scene, _ = seen
     turn = shortest_turn(sun_direction(scene), WIDE_MODEL.lens.unit_vectors(np.array([[510.7, 300.0]]))[0])
     cut = replace(scene, attitude=from_matrix(turn @ scene.camera_matrix))
@@ -334,13 +353,16 @@ def test_a_strip_is_sampled_bilinearly_up_to_its_border() -> None:
 
 
 def test_strings_in_one_plane_leave_the_cameras_above_and_below_it_possible() -> None:
-    """Six side panels determine only the Sun's azimuth; the error of its elevation is unbounded."""
+    """Strings in one plane do not exclude the cameras above and below this plane.
+
+    Six side panels determine only the azimuth of the Sun. The error of its elevation is not limited.
+    """
     direction, basis = np.array([1.0, 0.0, 0.0]), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     coarse = CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.diag([1e-4, 1e6]))
     lens = Pinhole.from_field_of_view(128, 128, np.radians(40.0))
 
     def camera(elevation: float, azimuth: float) -> MountedCamera:
-        """Return a camera whose boresight has these angles (deg) from x."""
+        """Return a camera whose boresight has the given angles (deg) from x."""
         up, side = np.radians([elevation, azimuth])
         boresight = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
         right = np.array([-np.sin(side), np.cos(side), 0.0])

@@ -1,1 +1,1 @@
-"""Tests of the Earth and Sun camera's simulator."""
+"""Tests of the simulator of the Earth and Sun camera."""

@@ -20,20 +20,21 @@ View = Literal["sunlit", "terminator", "dark", "any"]
 LOW, HIGH = 200e3, 2000e3
 """Range of altitudes (m) above the equatorial radius."""
 DAY, NIGHT = 0.1, -0.1
-"""Cosines of the Sun's zenith distance above and below which a limb point is clearly lit or dark."""
+"""Cosines of the Sun's zenith distance above which a limb point is clearly lit, and below which it is dark.
+"""
 _MOST_DRAWS = 20_000
 _LEAST_POINTS = 60
 """Number of limb points, of 720, that must be on the detector for the horizon to be in view."""
 
 
 def random_direction(generator: np.random.Generator) -> FloatArray:
-    """Return a unit vector (3,), all directions equally likely."""
+    """Return a random unit vector (3,), with a uniform distribution over the sphere."""
     vector = generator.standard_normal(3)
     return np.asarray(vector / np.linalg.norm(vector))
 
 
 def pointing(boresight: FloatArray, down: FloatArray) -> FloatArray:
-    """Return the attitude (4,) with +z along `boresight` (3,) and +y (image down) nearest to `down` (3,)."""
+    """Return the attitude (4,) with +z along `boresight` (3,) and +y (image down) closest to `down` (3,)."""
     across = np.cross(down, boresight)
     across = across / np.linalg.norm(across)
     return quaternion.from_matrix(np.stack([across, np.cross(boresight, across), boresight]))
@@ -42,10 +43,10 @@ def pointing(boresight: FloatArray, down: FloatArray) -> FloatArray:
 def limb_scene(
     altitude: float = 600e3, *, zenith: FloatArray, sun: FloatArray, dip: float = 0.0, texture: int = 0
 ) -> EarthScene:
-    """Return a scene above `zenith` (3,), the Sun towards `sun` (3,), and a horizontal limb in the centre.
+    """Return a scene above `zenith` (3,) with the Sun along `sun` (3,), and a horizontal limb in the centre.
 
-    `dip` (rad) rotates the boresight below the centre of the limb. The camera's azimuth is that of the Sun,
-    or that of the pole if the Sun is overhead.
+    `dip` (rad) is the angle of the boresight below the limb. The camera points to the azimuth of the Sun, or
+    of the pole if the Sun is overhead.
     """
     zenith = zenith / np.linalg.norm(zenith)
     side = np.cross(zenith, sun)
@@ -68,8 +69,8 @@ def random_scene(
 ) -> EarthScene:
     """Return a random scene with the horizon in view.
 
-    `view` states the illumination of the visible limb: all day, partly day and night, all night, or any.
-    `accept` may refuse a scene. Raises RuntimeError if none is found.
+    `view` states the illumination of the visible limb: day, day and night, night, or any. The function
+    `accept` may refuse a scene. Raises RuntimeError if no scene is found.
     """
     for _ in range(_MOST_DRAWS):
         scene = _draw(generator, model, altitudes)
@@ -95,7 +96,8 @@ def random_sun_scene(
 ) -> EarthScene:
     """Return a scene with the whole Sun at a random pixel, at least `margin` px inside the edge.
 
-    With a negative margin, the Sun may be outside by this amount. Raises RuntimeError if none is found.
+    If `margin` is negative, the Sun may be outside of the frame by this number of pixels. Raises RuntimeError
+    if no scene is found.
     """
     for _ in range(_MOST_DRAWS):
         size = np.array([model.columns, model.rows])
@@ -103,8 +105,8 @@ def random_sun_scene(
         ray = model.lens.unit_vectors(point[None, :])[0]
         sun = random_direction(generator)
         roll = random_direction(generator)
-        # The attitude follows from two triads, in camera axes and in inertial axes, each of the Sun direction
-        # and a second direction.
+        # The attitude follows from two triads of vectors, in camera axes and in inertial axes. Each triad is
+        # that of the Sun direction and a second direction.
         camera = _triad(ray, np.array([0.6, 0.8, 0.0]))
         attitude = quaternion.from_matrix(camera.T @ _triad(sun, roll))
         position = (SEMI_MAJOR_AXIS + generator.uniform(*altitudes)) * random_direction(generator)

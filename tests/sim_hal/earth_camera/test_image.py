@@ -1,4 +1,4 @@
-"""Tests of frames of Earth and Sun: detector response, noise, defects and blooming, and the Sun's disc."""
+"""Tests of frames of Earth and Sun: detector response, noise, defects, blooming, and the Sun's disc."""
 
 from __future__ import annotations
 
@@ -31,13 +31,16 @@ def test_counts_grow_with_the_light_over_six_decades_evenly_by_its_logarithm() -
     light = LOGARITHMIC.darkest * 10.0 ** np.arange(0.0, 6.01, 0.25)
     mean = np.array([_even(LOGARITHMIC, value).mean() for value in light])
     assert np.all(np.diff(mean) > 0.0)
-    steps = np.diff(mean[6:-1])  # steps above the knee at the dark current
+    steps = np.diff(mean[6:-1])  # steps above the knee of the response, which is at the dark current
     assert steps == pytest.approx(0.25 * (255 - 8) / 6.0, abs=0.5)
     assert mean[-1] == pytest.approx(255, abs=1.0)
 
 
 def test_darkness_reads_the_pedestal_with_the_stated_noise() -> None:
-    """Rounding adds 1/12 count^2 to the variance, which 262,144 pixels determine to within 0.3 %."""
+    """A dark frame has the pedestal and the stated noise.
+
+    Rounding adds 1/12 count^2 to the variance, which 262,144 pixels determine to within 0.3 %.
+    """
     for model, sigma in ((LOGARITHMIC, 0.7), (LINEAR, 20.0 / 80.0)):
         fine = EarthCameraModel.fuga15d(
             response=model.response,
@@ -56,7 +59,7 @@ def test_darkness_reads_the_pedestal_with_the_stated_noise() -> None:
 
 
 def test_the_linear_cameras_noise_is_that_of_the_charge() -> None:
-    """The variance in e- is that of the charge plus the read noise, up to the full well."""
+    """In a linear camera, the variance (e-^2) is the charge plus the squared read noise, to the full well."""
     model = EarthCameraModel.fuga15d(
         response="linear",
         bits=16,
@@ -147,7 +150,7 @@ def test_the_disc_is_centred_where_the_lens_projects_the_suns_direction(model: E
 
 
 def test_all_the_suns_light_arrives_pi_in_these_units() -> None:
-    """A matt white surface of radiance one has an irradiance of pi, whatever the disc's size in px."""
+    """The irradiance of a matt white surface of radiance one is pi, whatever the size of the disc in px."""
     sun = ASTRONOMICAL_UNIT * np.array([0.1, 0.05, 1.0]) / np.linalg.norm([0.1, 0.05, 1.0])
     scene = _deep_space(sun, np.array([0.0, 0.0, 1.0]))
     for model in (CLEAN, EarthCameraModel.fuga15d(scatter=0.0, field_of_view=np.radians(20.0))):
@@ -158,7 +161,7 @@ def test_all_the_suns_light_arrives_pi_in_these_units() -> None:
 
 
 def test_the_discs_radius_is_the_suns() -> None:
-    """In a narrow camera, the edge of the disc is where the brightness falls to half."""
+    """In a narrow camera, the brightness falls to half at the edge of the Sun's disc."""
     model = EarthCameraModel.fuga15d(scatter=0.0, field_of_view=np.radians(5.0))
     scene = _deep_space(ASTRONOMICAL_UNIT * np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]))
     across = expected_radiance(model, scene)[255]
@@ -175,7 +178,8 @@ def test_glare_holds_its_share_of_the_light_and_stays_when_the_sun_leaves_the_fi
     rays = pixel_rays(model.lens)
     solid = (rays[:, 2].reshape(light.shape)) ** 3 / model.lens.focal_length**2
     chords = np.linalg.norm(rays - ahead, axis=1).reshape(light.shape)
-    # Fraction of the scattering law's logarithmic integral between 3 deg and the inscribed circle of 60 deg.
+    # Fraction, between 3 deg and the inscribed circle of 60 deg, of the logarithmic integral of the
+    # scattering law.
     ring = (chords > np.radians(3.0)) & (chords < 1.0)
     square = model.scatter_angle**2
     part = np.log((1.0 + 1.0 / square) / (1.0 + np.radians(3.0) ** 2 / square)) / np.log(1.0 + 2.0 / square)
@@ -190,7 +194,10 @@ def test_glare_holds_its_share_of_the_light_and_stays_when_the_sun_leaves_the_fi
 
 
 def test_the_earth_hides_the_sun_and_its_air_dims_it() -> None:
-    """The brightness falls from full Sun to none within the disc's 0.53 deg and the air above the limb."""
+    """The Earth hides the Sun, and its atmosphere dims the Sun above the limb.
+
+    The brightness falls to zero within the disc's 0.53 deg and the atmosphere above the limb.
+    """
     distance = SEMI_MAJOR_AXIS + 600e3
     edge = np.arcsin(SEMI_MAJOR_AXIS / distance)
     shares = []
@@ -219,15 +226,15 @@ def test_a_sun_behind_the_earth_leaves_no_trace() -> None:
 
 
 def test_part_of_a_disc_on_the_edge_is_part_of_the_disc_in_the_field() -> None:
-    """With the Sun half beyond the edge, the common pixels of both images are equal."""
+    """If half of the Sun is beyond the edge, the common pixels of a narrow and a wide image are equal."""
     wide = EarthCameraModel.fuga15d(scatter=0.0)
     narrow = EarthCameraModel(
         lens=replace(wide.lens.ideal, columns=256, focal_length=wide.lens.focal_length),
         columns=256,
         scatter=0.0,
     )
-    # The last column of the narrow camera is the central column of the wide camera, whose axis is 128 px
-    # away.
+    # The last column of the narrow camera is the central column of the wide camera, whose optical axis is 128
+    # px away.
     ahead = np.array([0.0, 0.0, 1.0])
     f = wide.lens.focal_length
     turned = np.array([128.0 / f, 0.0, 1.0])
@@ -254,13 +261,13 @@ def test_logarithmic_and_linear_frames_saturate_in_the_core_and_nowhere_in_the_d
 
 @pytest.mark.parametrize("aside", [1e-3, 1e-6, 1e-9])
 def test_a_sun_at_a_right_angle_to_the_boresight_leaves_no_disc(aside: float) -> None:
-    """The Sun must leave no disc in the image.
+    """A Sun at 90 deg from the boresight gives no disc in the image.
 
-    Without lens distortion, the coordinates of its image are beyond the range of integers.
+    Without lens distortion, the coordinates of its image exceed the range of integers.
     """
     model = EarthCameraModel.fuga15d(scatter=0.0, k1=-0.05, k2=0.01)
     boresight = np.array([0.0, 1.0, 0.0])
-    # The Sun's disc with a radius of 0.27 deg crosses the plane beyond which the lens images nothing.
+    # The Sun's disc, with a radius of 0.27 deg, crosses the plane beyond which the lens has no image.
     for number in range(48):
         angle = number * (np.pi / 24.0)
         sun = np.array([np.sin(angle), aside, np.cos(angle)])

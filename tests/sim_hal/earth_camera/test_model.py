@@ -1,4 +1,4 @@
-"""Tests of the Earth camera's settings: defaults, and the limits of each range."""
+"""Tests of the settings of the Earth camera: defaults, and the limits of each range."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RANGES = {
 
 
 def made(**changes: Any) -> EarthCameraModel:
-    """Return a camera model with a pinhole lens for the model's image size."""
+    """Return a camera model with a pinhole lens for the image size of the model."""
     size = changes.get("columns", 512), changes.get("rows", 512)
     return EarthCameraModel(lens=Pinhole.from_field_of_view(*size, 1.0), **changes)
 

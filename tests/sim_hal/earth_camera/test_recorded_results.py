@@ -1,4 +1,4 @@
-"""Tests that rendered images of the Earth camera equal the recorded ones."""
+"""Tests that rendered images of the Earth camera equal the recorded images."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_an_image_with_the_sun_is_as_recorded() -> None:
 
 
 def rays() -> FloatArray:
-    """Return rays (80, 3) over the field of the small camera."""
+    """Return rays (80, 3) in the field of view of the small camera."""
     model = small("linear")
     x, y = np.meshgrid(np.linspace(3.0, 92.0, 10), np.linspace(3.0, 76.0, 8))
     return model.lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1))

@@ -25,14 +25,14 @@ AIR = Atmosphere()
 
 
 def _nadir_scene(sun: FloatArray, altitude: float = 800e3) -> EarthScene:
-    """Return a camera over latitude 0, longitude 0 that looks straight down, with the pole to its right."""
+    """Return a camera over latitude 0, longitude 0 that points straight down, with the pole to the right."""
     x = np.array([1.0, 0.0, 0.0])
     attitude = pointing(-x, np.array([0.0, -1.0, 0.0]))
     return EarthScene((SEMI_MAJOR_AXIS + altitude) * x, attitude, ASTRONOMICAL_UNIT * sun)
 
 
 def _solar_cosines(scene: EarthScene) -> FloatArray:
-    """Return the cosine (rows, columns) of the Sun's zenith distance on a round Earth; NaN off it."""
+    """Return the cosine (rows, columns) of the Sun's zenith distance on a spherical Earth, NaN elsewhere."""
     sight = look(scene, pixel_rays(QUIET.lens))
     places = np.where(sight.hits[:, None], sight.places, np.nan)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
@@ -41,7 +41,10 @@ def _solar_cosines(scene: EarthScene) -> FloatArray:
 
 
 def test_the_limb_depth_and_the_zenith_depth_are_integrals_of_exponential_air() -> None:
-    """The reference is a quadrature along the curved lines of sight."""
+    """The optical depths at limb and zenith are integrals of an exponential atmosphere.
+
+    The reference is a quadrature along the curved lines of sight.
+    """
 
     def through(tangent: float) -> float:
         def density(s: float) -> float:
@@ -83,16 +86,17 @@ def test_light_above_the_limb_falls_by_e_for_each_scale_height() -> None:
 
 
 def test_the_terminator_lies_where_the_sun_is_on_the_horizon() -> None:
-    """The brightness is relative to that of the sea below the Sun.
+    """The terminator is where the Sun is on the horizon.
 
-    The day side is brighter than a tenth, and the night side is darker than a hundredth.
+    Relative to the sea below the Sun, the day side is brighter than a tenth, and the night side is darker
+    than a hundredth.
     """
     scene = _nadir_scene(np.array([0.0, 1.0, 0.0]), 2000e3)
     light, cosine = expected_radiance(QUIET, scene), _solar_cosines(scene)
     noon = OCEAN * np.exp(-2.0 * AIR.optical_depth)
     assert light[cosine > 0.15].min() > 0.1 * noon
     assert light[cosine < -0.1].max() < 0.01 * noon
-    # The brightness across the terminator decreases monotonically over the width of twilight.
+    # Across the terminator, the brightness decreases monotonically within the width of twilight.
     rows = [light[np.abs(cosine - c) < 0.01].mean() for c in (0.15, 0.1, 0.05, 0.0, -0.05, -0.1)]
     assert np.all(np.diff(rows) < 0.0)
 
@@ -106,11 +110,14 @@ def test_the_night_side_is_dark_and_its_limb_too() -> None:
 
 
 def test_brightness_under_the_sun_is_that_of_matt_ground_seen_through_air() -> None:
-    """It is between those of sea and clouds, each dimmed twice by the air, plus scattered light."""
+    """Below the Sun, the brightness is between those of sea and clouds, plus scattered light.
+
+    The atmosphere dims the light of sea and clouds twice.
+    """
     light = expected_radiance(QUIET, _nadir_scene(np.array([1.0, 0.0, 0.0])))[206:306, 206:306]
     dimmed = np.exp(-2.0 * AIR.optical_depth)
     haze = 1.5 * 0.375 * (1.0 - np.exp(-AIR.optical_depth))
-    # Sun and camera are up to 9 deg from the zenith in the image.
+    # In the image, Sun and camera are up to 9 deg from the zenith.
     assert 0.96 * OCEAN * dimmed + 0.9 * haze < light.min()
     assert light.max() < CLOUD * dimmed + 1.02 * haze
 
@@ -133,7 +140,7 @@ def test_land_and_cloud_cover_their_shares_and_come_from_the_seed_alone() -> Non
         assert ground.max() <= CLOUD + 1e-6
         covered.append(np.mean(ground > 0.6))
         sea.append(np.mean(ground < OCEAN + 0.01))
-    # A globe has few continents, so the land fraction varies with the seed.
+    # A globe has few continents, so the fraction of land varies with the seed.
     assert np.mean(covered) == pytest.approx(CLOUD_SHARE, abs=0.12)
     assert np.mean(sea) == pytest.approx((1.0 - CLOUD_SHARE) * (1.0 - LAND_SHARE), abs=0.12)
     assert np.array_equal(albedo(directions[:100], 3), albedo(directions[:100], 3))
@@ -156,7 +163,10 @@ def _angles_from_nadir(scene: EarthScene, directions: FloatArray) -> FloatArray:
 
 
 def test_over_the_pole_the_limb_is_a_circle_whose_angle_is_that_of_the_meridian_ellipse() -> None:
-    """A line from height z on the axis touches x^2/a^2 + y^2/b^2 = 1 at the slope a^2/(z^2 - b^2) = tan^2."""
+    """Over the pole, the limb is a circle with the angle of the meridian ellipse.
+
+    A line from the height z on the axis touches x^2/a^2 + y^2/b^2 = 1 at the slope a^2/(z^2 - b^2) = tan^2.
+    """
     distance = SEMI_MINOR_AXIS + 600e3
     scene = EarthScene(np.array([0.0, 0.0, distance]), quaternion.IDENTITY, SUN)
     directions, _ = limb_directions(scene)
@@ -165,7 +175,10 @@ def test_over_the_pole_the_limb_is_a_circle_whose_angle_is_that_of_the_meridian_
 
 
 def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> None:
-    """The angle is asin(a/r) along the equator, and atan(b/sqrt(r^2 - a^2)) towards the poles."""
+    """Over the equator, the angle from nadir to the limb is asin(a/r) along the equator.
+
+    Towards the poles it is smaller, atan(b/sqrt(r^2 - a^2)).
+    """
     distance = SEMI_MAJOR_AXIS + 500e3
     scene = EarthScene(np.array([distance, 0.0, 0.0]), quaternion.IDENTITY, SUN)
     directions, _ = limb_directions(scene, 4)
@@ -173,14 +186,17 @@ def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> Non
     assert angles[2:] == pytest.approx(np.arcsin(SEMI_MAJOR_AXIS / distance), abs=1e-12)
     towards_poles = np.arctan(SEMI_MINOR_AXIS / np.sqrt(distance**2 - SEMI_MAJOR_AXIS**2))
     assert angles[:2] == pytest.approx(towards_poles, abs=1e-12)
-    # The error of a spherical Earth model is more than 0.06 deg, three times a nadir sensor's required
-    # accuracy.
+    # A spherical Earth model has an error of more than 0.06 deg, three times the accuracy that a nadir sensor
+    # must have.
     assert np.degrees(angles[3] - angles[0]) > 0.06
 
 
 @pytest.mark.parametrize("height", [0.0, APPARENT_LIMB_HEIGHT])
 def test_every_limb_direction_lies_on_the_tangent_cone(height: float) -> None:
-    """(d' M p)^2 = (d' M d)(p' M p - 1) with M = diag(1/a^2, 1/a^2, 1/b^2) for any attitude."""
+    """For any attitude, each limb direction d satisfies (d' M p)^2 = (d' M d)(p' M p - 1).
+
+    The matrix is M = diag(1/a^2, 1/a^2, 1/b^2).
+    """
     generator = np.random.default_rng(1)
     for _ in range(5):
         scene = random_scene(generator, NOISELESS)
@@ -220,12 +236,15 @@ def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
     towards = (places - scene.position) @ scene.camera_matrix.T
     crossed = np.cross(towards, rays) / np.linalg.norm(towards, axis=1, keepdims=True)
     assert np.abs(crossed).max() < 1e-9
-    # The first of the two intersections is on the camera's side.
+    # Of the two intersections, the first one is on the side of the camera.
     assert np.all(places @ scene.position > 0.0)
 
 
 def test_the_sunlit_limb_has_half_its_brightness_at_the_published_height() -> None:
-    """Along an image column, the brightness at this height is half of that at the ground's tangent point."""
+    """The brightness of the sunlit limb falls to half at the published height.
+
+    Along an image column, the brightness is compared with that at the tangent point of the ground.
+    """
     scene = limb_scene(600e3, zenith=np.array([0.3, 0.2, 0.9]), sun=np.array([0.5, 0.2, 0.8]))
     narrow = EarthCameraModel.fuga15d(scatter=0.0, blur=0.0, field_of_view=np.radians(8.0))
     light = expected_radiance(narrow, scene)
@@ -237,7 +256,7 @@ def test_the_sunlit_limb_has_half_its_brightness_at_the_published_height() -> No
         ground = int(np.argmax(heights[:, column] == 0.0))
         above = np.arange(ground - 100, ground)
         crossing = np.interp(0.5 * profile[ground - 1], profile[above], above)
-        assert crossing == pytest.approx(row, abs=0.4)  # 0.3 km
+        assert crossing == pytest.approx(row, abs=0.4)  # 0.4 px are 0.3 km
 
 
 def test_distortion_moves_the_limb_as_the_lens_says() -> None:
@@ -252,12 +271,15 @@ def test_distortion_moves_the_limb_as_the_lens_says() -> None:
         map_coordinates(expected_radiance(model, scene), points.T[::-1], order=1)
         for model, points in ((bent, moved), (NOISELESS, straight))
     )
-    # The brightness at the apparent limb changes by a tenth over a tenth of a pixel.
+    # Over a tenth of a pixel, the brightness at the apparent limb changes by a tenth.
     assert seen == pytest.approx(expected, rel=0.1)
 
 
 def test_a_tilted_pole_carries_the_flattening_with_it() -> None:
-    """With the pole towards the camera, the limb is a circle; with the default pole it is not."""
+    """If the pole is tilted, the flattening is tilted with it.
+
+    With the pole towards the camera, the limb is a circle. With the default pole, it is no circle.
+    """
     position = np.array([SEMI_MAJOR_AXIS + 400e3, 0.0, 0.0])
     upright = EarthScene(position, quaternion.IDENTITY, SUN)
     lying = replace(upright, pole=np.array([1.0, 0.0, 0.0]), rotation=0.7)
@@ -282,7 +304,11 @@ def test_a_camera_inside_the_earth_and_numbers_that_are_none_are_refused() -> No
 
 @pytest.mark.parametrize("altitude", [1e3, 110e3, 500e3, 36e6])
 def test_no_ray_below_the_top_of_the_air_is_left_out(altitude: float) -> None:
-    """Rays from all over the sphere, and many within a tenth of a degree of the top of the air."""
+    """No ray below the top of the atmosphere is omitted.
+
+    The rays are from all over the sphere, and many are within a tenth of a degree of the top of the
+    atmosphere.
+    """
     generator = np.random.default_rng(8)
     for _ in range(5):
         zenith = random_direction(generator)

@@ -30,13 +30,14 @@ from tests.support.flights import demo_config, demo_world
 CYCLE_NS = 25_000_000
 
 Command = Callable[[float, ImuReading], FloatArray]
-"""Controller that returns the currents (3,), A, at a time (s) from the newest reading."""
+"""Controller that returns the currents (3,), A, from the time (s) and the newest reading."""
 
 
 def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) -> Command:
-    """Return a controller that holds the angle `target`, rad, about y.
+    """Return a controller that holds the angle `target` (rad) about y.
 
-    The command has noise (A). The coils x and z have alternating currents of the amplitude `others`, A.
+    The command has the noise `noise` (A). The other coils have alternating currents of the amplitude `others`
+    (A).
     """
     rng = np.random.default_rng(seed)
 
@@ -85,9 +86,9 @@ def observe(
     monitor_only: bool = False,
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Watched:
-    """Command the coils for some time, and return the results of a coil monitor.
+    """Drive the coils for some time, and return the results of a coil monitor.
 
-    `gain` scales the configured resistance.
+    `gain` is a factor of the configured resistance.
     """
     config = demo_config(duration, camera=False)
     entries = tuple(FaultEntry(fault=fault) for fault in faults)

@@ -29,7 +29,10 @@ IN_ORBIT = {"gps", "strings", "wide", "battery-monitor", "bus-monitor", "battery
 
 @pytest.fixture(scope="module")
 def orbit() -> LockStep:
-    """Return the emulated devices of a satellite, which tests share: every fault ends without effect."""
+    """Return the emulated devices of a satellite.
+
+    The tests share them, as every fault ends without effect.
+    """
     config = configuration.replace(orbit_config(), power=Power(battery=Battery(capacity=2.6)))
     return build_lockstep(config, orbit_world(), None, SimClock())
 
@@ -109,7 +112,7 @@ def test_a_fault_that_is_lifted_leaves_nothing_broken(lock: LockStep, kind: Faul
     put([parse(f"{kind.name} @ 1 for 1.3")], bench_of(lock), 0)
     assert is_sound(lock)
     lock.clock.sleep_until_ns(round(1.1 * SECOND_NS))
-    # The fault `imu: off` switches the whole unit off, and momentary faults have ended by now.
+    # The fault `imu: off` switches the whole IMU off. Momentary faults have ended by now.
     assert kind.momentary or kind.name == "imu: off" or not is_sound(lock)
     lock.clock.sleep_until_ns(4 * SECOND_NS)
     assert is_sound(lock)
@@ -162,13 +165,16 @@ def test_an_unplugged_line_raises_where_the_driver_asks(lock: LockStep) -> None:
 
 
 def test_legs_that_are_stuck_drive_their_coil_and_are_braked_by_the_other(lock: LockStep) -> None:
-    """The voltage across the coil is the difference of its two ends (Table 5.2 of the thesis)."""
+    """A stuck leg drives its coil, and the other leg can brake the coil.
+
+    The voltage across the coil is the difference of the voltages of both legs (Table 5.2 of the thesis).
+    """
     circuit, pwm = lock.hardware.circuit, lock.hardware.pwm
     full = 3.4 / 23.0
     pwm.write(0x40, bytes([0x00, 0x20]))
     circuit.become(0, CoilCondition.A_HIGH)
     assert circuit.currents()[0] == pytest.approx(full, abs=3.5e-3)
-    pwm.write(0x40, bytes([0x0A, 0x00, 0x10, 0x00, 0x00]))  # B full on
+    pwm.write(0x40, bytes([0x0A, 0x00, 0x10, 0x00, 0x00]))  # input B is full on
     assert circuit.currents()[0] == 0.0
     circuit.become(0, CoilCondition.SOUND)
     assert circuit.currents()[0] == pytest.approx(-full, abs=3.5e-3)
@@ -261,7 +267,7 @@ TOGETHER = {
     "bus": "off nack arbitration hang intermittent",
     "gps": "silent clock garbage bits delayed intermittent",
 }
-"""Kinds of fault that may be present together with other faults of their device."""
+"""Types of fault that may be active together with other faults of the same device."""
 
 
 def test_the_faults_are_those_of_the_table() -> None:
@@ -301,7 +307,8 @@ def test_some_faults_need_a_process_or_a_command_line() -> None:
 def test_the_choices_are_registers_and_speeds_that_exist() -> None:
     assert list(CATALOGUE["imu: upset"].parameters["register"].choices) == [6, 7, 75]
     assert list(CATALOGUE["monitor: upset"].parameters["register"].choices) == [0, 5]
-    # PCA9685: MODE1, MODE2, four registers of each of 16 channels from 0x06, PRE_SCALE.
+    # Registers of the PCA9685: MODE1, MODE2, four registers of each of the 16 channels from 0x06 on, and
+    # PRE_SCALE.
     assert list(CATALOGUE["pwm: upset"].parameters["register"].choices) == [0, 1, *range(6, 70), 254]
     speeds = [9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600]
     assert list(CATALOGUE["imu: baud"].parameters["rate"].choices) == speeds

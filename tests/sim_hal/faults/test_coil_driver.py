@@ -1,4 +1,4 @@
-"""Tests of the coil driver with a faulty PWM chip: errors are detected, reported and corrected."""
+"""Tests of the coil driver with a faulty PWM chip: faults are detected, reported and corrected."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ WANTED = np.array([0.06, 0.0, -0.03])
 
 
 def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
-    """Command the coils for six seconds during a fault.
+    """Drive the coils for six seconds during a fault.
 
-    Return (time, error) by cycle, and the last current error (A).
+    Returns (time, error) of each cycle, and the last current error (A).
     """
     config = demo_config(10.0, camera=False)
     lock = build_lockstep(config, demo_world(), None, SimClock())
@@ -35,7 +35,7 @@ def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
     seen = []
     for cycle in range(240):
         lock.clock.sleep_until_ns(epoch_ns + cycle * CYCLE_NS)
-        # A changing command, as in flight, reveals a stuck output.
+        # A changing command, as in flight, shows a stuck output.
         coils.command(WANTED * (1.0 + 0.003 * cycle))
         seen.append((0.025 * cycle, coils.state().error))
     miss = float(np.abs(lock.hardware.circuit.currents() - coils.state().current).max())

@@ -1,4 +1,4 @@
-"""Tests of the magnitude of fault effects on samples, lines and parts of the emulated hardware."""
+"""Tests of the size of the effects of faults on samples, lines and other emulated hardware."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ SAMPLE = Vn100Sample(
 
 @pytest.fixture(scope="module")
 def bench() -> Bench:
-    """Return the demonstration's devices; every test removes its fault."""
+    """Return the devices of the demonstration. Every test removes its fault at the end."""
     lock = build_lockstep(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
     return bench_of(lock)
 
 
 def altered(bench: Bench, name: str, samples: list[Vn100Sample], **given: float) -> list[Vn100Sample]:
-    """Return IMU samples under a fault."""
+    """Return IMU samples while a fault is active."""
     kind = CATALOGUE[name]
     assert kind.begin is not None
     remove = kind.begin(bench, kind, given)

@@ -30,7 +30,7 @@ def pull_out(ends: tuple[int, int]) -> None:
 
 
 def receive(port: PySerialPort, patience: float = 3.0) -> bytes:
-    """Return the next bytes, ignoring errors of the port until then."""
+    """Return the next bytes of the port. Earlier errors of the port are ignored."""
     deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         try:
@@ -60,7 +60,7 @@ def test_the_port_is_open_again_within_two_seconds(tmp_path: Path) -> None:
         begun = time.monotonic()
         found = b""
         while not found and time.monotonic() - begun < 3.0:
-            os.write(ends[0], b"after")  # bytes that arrived before the port was open are discarded
+            os.write(ends[0], b"after")  # bytes that arrive before the port is open are discarded
             found = receive(port, 0.05)
         assert found.startswith(b"after")
         assert time.monotonic() - begun < 2.0
@@ -93,7 +93,7 @@ def test_a_port_that_vanishes_is_not_closed_while_data_are_sent(
 
     def vanish(data: bytes) -> None:
         pull_out(ends)
-        time.sleep(0.1)  # the receiving thread notices that the port is lost
+        time.sleep(0.1)  # time in which the receiving thread detects that the port is lost
         open_meanwhile.append(port._serial.is_open)
 
     monkeypatch.setattr(port, "_write", vanish)

@@ -1,4 +1,4 @@
-"""Tests of the syntax of faults, and of the messages for invalid faults."""
+"""Tests of the syntax of faults, and of the error messages for invalid faults."""
 
 from __future__ import annotations
 

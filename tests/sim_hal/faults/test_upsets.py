@@ -1,4 +1,4 @@
-"""Tests of register upsets and a delayed current monitor: effects, and corrections by the drivers."""
+"""Tests of upsets of registers and of a delayed current monitor: effects, and corrections by drivers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ UPSETS = ("pwm: upset", "monitor: upset", "imu: upset")
 
 
 def driven_rig() -> Rig:
-    """Return coils that have been commanded each cycle for a second."""
+    """Return coils that were commanded in each cycle for one second."""
     rig = Rig()
     rig.coils.start()
     for _ in range(40):
@@ -115,7 +115,7 @@ def test_the_monitors_calibration_is_used_by_nobody() -> None:
         (75, 0),  # no port
         (75, 9),  # ports that do not exist
         (75, 20),  # rate above the capacity of the line
-        (75, 24),  # output that is too infrequent for any user
+        (75, 24),  # an output so infrequent that no user needs it
         (75, 32),  # output without any group
         (75, 41),  # an output group that the VN-100 does not have
         (75, 52),  # without the attitude
@@ -135,7 +135,7 @@ def test_a_unit_whose_output_is_upset_is_set_up_again_within_two_seconds(registe
 
 @pytest.mark.parametrize(
     ("register", "bit"),
-    # Upsets that change the rate, a field, or add lines to the packets.
+    # Upsets that change the output rate, change a field, or add sentences to the packets.
     [*((75, bit) for bit in (16, 17, 18, 19, 21, 22, 23, 48)), (6, 1), (6, 3)],
 )
 def test_a_unit_that_says_more_or_less_than_it_was_asked_is_set_up_again(register: int, bit: int) -> None:
@@ -162,7 +162,10 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
 
 @pytest.mark.parametrize("name", UPSETS)
 def test_what_is_not_said_is_drawn(name: str) -> None:
-    """Upsets without a stated register change random registers: 40 upsets give more than ten results."""
+    """An upset without a stated register changes a random register.
+
+    40 upsets give more than ten different results.
+    """
     lock = build_lockstep(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
     hardware = lock.hardware
     assert hardware.monitor is not None

@@ -41,7 +41,7 @@ Serve = Callable[[Callable[[list[Any]], list[Any]]], RemoteI2cBus]
 
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Serve]:
-    """Return a server that replies to each request with a function's messages, and a bus connected to it."""
+    """Return a server that answers requests with the messages of a function, and a bus connected to it."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(tmp_path / "devices.sock"))
     listener.listen()

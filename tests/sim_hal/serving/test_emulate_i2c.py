@@ -1,4 +1,4 @@
-"""Tests that unchanged programs open the emulated bus as /dev/i2c-N in their own processes."""
+"""Tests that unchanged programs, in their own processes, open the emulated bus as /dev/i2c-N."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ debian_tools = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def environment() -> Iterator[Mapping[str, str]]:
-    """Serve the bus as /dev/i2c-7; yield the environment that programs need."""
+    """Serve the bus as /dev/i2c-7; yield the environment variables that programs need."""
     with subprocess.Popen([*COMMAND, "--bus", "7", "--json"], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         facts: dict[str, Any] = json.loads(process.stdout.readline())
@@ -46,7 +46,7 @@ def environment() -> Iterator[Mapping[str, str]]:
 
 
 def run(environment: Mapping[str, str], script: str) -> str:
-    """Return the output of a Python script without code for the emulation."""
+    """Return the output of a Python script, which contains no code for the emulation."""
     command = [sys.executable, "-c", textwrap.dedent(script)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == 0, done.stderr
@@ -54,7 +54,10 @@ def run(environment: Mapping[str, str], script: str) -> str:
 
 
 def test_smbus2_makes_every_transfer(environment: Mapping[str, str]) -> None:
-    """Expected from the data sheets: PRE_SCALE 0x1E and Config 0x399F at power-on, sent big-endian."""
+    """smbus2 makes every type of transfer, with the values of the data sheets.
+
+    PRE_SCALE is 0x1E and Config is 0x399F at power-on, which the chip sends big-endian.
+    """
     said = run(
         environment,
         """
@@ -138,7 +141,10 @@ def test_files_copies_and_children_are_as_ever(environment: Mapping[str, str], t
     reason="adafruit-pureio, another's client, is not installed",
 )
 def test_adafruits_client_drives_a_coil_and_reads_its_current(environment: Mapping[str, str]) -> None:
-    """A fully driven coil x draws 3.4 V / 23 ohm = 148 mA, or 1478 steps of 10 uV across 0.1 ohm."""
+    """Adafruit's client drives a coil and reads its current.
+
+    A fully driven coil x draws 3.4 V / 23 ohm = 148 mA, which is 1478 steps of 10 uV across 0.1 ohm.
+    """
     said = run(
         environment,
         """
@@ -153,7 +159,7 @@ def test_adafruits_client_drives_a_coil_and_reads_its_current(environment: Mappi
         """,
     )
     shunt, register = said.splitlines()
-    assert int(shunt) == pytest.approx(1478, abs=40)  # the tolerance allows for 3.5 mA of noise
+    assert int(shunt) == pytest.approx(1478, abs=40)  # the tolerance includes 3.5 mA of noise
     assert register == "0x1000 0x20"
 
 
@@ -163,7 +169,7 @@ def test_debians_tools_find_and_read_the_parts(environment: Mapping[str, str]) -
         done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=10, check=True)
         return done.stdout
 
-    tool("i2cset", "-y", "7", "0x40", "0", "0x21")  # set MODE1 as at power-on, but awake
+    tool("i2cset", "-y", "7", "0x40", "0", "0x21")  # MODE1 as at power-on, but without SLEEP
     table = tool("i2cdetect", "-y", "7").split("\n", 1)[1]
     found = {int(word, 16) for line in table.splitlines() for word in line[3:].split() if word != "--"}
     assert found == {PWM, MONITOR, ALL_CALL}
@@ -184,7 +190,10 @@ def test_the_flights_own_driver_reads_it(environment: Mapping[str, str]) -> None
 
 
 def test_a_bus_with_a_name_of_its_own_is_opened_by_this_name_only(environment: Mapping[str, str]) -> None:
-    """The unit's KNIGHTCUBE_I2C, which is the device for `coils-off`, does not disturb the emulation."""
+    """A bus with a persistent name is opened only by this name.
+
+    The unit's variable KNIGHTCUBE_I2C, which is meant for `coils-off`, does not disturb the emulation.
+    """
     named = {**environment, "KNIGHTCUBE_I2C_BUS": "/dev/knightcube-i2c", "KNIGHTCUBE_I2C": "/dev/i2c-1"}
     script = """
     import os

@@ -1,4 +1,4 @@
-"""Tests of the device server: its start, its renderer, and devices in orbit in real time."""
+"""Tests of the device server: its start, its rendering process, and devices in orbit in real time."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from sim_hal.serving.server import DeviceServer
 
 
 class IdlePool:
-    """A pool whose process is busy: submitted jobs wait."""
+    """A process pool whose process is busy, so submitted jobs wait."""
 
     def submit(self, *_: Any) -> Future[Any]:
         return Future()
@@ -61,7 +61,7 @@ PATIENCE_S = 15.0
 def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults(tmp_path: Path) -> None:
     path = tmp_path / "orbit.yaml"
     flown = Path("config/orbit.yaml").read_text(encoding="utf-8")
-    # The wide cameras are replaced by smaller ones.
+    # The horizon cameras are replaced by cameras with fewer pixels.
     flown = re.sub(r"\nwide_cameras:.*?\n\n", "\n\n", flown, flags=re.DOTALL)
     path.write_text(flown.replace("\ngps: {}", "\n") + DEVICES, encoding="utf-8")
     config = reader.load(path)
@@ -103,7 +103,10 @@ def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults
 def test_the_facts_are_written_before_the_devices_are_served(
     patience: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The parent process waits for this line, so the line must be flushed."""
+    """The facts are written and flushed before the devices are served.
+
+    The parent process waits for the line with the facts.
+    """
     calls = Mock()
     calls.server.lines = {"/dev/knightcube-imu": "/dev/pts/7"}
     calls.server.socket_path = tmp_path / "devices"

@@ -1,1 +1,1 @@
-"""Tests of the star camera's image model."""
+"""Tests of the image model of the star camera."""

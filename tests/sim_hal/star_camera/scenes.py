@@ -1,4 +1,4 @@
-"""Scenes for the star camera's tests, and an independent brute-force renderer."""
+"""Scenes for the tests of the star camera, and an independent renderer that sums over instants."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POINTING = quaternion.normalise(np.array([0.3, -0.5, 0.7, 0.2]))
 
 
 def at_pixels(model: StarCameraModel, points: object, attitude: FloatArray = POINTING) -> FloatArray:
-    """Return ICRS directions (n, 3) of stars that `attitude` puts at pixels `points` (n, 2)."""
+    """Return ICRS directions (n, 3) of stars that appear at the pixels `points` (n, 2) for `attitude`."""
     seen = model.pinhole.unit_vectors(np.atleast_2d(np.asarray(points, dtype=float)))
     return np.asarray(seen @ quaternion.attitude_matrix(attitude))
 
@@ -32,7 +32,7 @@ def still(exposure: float = 1.0) -> tuple[FloatArray, FloatArray]:
 
 
 def centroid(image: FloatArray) -> FloatArray:
-    """Return the brightness centroid (2,) as x, y."""
+    """Return the brightness centroid (2,), as (x, y)."""
     rows, columns = np.indices(image.shape)
     return np.asarray(np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum())
 
@@ -40,9 +40,9 @@ def centroid(image: FloatArray) -> FloatArray:
 def integrated_by_brute_force(
     shape: tuple[int, int], path: FloatArray, electrons: float, sigma: float
 ) -> FloatArray:
-    """Return the pixel-integrated image of a point that spends equal times at each of `path` (k, 2).
+    """Return the pixel-integrated image of a point that is for equal times at each point of `path` (k, 2).
 
-    The sum uses the definition in double precision with scipy's erf; k should be thousands.
+    The definition of the image is summed in double precision, with scipy's erf. `k` should be some thousands.
     """
     scale = sigma * np.sqrt(2.0)
     across = np.arange(shape[1] + 1) - 0.5 - path[:, :1]

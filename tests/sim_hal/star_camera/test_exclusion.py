@@ -1,4 +1,4 @@
-"""Tests of Sun and Earth in the field of view, and of the Earth between camera and object."""
+"""Tests of Sun and Earth in the field of view, and of the Earth between the camera and an object."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ def _tilted(axis: FloatArray, towards: FloatArray, degrees: float) -> FloatArray
 
 
 def test_the_boresight_is_the_cameras_z_through_its_mounting() -> None:
-    """As in the errata to 2.16, the camera looks along body x, and the body is rotated by 90 deg about z."""
+    """The boresight is the camera's axis z, rotated by the mounting.
+
+    As in the errata to 2.16, the camera looks along body x, and the body is rotated by 90 deg about z.
+    """
     body = quaternion.from_rotation_vector(np.array([[0.0, 0.0, 0.5 * np.pi]]))
     rows = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     mounting = quaternion.from_matrix(rows)
@@ -41,13 +44,19 @@ def _below_horizontal(degrees: float) -> tuple[float, float, float]:
     ("degrees", "excluded"), [(0.0, True), (10.26, True), (10.27, False), (170.0, False)]
 )
 def test_the_sun_spoils_a_frame_to_its_limb(degrees: float, excluded: bool) -> None:
-    """The limit is half the field plus the Sun's radius of 0.2666 deg; its parallax is 10" at most."""
+    """A frame is spoilt if any part of the Sun's disc is in the field of view.
+
+    The limit is half the field plus the Sun's radius of 0.2666 deg. The parallax of the Sun is at most 10".
+    """
     boresight = _tilted(SUN / ASTRONOMICAL_UNIT, np.array([[0.0, 0.0, 1.0]]), degrees)
     assert sun_in_field(boresight, np.zeros((1, 3)), SUN, HALF)[0] == excluded
 
 
 def test_the_sun_is_seen_from_the_camera_not_from_the_earths_centre() -> None:
-    """From a distance of 4 million km, the Sun is displaced by 1.5 deg."""
+    """The Sun is seen from the camera, not from the Earth's centre.
+
+    At a distance of 4 million km from the Earth, the Sun is displaced by 1.5 deg.
+    """
     aside = np.array([[0.0, 4e9, 0.0]])
     boresight = _tilted(SUN / ASTRONOMICAL_UNIT, np.array([[0.0, -1.0, 0.0]]), 11.0)
     assert sun_in_field(boresight, aside, SUN, HALF)[0]
@@ -56,7 +65,10 @@ def test_the_sun_is_seen_from_the_camera_not_from_the_earths_centre() -> None:
 
 @pytest.mark.parametrize("above_limb", [9.9, 10.1, 25.0])
 def test_the_earth_spoils_a_frame_to_its_limb(above_limb: float) -> None:
-    """At 380 km the horizon is 19.3 deg below the horizontal (Meller et al. 4.1: "20 deg")."""
+    """A frame is spoilt if the Earth's limb is in the field of view.
+
+    At 380 km the horizon is 19.3 deg below the horizontal (Meller et al. 4.1: "20 deg").
+    """
     dip = np.degrees(np.arccos(EARTH_RADIUS / np.linalg.norm(CAMERA)))
     assert dip == pytest.approx(19.3, abs=0.1)
     horizontal, up = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 1.0, 0.0]])
@@ -78,15 +90,18 @@ def test_a_buffer_widens_both() -> None:
         ((0.0, -7e6, 0.0), True),
         ((0.0, 9e6, 0.0), False),
         ((7e6, 0.0, 0.0), True),
-        # Objects at 5000 km, 0.1 deg below and above the horizon's dip of 19.3 deg.
+        # Objects at a distance of 5000 km, 0.1 deg below and above the horizon, whose dip is 19.3 deg.
         (_below_horizontal(19.4), True),
         (_below_horizontal(19.2), False),
-        # The object is straight below the camera, but above the ground.
+        # The object is straight below the camera, but above the ground, so the Earth does not hide it.
         ((0.0, EARTH_RADIUS + 1000.0, 0.0), False),
     ],
 )
 def test_the_earth_hides_what_is_behind_it(target: tuple[float, float, float], hidden: bool) -> None:
-    """The reference is the closest of 100,000 points of the line to the Earth's centre."""
+    """An object is hidden exactly if the line of sight to it passes through the Earth.
+
+    The reference is the point closest to the Earth's centre of 100,000 points of this line.
+    """
     end = np.array([target])
     way = CAMERA + np.linspace(0.0, 1.0, 100_001)[:, None] * (end - CAMERA)
     assert (np.linalg.norm(way, axis=1).min() < EARTH_RADIUS) == hidden

@@ -1,4 +1,4 @@
-"""Tests of a star's image path over an exposure with a global and a rolling shutter."""
+"""Tests of the image of a star over an exposure, with a global and with a rolling shutter."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FINE = 20_001
 
 
 def _path(model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray) -> FloatArray:
-    """Return the star's pixels at the middle of equal steps, with attitudes interpolated by scipy."""
+    """Return the pixels of a star at the middle of equal time steps, with attitudes interpolated by scipy."""
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second, for these tests only
 
     edges = np.linspace(times[0], times[-1], FINE)
@@ -34,7 +34,7 @@ def _path(model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes
 def _worst_against_brute_force(
     model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray
 ) -> float:
-    """Return the largest error of a pixel, as a fraction of the streak's peak."""
+    """Return the largest error of a pixel against a sum over instants, relative to the streak's peak."""
     image = expected_electrons(model, star, [2.0], times, attitudes)
     electrons = float(model.electrons(2.0, float(times[-1] - times[0])))
     path = _path(model, star, times, attitudes)
@@ -59,7 +59,10 @@ def test_a_curved_streak_about_the_boresight_is_exact() -> None:
 
 
 def test_a_streak_of_changing_rate_is_exact() -> None:
-    """If the camera accelerates from rest, the start of the path is brighter than its end."""
+    """A streak at a changing rate is exact.
+
+    If the camera accelerates from rest, the start of the path is brighter than its end.
+    """
     times = np.linspace(0.0, 1.0, 101)
     turn = np.outer(times**2, [60.0 / FOCAL, 30.0 / FOCAL, 0.0])
     attitudes = quaternion.multiply(quaternion.from_rotation_vector(turn), POINTING)
@@ -68,9 +71,10 @@ def test_a_streak_of_changing_rate_is_exact() -> None:
 
 @pytest.mark.parametrize("jitter", [0.003, 0.03, 0.3, 1.0])
 def test_jitter_between_samples_is_followed(jitter: float) -> None:
-    """The motion has kinks of up to about a pixel at its 200 samples.
+    """Jitter between the samples of the attitude is followed.
 
-    The renderer treats the smallest of these kinks as a smooth motion.
+    The motion has kinks of up to about a pixel at its 200 samples. The renderer treats the smallest kinks as
+    a smooth motion.
     """
     rng = np.random.default_rng(8)
     times = np.linspace(0.0, 1.0, 201)
@@ -98,7 +102,10 @@ def test_the_light_is_the_same_however_far_the_star_moves(heading: float, streak
 
 
 def test_a_streak_runs_along_minus_omega_cross_v_over_the_known_length() -> None:
-    """When the camera rotates by 80 px about +x, a star at the boresight moves to +y: v' = -w x v."""
+    """A streak runs along v' = -w x v and has the expected length.
+
+    If the camera rotates by 80 px about +x, a star at the boresight moves towards +y.
+    """
     star = at_pixels(MODEL, MODEL.pinhole.centre)
     angle = 70.0 / FOCAL
     image = expected_electrons(MODEL, star, [0.0], *turning([angle, 0.0, 0.0]))
@@ -108,7 +115,7 @@ def test_a_streak_runs_along_minus_omega_cross_v_over_the_known_length() -> None
     profile = image.sum(axis=0)
     assert profile.argmax() in (int(x), int(x) + 1)
     lit = image.sum(axis=1)
-    # At the ends the brightness is half of that of the flat middle.
+    # The brightness at the ends is half of the brightness in the flat middle.
     half = 0.5 * np.median(lit[int(y) + 10 : int(y + length) - 10])
     start, *_, end = np.flatnonzero(lit > half)
     first = start - (lit[start] - half) / (lit[start] - lit[start - 1])
@@ -124,7 +131,7 @@ def test_a_turn_about_plus_y_moves_stars_to_the_left() -> None:
 
 
 def test_a_star_on_the_axis_of_rotation_does_not_move() -> None:
-    """The image is that of a star at rest, at any rate of rotation."""
+    """A star on the axis of rotation does not move: its image is that of a star at rest, at any rate."""
     point = np.array([[120.3, 60.8]])
     axis = MODEL.pinhole.unit_vectors(point)[0]
     image = expected_electrons(MODEL, at_pixels(MODEL, point), [2.0], *turning(1.5 * axis, samples=3))
@@ -146,7 +153,10 @@ def test_an_even_turn_needs_no_more_knots_for_being_sampled_finely() -> None:
 
 
 def test_an_edge_cuts_a_streak_without_moving_the_rest() -> None:
-    """The image of the small detector equals the centre of the wide image, pixel by pixel."""
+    """An edge of the detector truncates a streak without changing the rest of the streak.
+
+    The image of the small detector equals the centre of the wide image, pixel by pixel.
+    """
     wide = StarCameraModel(columns=400, rows=400, field_of_view=2.0 * np.arctan(200.0 / FOCAL))
     rng = np.random.default_rng(4)
     stars = at_pixels(MODEL, rng.uniform([-60.0, -60.0], [260.0, 220.0], (60, 2)))
@@ -160,7 +170,10 @@ def test_an_edge_cuts_a_streak_without_moving_the_rest() -> None:
 
 @pytest.mark.parametrize(("when", "crossings"), [(0.0, 0.5), (0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (1.0, 0.5)])
 def test_a_sweep_across_the_sky_shows_each_star_while_it_crosses(when: float, crossings: float) -> None:
-    """The rotation is 0.5 rad, or seven fields of view; the star is on the boresight at `when`."""
+    """In a fast rotation, each star appears while it crosses the field of view.
+
+    The rotation is 0.5 rad, or seven fields of view. The star is on the boresight at the time `when`.
+    """
     rate = np.array([0.0, 0.5, 0.0])
     then = quaternion.multiply(quaternion.from_rotation_vector(when * rate), POINTING)
     star = at_pixels(MODEL, MODEL.pinhole.centre, then)
@@ -170,7 +183,7 @@ def test_a_sweep_across_the_sky_shows_each_star_while_it_crosses(when: float, cr
 
 
 def test_the_thesis_model_streaks_too() -> None:
-    """The expected image is the mean of still images at 2,000 steps, as in Sease's sum."""
+    """The model of the thesis gives streaks too: the mean of still images at 2,000 steps (Sease's sum)."""
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.03, psf="bilinear")
     star = at_pixels(model, [20.0, 20.0])
     times, attitudes = turning(np.array([-9.0, -25.0, 0.0]) / model.pinhole.focal_length)
@@ -203,7 +216,7 @@ def test_a_moving_source_streaks_while_the_stars_stand_still() -> None:
 
 
 def test_a_source_that_the_camera_follows_is_a_point() -> None:
-    """The object moves with the boresight, so that only the stars streak."""
+    """An object that the camera follows is a point. The stars are streaks."""
     times, attitudes = turning([0.0, 60.0 / FOCAL, 0.0], samples=101)
     boresights = quaternion.attitude_matrix(attitudes)[:, 2]
     nothing = np.zeros((0, 3))
@@ -241,14 +254,17 @@ READOUT = ROLLING_MODEL.rows * ROLLING_MODEL.line_time
 
 
 def _history(rate: object, samples: int = 2) -> tuple[FloatArray, FloatArray]:
-    """Return an attitude history at constant `rate` (3,) rad/s that lasts from the first row to the last."""
+    """Return an attitude history at the constant `rate` (3,), rad/s, from the first row to the last row."""
     return turning(rate, EXPOSURE + READOUT, samples)
 
 
 def _by_brute_force(
     model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray, magnitude: float = 2.0
 ) -> FloatArray:
-    """Return the image row by row, each from 1,000 instants of its own exposure, with attitudes by scipy."""
+    """Return the image row by row, each as a sum over 1,000 instants of its own exposure.
+
+    Scipy interpolates the attitudes.
+    """
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second, for these tests only
 
     camera_to_reference = Slerp(times, Rotation.from_quat(attitudes))
@@ -279,7 +295,10 @@ def _worst(model: StarCameraModel, star: FloatArray, times: FloatArray, attitude
 def test_every_row_is_the_integral_over_its_own_exposure(
     line_time: float, velocity: tuple[float, float]
 ) -> None:
-    """The motion is up to 0.15 px per line time, in both directions of the shutter."""
+    """Every row of a rolling shutter is the integral over its own exposure.
+
+    The motion is up to 0.15 px per line time, in both directions of the shutter.
+    """
     model = replace(ROLLING_MODEL, line_time=line_time)
     vx, vy = velocity
     span = EXPOSURE + model.rows * line_time
@@ -307,7 +326,7 @@ def test_a_changing_rate_is_exact() -> None:
 
 
 def test_jitter_is_followed() -> None:
-    """The motion has kinks of 0.1 px every 5 ms at 150 px/s."""
+    """Jitter is followed under a rolling shutter. The motion has kinks of 0.1 px every 5 ms at 150 px/s."""
     times = np.linspace(0.0, EXPOSURE + READOUT, 45)
     rng = np.random.default_rng(3)
     turn = np.outer(times, [0.0, 150.0 / ROLLING_FOCAL, 0.0]) + rng.normal(0.0, 0.1 / ROLLING_FOCAL, (45, 3))
@@ -317,14 +336,20 @@ def test_jitter_is_followed() -> None:
 
 @pytest.mark.parametrize("start", [(60.0, -2.0), (60.0, 101.0), (-25.0, 50.0), (110.0, 90.0)])
 def test_streaks_that_an_edge_cuts_are_exact(start: tuple[float, float]) -> None:
-    """Stars enter from above, below and the left, and leave at the corner."""
+    """Streaks that an edge truncates are exact.
+
+    Stars enter from above, below and the left, and leave at the corner.
+    """
     vertical = 100.0 if start[1] < 60.0 else -100.0 if start[0] < 100.0 else 200.0
     rate = np.array([vertical, -200.0, 0.0]) / ROLLING_FOCAL
     assert _worst(ROLLING_MODEL, at_pixels(ROLLING_MODEL, start), *_history(rate)) < 2e-3
 
 
 def test_a_track_under_a_rolling_shutter_is_a_star_under_the_opposite_turn() -> None:
-    """A camera at rest with a moving object gives the image of a star in a rotating camera."""
+    """Under a rolling shutter, an object that moves relative to a camera at rest has the image of a star.
+
+    The star is in a camera that rotates in the opposite sense.
+    """
     times, attitudes = _history(np.array([100.0, -120.0, 0.0]) / ROLLING_FOCAL, 23)
     star = at_pixels(ROLLING_MODEL, [40.0, 40.0])
     seen = quaternion.attitude_matrix(attitudes) @ star[0]
@@ -346,7 +371,10 @@ def test_a_still_camera_sees_what_a_global_shutter_sees() -> None:
 
 
 def test_with_hardly_any_line_time_a_field_of_streaks_is_a_global_shutters() -> None:
-    """Stars on and around the detector cross each edge, and a few stars are behind the camera."""
+    """With a very short line time, a field of streaks equals that of a global shutter.
+
+    Stars on and around the detector cross each edge, and a few stars are behind the camera.
+    """
     rng = np.random.default_rng(6)
     stars = at_pixels(ROLLING_MODEL, rng.uniform(-150.0, 250.0, (300, 2)))
     stars[:20] *= -1.0
@@ -358,7 +386,10 @@ def test_with_hardly_any_line_time_a_field_of_streaks_is_a_global_shutters() -> 
 
 
 def test_stars_far_down_streak_later() -> None:
-    """For two stars 80 rows apart and a rotation about y, the lower star is exposed 80 line times later."""
+    """Stars in lower rows are exposed later.
+
+    For two stars 80 rows apart and a rotation about y, the lower star is exposed 80 line times later.
+    """
     times, attitudes = _history([0.0, 200.0 / ROLLING_FOCAL, 0.0])
     upper, lower = (
         centroid(
@@ -370,9 +401,10 @@ def test_stars_far_down_streak_later() -> None:
 
 
 def test_a_streak_that_runs_down_after_the_shutter_is_longer_and_brighter_in_all() -> None:
-    """A star that moves down with the shutter is exposed for 1 / (1 - 0.08) times the exposure time of a row.
+    """A star that moves down with the shutter is exposed 1 / (1 - 0.08) times longer than a row.
 
-    The star moves at 400 px/s, and the readout takes 0.2 ms per line.
+    Its streak is longer and brighter by this factor. The star moves at 400 px/s, and the readout takes 0.2 ms
+    per line.
     """
     star = at_pixels(ROLLING_MODEL, [60.0, 3.0])
     times, attitudes = turning([400.0 / ROLLING_FOCAL, 0.0, 0.0], 0.1 + READOUT)

@@ -1,4 +1,4 @@
-"""Tests of star images: moments of noise, saturation and counts, and positions of stars at rest."""
+"""Tests of star images: moments of the noise, saturation and counts, and positions of stars at rest."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ def _check_moments(frames: Image, mean: FloatArray, variance: FloatArray) -> Non
 
 @pytest.mark.parametrize("light", [0.0, 3.0, 30.0, 37.4, 37.6, 60.0, 1000.0])
 def test_mean_and_variance_are_right_on_both_sides_of_the_faint_limit(light: float) -> None:
-    """The variance is 150 e-^2 of the background, up to 37.5 of faint light, and 1/12 of rounding."""
+    """Mean and variance of a pixel are right above and below the limit for faint light.
+
+    The variance is 150 e-^2 of the background, up to 37.5 of faint light, and 1/12 of rounding.
+    """
     image = np.full((96, 96), light)
     _check_moments(_frames(DEEP, image, 200), image + 150.0, image + 150.0 + 1.0 / 12.0)
 
@@ -70,7 +73,10 @@ def test_moments_are_right_in_every_pixel_of_a_star_field() -> None:
 
 
 def test_moments_are_right_without_read_noise() -> None:
-    """Without other noise, the Poisson steps are visible, and each pixel has its own distribution."""
+    """The moments are right without read noise.
+
+    Without other noise, the Poisson steps are visible, and each pixel has its own distribution.
+    """
     model = replace(DEEP, read_noise=0.0, dark_current=4.0)
     light = np.full((96, 96), 0.5)
     frames = _frames(model, light, 200)
@@ -89,14 +95,17 @@ def test_moments_scale_with_gain_and_exposure() -> None:
 
 
 def test_the_background_has_gaussian_tails() -> None:
-    """The numbers of 4 million pixels beyond 3, 4 and 4.4 sigma are as expected: the tails are not cut."""
+    """The noise of the background has Gaussian tails, which are not truncated.
+
+    The numbers of 4 million pixels beyond 3, 4 and 4.4 sigma are as expected.
+    """
     model = replace(DEEP, dark_current=0.0, read_noise=100.0, pedestal=1000.0, columns=1000, rows=1000)
     z = (_frames(model, np.zeros((1000, 1000)), 4) - 1000.0) / 100.0
     for limit in (3.0, 4.0, 4.4):
         beyond = np.count_nonzero(np.abs(z) > limit + 0.001)
         expected = (
             2.0 * z.size * ndtr(-limit - 0.005)
-        )  # a count is 0.01 sigma, so rounding moves the bound by half a count, 0.005 sigma
+        )  # a count is 0.01 sigma, so rounding shifts the bound by half a count, which is 0.005 sigma
         assert beyond == pytest.approx(expected, abs=5.0 * np.sqrt(expected))
     assert abs(np.count_nonzero(z > 4.0) - np.count_nonzero(z < -4.0)) < 5.0 * np.sqrt(
         2.0 * z.size * ndtr(-4.0)
@@ -126,7 +135,10 @@ def test_a_bright_star_saturates_at_the_converters_top() -> None:
 
 
 def test_a_bright_star_saturates_at_the_full_well() -> None:
-    """20,000 e- at 2 e-/count and a pedestal of 100 are 10,100 counts, with a read noise of 5 counts."""
+    """A star saturates at the full well: 20,000 e- at 2 e-/count plus a pedestal of 100 are 10,100 counts.
+
+    The read noise is 5 counts.
+    """
     model = replace(DEEP, full_well=20_000.0, gain=2.0)
     frame = render(model, at_pixels(model, [40.0, 40.0]), [-3.0], *still(), np.random.default_rng(1)).astype(
         float
@@ -169,9 +181,9 @@ def test_light_is_rounded_to_the_nearest_count() -> None:
 
 
 def test_the_thesis_noise_is_uniform_and_never_negative() -> None:
-    """The noise of 2.11 is sqrt(signal) U + sqrt(RN^2 + DC T) U, with U in 0..1.
+    """The noise of the thesis (2.11), sqrt(signal) U + sqrt(RN^2 + DC T) U, is uniform and never negative.
 
-    Here sqrt(400), sqrt(150).
+    U is uniform between 0 and 1. The tested terms are sqrt(400) U and sqrt(150) U.
     """
     model = replace(DEEP, noise="uniform")
     image = np.full((96, 96), 400.0)
@@ -219,7 +231,10 @@ def test_a_source_brighter_than_any_number_of_wells_does_not_overflow() -> None:
 
 @pytest.mark.parametrize("slopes", [(2.0, 0.0), (0.0, -1.5), (0.5, 0.25)])
 def test_stray_light_grows_across_the_frame_and_brings_its_own_noise(slopes: tuple[float, float]) -> None:
-    """The stray light is zero in the darkest corner; at 2 e-/count its variance is half its mean."""
+    """Stray light increases across the frame, and has its own noise.
+
+    The stray light is zero in the darkest corner. At 2 e-/count its variance is half its mean.
+    """
     model = replace(DEEP, background_gradient=slopes, gain=2.0)
     across, down = slopes
     stray = across * np.arange(96) + down * np.arange(96)[:, None]
@@ -240,7 +255,10 @@ SMALL = StarCameraModel(columns=64, rows=48, field_of_view=np.radians(4.0))
 
 
 def test_a_star_of_magnitude_zero_gives_liebes_flux() -> None:
-    """A flux of 19,000 e-/s per mm^2 of a 25 mm aperture gives 1.8653e6 e- in 0.2 s."""
+    """A star of magnitude zero gives 1.8653e6 e- in 0.2 s, by Liebe's flux.
+
+    The flux is 19,000 e-/s per mm^2, and the aperture is 25 mm.
+    """
     image = expected_electrons(SMALL, at_pixels(SMALL, [30.2, 20.7]), [0.0], *still(0.2))
     assert image.sum() == pytest.approx(19_000 * math.pi * 12.5**2 * 0.2, rel=1e-5)
 
@@ -254,7 +272,10 @@ def test_no_light_is_lost_whatever_the_place_in_the_pixel(psf: str, point: tuple
 
 
 def test_five_magnitudes_are_a_factor_of_a_hundred() -> None:
-    """By the errata to 2.8, the scale is Pogson's, not 2.5 per magnitude (which would give 97.7)."""
+    """Five magnitudes are a factor of 100, because the scale is Pogson's (errata to 2.8).
+
+    The factor 2.5 per magnitude would give 97.7.
+    """
     star, history = at_pixels(SMALL, [30.2, 20.7]), still()
     bright, faint = (expected_electrons(SMALL, star, [v], *history).sum() for v in (1.0, 6.0))
     assert bright / faint == pytest.approx(100.0, rel=1e-5)
@@ -271,7 +292,10 @@ def test_light_grows_with_exposure_and_with_the_square_of_the_aperture() -> None
 @settings(max_examples=40, deadline=None)
 @given(st.floats(12.0, 50.0), st.floats(12.0, 35.0), st.sampled_from([0.6, 1.0, 1.7]))
 def test_the_centroid_is_the_projection(x: float, y: float, sigma: float) -> None:
-    """An undersampled image (such as sigma 0.3 px) would be biased by the pixels."""
+    """The centroid of a star is its projection.
+
+    In an undersampled image, for example with sigma 0.3 px, the pixels would bias the centroid.
+    """
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf_sigma=sigma)
     image = expected_electrons(model, at_pixels(model, [x, y]), [-5.0], *still())
     assert centroid(image) == pytest.approx([x, y], abs=1e-3)
@@ -287,7 +311,7 @@ def test_the_image_is_the_gaussian_integrated_over_each_pixel(sigma: float) -> N
 
 
 def test_the_thesis_kernel_appears_around_a_star_in_the_middle_of_a_pixel() -> None:
-    """The expected kernel is that of Sease 2.9, printed to four digits."""
+    """The image of a star in the middle of a pixel is the kernel of Sease 2.9, printed to four digits."""
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear")
     image = expected_electrons(model, at_pixels(model, [30.0, 20.0]), [3.0], *still()) / model.electrons(
         3.0, 1.0
@@ -298,9 +322,9 @@ def test_the_thesis_kernel_appears_around_a_star_in_the_middle_of_a_pixel() -> N
 
 
 def test_the_thesis_placement_shares_a_star_among_four_pixels() -> None:
-    """The expected shares follow from equations (2.5) and (2.6) for a star at (30.25, 20.4).
+    """The thesis's placement divides a star at (30.25, 20.4) among four pixels, by equations (2.5) and (2.6).
 
-    The kernel is so narrow (sigma 0.2) that only 3.7e-6 leaves a pixel.
+    The kernel is so narrow (sigma 0.2) that only 3.7e-6 of the light leaves a pixel.
     """
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear", psf_sigma=0.2)
     image = expected_electrons(model, at_pixels(model, [30.25, 20.4]), [3.0], *still()) / model.electrons(
@@ -310,7 +334,11 @@ def test_the_thesis_placement_shares_a_star_among_four_pixels() -> None:
 
 
 def test_the_thesis_placement_and_kernel_together() -> None:
-    """At (30.5, 20): across (g1/2, (g1 + g0)/2, again, g1/2), down (g1, g0, g1), g0 = 0.4519, g1 = 0.2741."""
+    """The placement and the kernel of the thesis are combined, for a star at (30.5, 20).
+
+    Across, the weights are g1/2, (g1 + g0)/2, (g1 + g0)/2, g1/2. Down, they are g1, g0, g1. g0 = 0.4519, g1 =
+    0.2741.
+    """
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear")
     image = expected_electrons(model, at_pixels(model, [30.5, 20.0]), [3.0], *still()) / model.electrons(
         3.0, 1.0
@@ -320,7 +348,11 @@ def test_the_thesis_placement_and_kernel_together() -> None:
 
 
 def test_a_star_behind_the_camera_gives_no_light() -> None:
-    """By the collinearity equations alone (errata to 2.1), such a star would fall on the same pixel."""
+    """A star behind the camera gives no light.
+
+    By the collinearity equations alone, such a star would appear at the same pixel as its opposite (errata to
+    2.1).
+    """
     star = at_pixels(SMALL, [30.2, 20.7])
     assert expected_electrons(SMALL, -star, [0.0], *still()).max() == 0.0
     assert expected_electrons(SMALL, star, [0.0], *still()).max() > 0.0
@@ -344,7 +376,7 @@ def test_images_of_several_stars_add_up() -> None:
 
 
 def test_the_real_sky_puts_each_bright_star_where_the_pinhole_does() -> None:
-    """The brightness around each star of Orion's belt is centred on its projection."""
+    """Each star of Orion's belt in the real sky is centred on its pinhole projection."""
     stars = catalogue.load()
     belt = [int(np.flatnonzero(stars.hip == hip)[0]) for hip in (25930, 26311, 26727)]
     directions = stars.directions_at(2000.0)

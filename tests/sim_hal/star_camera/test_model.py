@@ -1,4 +1,4 @@
-"""Tests of the star camera's settings: defaults of a CubeSat camera, and the limits of each range."""
+"""Tests of the settings of the star camera: defaults for a CubeSat camera, and the limits of each range."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RANGES = {
 
 
 def made(**changes: Any) -> StarCameraModel:
-    """Return a model."""
+    """Return a star camera model."""
     return StarCameraModel(**changes)
 
 

@@ -1,4 +1,4 @@
-"""Tests of moving objects in the star camera's sky: tracks, brightness and frames."""
+"""Tests of moving objects in the sky of the star camera: tracks, brightness and frames."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _line(direction: FloatArray, rate_deg: float, towards_deg: float = 30.0) -> 
 
 
 def _frame(config: Config, objects: tuple[SkyObject, ...]) -> tuple[Image, FloatArray]:
-    """Return a frame of the configured camera at rest, and its attitude matrix."""
+    """Return a frame of the configured camera at rest, and the attitude matrix of the camera."""
     text = config_path("step_demo").read_text()
     section = simulation_section(text, "step_demo", Simulation)
     assert section is not None
@@ -97,17 +97,22 @@ def test_the_camera_shows_an_object_as_a_streak_of_its_rate_and_magnitude() -> N
     rows, columns = np.nonzero(light)
     pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.radians(camera.field_of_view_deg))
     length = np.radians(0.6) * EXPOSURE * pinhole.focal_length
-    # The object starts at the boresight with constant brightness, so the centroid is half a length away.
+    # The object starts at the boresight with constant brightness, so its centroid is half a streak length
+    # away.
     weights, places = light[rows, columns], np.stack([columns, rows], axis=1).astype(float)
     middle = np.average(places, axis=0, weights=weights)
     assert np.hypot(*(middle - (camera.columns - 1) / 2)) == pytest.approx(length / 2, abs=0.5)
-    # A uniform line of length L has the variance L^2 / 12 along it, and that of the spot across it.
+    # Along a uniform line of length L, the variance is L^2 / 12 plus that of the spot. Across the line, it is
+    # that of the spot.
     across, along = np.linalg.eigvalsh(np.cov(places.T, aweights=weights))
     assert np.sqrt(12.0 * (along - across)) == pytest.approx(length, rel=0.05)
 
 
 def test_an_object_in_orbit_is_shifted_by_its_motion_relative_to_the_camera_alone() -> None:
-    """For planetary aberration between two bodies near the Earth, the Earth's velocity cancels."""
+    """An object in orbit is displaced only by its motion relative to the camera.
+
+    In the planetary aberration between two bodies near the Earth, the Earth's velocity cancels.
+    """
     world = _world()
     around = world.surroundings()
     position, velocity = np.array(around.position), np.array(around.velocity)
@@ -138,9 +143,9 @@ def test_a_tumbling_object_is_as_bright_as_its_mean_light_over_the_exposure() ->
     objects.begin(5_000_000_000)
     slow, fast = objects.tracks(105_000_000_000, np.array([0.0, 0.5]))
     assert slow.magnitude == pytest.approx(4.0, abs=1e-4)
-    # The mean of exp(x sin) over a rotation is the modified Bessel function I0, and I0(0.921) = 1.2236.
+    # The mean of exp(x sin) over a rotation is the modified Bessel function I0(x), and I0(0.921) = 1.2236.
     assert fast.magnitude == pytest.approx(3.0 - 2.5 * np.log10(1.2236), abs=1e-3)
-    # At a mission time of 100 s, 0.1 deg/s have moved the object by 10 deg due north.
+    # At 0.1 deg/s, the object has moved by 10 deg due north at the mission time 100 s.
     assert np.degrees(np.arcsin(slow.directions[0, 2])) == pytest.approx(30.0, abs=1e-9)
 
 
@@ -178,7 +183,7 @@ def _table_4_3() -> Scenario:
 
 
 def _pair(ahead: float, duration: float = 6000.0) -> tuple[ResidentSpaceObject, ResidentSpaceObject]:
-    """Return two objects on one circular orbit, the second `ahead` rad in front."""
+    """Return two objects on one circular orbit; the second object is `ahead` rad in front of the first."""
     elements = KeplerianElements(semi_major_axis=7000e3, inclination=1.0)
     leader = replace(elements, true_anomaly=ahead)
     first, second = (propagate(part, duration, j2=0.0) for part in (elements, leader))
@@ -203,7 +208,10 @@ def test_a_track_counts_time_from_where_the_attitude_does() -> None:
 
 @pytest.mark.parametrize("height", [100.0, 5e3, 330e3])
 def test_a_track_is_sampled_finely_enough_for_any_pass(height: float) -> None:
-    """If orbits cross `height` m apart, uniform motion between samples is correct to 1e-7 rad."""
+    """A track is sampled finely enough for any pass.
+
+    If the orbits cross at a distance of `height` m, uniform motion between samples is correct to 1e-7 rad.
+    """
     low = KeplerianElements(semi_major_axis=7000e3)
     high = KeplerianElements(semi_major_axis=7000e3 + height, inclination=1.5)
     camera, other = propagate(low, 10.0, j2=0.0), propagate(high, 10.0, j2=0.0)
@@ -211,7 +219,7 @@ def test_a_track_is_sampled_finely_enough_for_any_pass(height: float) -> None:
     times = np.linspace(0.0, 0.5, 30_001)
     exact = directions(camera.positions_at(times), other.positions_at(times))
     off = np.linalg.norm(np.cross(track.directions_at(times), exact), axis=1)
-    # At very short distances, the rounding of positions is visible.
+    # At very short distances, the rounding errors of positions dominate.
     assert off.max() < 1.1 * TRACK_ERROR + 1e-8 * 7000.0 / height
 
 
@@ -233,7 +241,10 @@ def test_in_the_umbra_there_is_no_track_and_in_the_penumbra_a_fainter_one() -> N
 
 
 def test_an_object_behind_the_earth_has_no_track() -> None:
-    """Two objects on one orbit are visible to each other up to 2 acos(R/a) = 48.7 deg apart."""
+    """An object behind the Earth has no track.
+
+    Two objects on one orbit are visible to each other if they are up to 2 acos(R/a) = 48.7 deg apart.
+    """
     clear = 2.0 * np.arccos(EARTH_RADIUS / 7000e3)
     epochs = (EPOCH, EPOCH + 182.0)
     for ahead, seen in ((clear - 0.01, True), (clear + 0.01, False)):
@@ -294,7 +305,7 @@ def test_the_thesis_scenario_has_the_orbits_of_table_4_3() -> None:
     camera, spacecraft = scenario.camera, scenario.objects[0].orbit
     start = np.array([0.0])
     assert camera.positions_at(start)[0] == pytest.approx([6748e3, 0.0, 0.0], abs=1e-6)
-    # 150 deg from the node along an orbit tilted by 89 deg.
+    # 150 deg from the node, along an orbit with an inclination of 89 deg.
     along, tilt = np.radians(150.0), np.radians(89.0)
     place = 7078e3 * np.array([np.cos(along), np.sin(along) * np.cos(tilt), np.sin(along) * np.sin(tilt)])
     assert spacecraft.positions_at(start)[0] == pytest.approx(place, abs=1.0)
@@ -305,9 +316,10 @@ def test_the_thesis_scenario_has_the_orbits_of_table_4_3() -> None:
 
 
 def test_at_a_frame_a_second_the_thesis_scenario_has_about_as_many_opportunities() -> None:
-    """The thesis has 14 passes for an unstated date and frame interval.
+    """With a frame a second, the scenario of the thesis has about as many passes as in the thesis.
 
-    With a frame a second there are 9 to 19 in a year.
+    The thesis states 14 passes, without date and frame interval. With a frame a second there are 9 to 19
+    passes in a year.
     """
     counts = [
         len(opportunities(replace(_table_4_3(), epoch=EPOCH + day), cadence=1.0, exposure=0.5))
@@ -333,7 +345,7 @@ def test_every_opportunity_lies_within_a_window() -> None:
     found, stretches = opportunities(scenario, cadence=1.0, exposure=0.5), windows(scenario)
     for item in found:
         assert any(w.start - 2e-3 <= item.start and item.start + 0.5 <= w.end + 2e-3 for w in stretches)
-    # The number of starts equals the number of grid points that fit into the windows, so no start is missed.
+    # The number of starts equals the number of grid points within the windows, so no start is missed.
     fit = sum(
         len([t for t in np.arange(np.ceil(w.start), w.end - 0.5)]) for w in stretches if w.end - w.start > 0.5
     )
@@ -357,7 +369,7 @@ def test_the_object_is_in_the_frame_where_the_opportunity_has_it() -> None:
     assert image.sum() == pytest.approx(float(StarCameraModel().electrons(4.0, 0.5)), rel=1e-3)
     middle = 0.5 * (np.array(item.first) + np.array(item.last))
     assert centroid(image) == pytest.approx(middle, abs=0.3)
-    # A rotation of 0.025 rad moves stars by 73 px, and the object itself moves by a few px.
+    # A rotation of 0.025 rad moves stars by 73 px, and the object by only a few px.
     assert np.hypot(*(np.array(item.last) - np.array(item.first))) == pytest.approx(73.0, abs=15.0)
 
 

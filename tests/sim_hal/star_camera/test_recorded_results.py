@@ -1,4 +1,4 @@
-"""Tests that rendered frames of stars and objects equal the recorded ones."""
+"""Tests that rendered frames of stars and objects equal the recorded frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the Basilisk world against `free_body`; skipped if Basilisk is not installed."""
+"""Tests of the Basilisk world against `free_body`. They are skipped if Basilisk is not installed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ def both(
 
 
 def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradient() -> None:
-    """The degree 13 of IGRF-14, which WMM2025 lacks, changes the attitude by a milliradian."""
+    """Orbit, field and rotation of both worlds agree, with coils and gravity gradient.
+
+    The degree 13 of IGRF-14, which WMM2025 does not have, changes the attitude by a milliradian.
+    """
     currents = [np.array([0.05, -0.03, 0.02])]
     theirs, ours = both(FreeBodySection(craft="cubesat_3u", disturbances=CALM), lambda: currents[0])
     for second in range(1, 121):
@@ -56,7 +59,10 @@ def test_orbit_field_and_rotation_agree_with_ours_under_coils_and_gravity_gradie
 
 
 def test_disturbances_turn_the_body_about_as_ours_do() -> None:
-    """Sunlight, dipoles and drag act on a body from rest for five minutes."""
+    """Disturbances rotate the body equally in both worlds.
+
+    Sunlight, dipoles and drag act for five minutes on a body that was at rest.
+    """
     body = FreeBodySection(
         orbit=OrbitSection(local_time=12.0), disturbances=Disturbances(gravity_gradient=0.0)
     )

@@ -104,7 +104,7 @@ def test_the_errors_of_craft_and_coils_are_as_large_as_asked_for() -> None:
 
 
 def test_drag_on_a_box_is_its_arm_across_the_force_on_its_shadow() -> None:
-    """For a convex box, the aerodynamic torque equals that of the total force at the centre of the box."""
+    """For a convex box, the drag torque is that of the total force at the centre of the box."""
     arm, flow = np.array([0.01, -0.005, 0.015]), np.array([5000.0, 4000.0, -3000.0])
     faces = box((0.3, 0.1, 0.2), arm, np.zeros(6))
     shadow = np.array([0.02, 0.06, 0.03]) @ np.abs(flow)
@@ -124,7 +124,10 @@ def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> 
 
 
 def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None:
-    """At 500 km: gravity gradient 4.9e-8 N m, dipole of 1e-3 A m^2 2 to 5e-8 N m, drag along x 6e-9 N m."""
+    """The disturbances of a 3U at 500 km have the sizes of the design.
+
+    The gravity gradient is 4.9e-8 N m, a dipole of 1e-3 A m^2 gives 2 to 5e-8 N m, and drag along x 6e-9 N m.
+    """
     sizes: dict[str, list[float]] = {}
     for seed in range(12):
         body = FreeBody(FreeBodySection(craft="cubesat_3u"), lambda: np.zeros(3), seed=seed)
@@ -165,7 +168,7 @@ def test_a_configuration_names_the_free_body_and_must_describe_it() -> None:
 
 
 def test_the_documents_section_is_read_and_flies() -> None:
-    """The configuration section is the example of docs/fly/simulation.md."""
+    """The example section of docs/fly/simulation.md is read, and a run with it succeeds."""
     page = Path("docs/fly/simulation.md").read_text(encoding="utf-8")
     text = page.split("worlds/test_free_body.py -->\n```yaml\n")[1].split("```")[0]
     section = reader.simulation_section(text, "simulation.md", Simulation)
@@ -196,7 +199,7 @@ def inertia_matrix(body: FreeBody) -> FloatArray:
 def independent(
     body: FreeBody, start: FloatArray, currents: FloatArray, seconds: float, loads: bool
 ) -> FloatArray:
-    """Return quaternion and rate (7,) by DOP853, in body axes with a full matrix of inertia."""
+    """Return quaternion and rate (7,) by DOP853, in body axes with a full inertia matrix."""
     inertia = inertia_matrix(body)
 
     def slope(time: float, state: FloatArray) -> FloatArray:
@@ -264,7 +267,10 @@ def test_without_torque_energy_and_momentum_are_kept(speed: float) -> None:
 
 
 def test_a_body_at_the_stable_attitude_swings_with_the_known_period() -> None:
-    """Pitch oscillates with omega^2 = 3 n^2 (J_x - J_z) / J_y (Wertz 1978, 18.3)."""
+    """Near the stable attitude, a body oscillates in pitch with omega^2 = 3 n^2 (J_x - J_z) / J_y.
+
+    The formula is that of Wertz 1978, 18.3.
+    """
     inertia = (0.0333, 0.0333, 0.0066)
     rotation, n = Rotation(inertia), 1.1e-3
     expected = 2.0 * np.pi / (n * np.sqrt(3.0 * (inertia[0] - inertia[2]) / inertia[1]))
@@ -285,7 +291,10 @@ FOLDER = Path(__file__).resolve().parents[3] / "config"
 
 @pytest.mark.parametrize("name", ["orbit.yaml", "orbit_3u.yaml", "orbit_object.yaml", "orbit_object_1u.yaml"])
 def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
-    """The seed draws errors of a few per cent; entirely different coils would be a wrong configuration."""
+    """The coils and the inertia of the configuration are those of the world, within a few per cent.
+
+    Entirely different coils would be a wrong configuration.
+    """
     config = as_orbit(reader.load(FOLDER / name))
     text = (FOLDER / name).read_text(encoding="utf-8")
     section = reader.simulation_section(text, name, Simulation)
@@ -298,7 +307,10 @@ def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
 
 
 def test_the_dipole_of_a_coil_varies_every_twenty_seconds() -> None:
-    """The torque of a single driven coil shows its dipole relative to the mean dipole."""
+    """The dipole of a coil changes every twenty seconds.
+
+    The torque of a single driven coil shows its dipole relative to the mean dipole.
+    """
     varied = FreeBodySection(craft="cubesat_3u", disturbances=Disturbances(coil_variation=0.02))
     current = np.array([0.1, 0.0, 0.0])
     body = FreeBody(varied, lambda: current)
@@ -368,7 +380,10 @@ def test_the_campaign_of_pointing_judges_the_weights_that_are_flown(name: str, c
 
 
 def test_the_filter_expects_the_errors_of_tilted_coils_that_the_world_draws() -> None:
-    """The mean square of the coil matrix's errors, in expected sigmas, over 200 satellites is checked."""
+    """The filter expects the errors of tilted coils that the world draws.
+
+    Over 200 satellites, the mean square of the errors of the coil matrix, in expected sigmas, is checked.
+    """
     config = as_orbit(reader.load(FOLDER / "orbit_1u_tilted.yaml"))
     coils, prior = config.coils.map(), filter_settings(config).coils
     assert prior is not None

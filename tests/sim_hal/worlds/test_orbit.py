@@ -1,4 +1,4 @@
-"""Tests of orbits, Sun and environment against published states, analytic solutions and the models."""
+"""Tests of orbits, Sun and environment, against published states, analytic solutions and other models."""
 
 from __future__ import annotations
 
@@ -82,7 +82,10 @@ def test_elements_with_another_shape_than_the_orbit_are_named(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_mean_elements_written_as_an_orbit_keep_its_shape(seed: int) -> None:
-    """The mean elements of SGP4 are written as osculating elements in ICRS axes, a common confusion."""
+    """Mean elements of SGP4 that are used as osculating elements in ICRS axes keep the shape of the orbit.
+
+    This use of mean elements is a common confusion.
+    """
     rng = np.random.default_rng(seed)
     altitude, tilt = rng.uniform(400e3, 1200e3), rng.uniform(20.0, 120.0)
     node, perigee = rng.uniform(0.0, 360.0, 2)
@@ -99,14 +102,17 @@ def test_mean_elements_written_as_an_orbit_keep_its_shape(seed: int) -> None:
 
 
 def test_elements_give_the_published_state() -> None:
-    """The expected state is that of Vallado's Example 2-6, whose GM differs by 4e-10."""
+    """The elements of Vallado's Example 2-6 give the published state.
+
+    The GM of the example differs by 4e-10.
+    """
     position, velocity = VALLADO.state()
     assert position == pytest.approx([6_525_368.12, 6_861_531.83, 6_449_118.61], abs=0.01)
     assert velocity == pytest.approx([4902.2786, 5533.1396, -1975.7101], abs=1e-4)
 
 
 def _by_kepler(elements: KeplerianElements, time: float) -> FloatArray:
-    """Return the position `time` s later, by Kepler's equation and its own geometry."""
+    """Return the position `time` s later by Kepler's equation, with independent geometry."""
     e, a = elements.eccentricity, elements.semi_major_axis
     eccentric = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(0.5 * elements.true_anomaly))
     mean = eccentric - e * np.sin(eccentric) + np.sqrt(GRAVITATIONAL_PARAMETER / a**3) * time
@@ -117,9 +123,9 @@ def _by_kepler(elements: KeplerianElements, time: float) -> FloatArray:
 
 @pytest.mark.parametrize("elements", [LOW, replace(LOW, eccentricity=0.0), VALLADO])
 def test_two_bodies_keep_keplers_laws(elements: KeplerianElements) -> None:
-    """The test covers 55,000 s, about nine revolutions of the thesis's orbit.
+    """The motion of two bodies obeys Kepler's laws for 55,000 s, about nine revolutions.
 
-    The positions, up to 66,000 km from the Earth's centre, agree to 1 cm.
+    The orbit is that of the thesis. The positions agree to 1 cm, at up to 66,000 km from the Earth's centre.
     """
     orbit = propagate(elements, 55_000.0, j2=0.0)
     for time in (0.0, 17.3, 5000.0, 31_234.5, 55_000.0):
@@ -137,7 +143,10 @@ def _potential(position: FloatArray) -> float:
 def test_the_acceleration_is_the_gradient_of_the_potential(
     anomaly: float, tilt: float, radius: float
 ) -> None:
-    """Compare second differences of the path with first differences of J2's potential (2.14 as printed)."""
+    """The acceleration is the gradient of J2's potential (2.14, as printed).
+
+    Second differences of the path are compared with first differences of the potential.
+    """
     elements = KeplerianElements(semi_major_axis=radius, inclination=tilt, true_anomaly=anomaly)
     step = 2.0
     orbit = propagate(elements, 2.0 * step)
@@ -170,7 +179,10 @@ def _secular_rate(times: FloatArray, angles: FloatArray) -> float:
 
 @pytest.mark.parametrize("inclination", [28.5, 50.0, 89.0, 98.2])
 def test_the_node_regresses_at_the_secular_rate(inclination: float) -> None:
-    """The rate is -3/2 J2 (R/p)^2 n cos i (Vallado, section 9.6), to first order in J2: 0.2 %."""
+    """The node regresses at -3/2 J2 (R/p)^2 n cos i (Vallado, section 9.6), within 0.2 %.
+
+    The formula is of first order in J2.
+    """
     elements = KeplerianElements(semi_major_axis=7078e3, inclination=np.radians(inclination))
     times = np.linspace(0.0, 30.0 * elements.period, 3001)
     mean_motion = 2.0 * np.pi / elements.period
@@ -180,9 +192,9 @@ def test_the_node_regresses_at_the_secular_rate(inclination: float) -> None:
 
 
 def test_a_sun_synchronous_orbit_follows_the_sun() -> None:
-    """The published inclination at 800 km is 98.6 deg.
+    """A Sun-synchronous orbit follows the Sun: its node rotates by 0.9856 deg a day.
 
-    The node rotates by 0.9856 deg a day (once a tropical year).
+    The node rotates once in a tropical year. The published inclination at 800 km is 98.6 deg.
     """
     elements = KeplerianElements(semi_major_axis=EARTH_RADIUS + 800e3, inclination=np.radians(98.6))
     times = np.linspace(0.0, 2.0 * 86_400.0, 4001)
@@ -192,7 +204,10 @@ def test_a_sun_synchronous_orbit_follows_the_sun() -> None:
 
 @pytest.mark.parametrize("inclination", [30.0, 63.4349, 85.0])
 def test_the_perigee_turns_at_the_secular_rate(inclination: float) -> None:
-    """The rate is 3/4 J2 (R/p)^2 n (5 cos^2 i - 1), zero at the critical inclination of 63.43 deg."""
+    """The perigee rotates at 3/4 J2 (R/p)^2 n (5 cos^2 i - 1).
+
+    This rate is zero at the critical inclination of 63.43 deg.
+    """
     elements = KeplerianElements(
         semi_major_axis=26_000e3,
         eccentricity=0.7,
@@ -210,7 +225,7 @@ def test_the_perigee_turns_at_the_secular_rate(inclination: float) -> None:
     node /= np.linalg.norm(node, axis=1, keepdims=True)
     ahead = np.cross(momentum / np.linalg.norm(momentum, axis=1, keepdims=True), node)
     argument = np.unwrap(np.arctan2(np.sum(to_perigee * ahead, axis=1), np.sum(to_perigee * node, axis=1)))
-    # The interval is from apogee to apogee, where the short-periodic part is equal.
+    # The interval is from apogee to apogee, because the short-periodic motion is the same at both ends.
     moved = (argument[-1] - argument[0]) / times[-1]
     parameter = 26_000e3 * (1.0 - 0.49)
     scale = 0.75 * J2 * (EARTH_RADIUS / parameter) ** 2 * 2.0 * np.pi / elements.period
@@ -269,9 +284,9 @@ ABERRATION = 20.5 * ARCSECOND
 def test_the_sun_stands_where_it_was_published(
     julian_date: float, published: tuple[float, float, float]
 ) -> None:
-    """The references are geometric; the apparent Sun is 20.5" behind along the ecliptic.
+    """The position of the Sun agrees with published positions to 40" and 1e-4 AU.
 
-    The tolerances are 40" and 1e-4 AU.
+    The published positions are geometric. The apparent Sun is displaced by 20.5" along the ecliptic.
     """
     place = np.array(published)
     pole = np.array([0.0, -np.sin(OBLIQUITY), np.cos(OBLIQUITY)])
@@ -284,8 +299,8 @@ def test_the_sun_stands_where_it_was_published(
 @pytest.mark.parametrize(
     ("julian_date", "longitude"),
     [
-        # US Naval Observatory, Earth's seasons: 2026 March 20 14:46, June 21 08:25, September 23 00:05,
-        # December 21 20:50; 2030 March 20 13:52 UT. TT is 69 s later.
+        # Earth's seasons by the US Naval Observatory: 2026 March 20 14:46, June 21 08:25, September 23 00:05,
+        # December 21 20:50, and 2030 March 20 13:52 UT. TT is 69 s ahead.
         (2_461_120.11528, 0.0),
         (2_461_212.85069, 90.0),
         (2_461_306.50347, 180.0),
@@ -294,7 +309,10 @@ def test_the_sun_stands_where_it_was_published(
     ],
 )
 def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float, longitude: float) -> None:
-    """The longitudes are those of date; longitudes of J2000 are smaller by the precession, 50.29" a year."""
+    """At equinoxes and solstices, the Sun's longitude is a multiple of 90 deg.
+
+    These are longitudes of date. Longitudes of J2000 are smaller by the precession, 50.29" a year.
+    """
     when = julian_date + 69.0 / DAY
     x, y, z = sun_position(when)
     along = np.arctan2(y * np.cos(OBLIQUITY) + z * np.sin(OBLIQUITY), x)
@@ -305,7 +323,10 @@ def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float
 
 
 def test_the_distance_is_least_in_january_and_greatest_in_july() -> None:
-    """By the US Naval Observatory, the extremes are 0.9833 AU (2026 January 3) and 1.0167 AU (July 6)."""
+    """The Sun's distance is smallest in January, 0.9833 AU, and largest in July, 1.0167 AU.
+
+    The US Naval Observatory gives the dates 2026 January 3 and July 6.
+    """
     days = 2_461_041.5 + np.arange(365.0)
     distance = np.linalg.norm(sun_position(days), axis=-1) / ASTRONOMICAL_UNIT
     assert distance.min() == pytest.approx(0.9833, abs=1e-4)
@@ -362,7 +383,7 @@ def test_the_local_time_of_the_node_places_the_sun_over_it() -> None:
     position, _ = elements(ORBIT, DATE).state()
     away = sun_position(DATE)
     cosine = position @ away / np.linalg.norm(position) / np.linalg.norm(away)
-    assert np.degrees(np.arccos(cosine)) < 1.0  # at the equinox the Sun is above the equator
+    assert np.degrees(np.arccos(cosine)) < 1.0  # at the equinox, the Sun is above the equator
 
 
 def test_the_ring_current_is_slow_never_reversed_and_as_large_as_asked_for() -> None:
@@ -398,7 +419,10 @@ def test_without_bulge_and_walks_the_air_is_the_same_on_all_sides_and_the_dipole
 
 
 def test_the_air_turns_with_the_earth() -> None:
-    """At the equator of an eastward orbit the air speed is lower by 0.4929 km/s at 6,760 km."""
+    """The atmosphere rotates with the Earth.
+
+    At the equator of an eastward orbit at 6,760 km, the air speed is smaller by 0.4929 km/s.
+    """
     environment = Environment(
         elements(OrbitSection(inclination_deg=0.0), DATE), DATE, np.random.default_rng(1)
     )

@@ -1,1 +1,1 @@
-"""Tests of `knightcube.vision.streaks`."""
+"""Tests of the package `knightcube.vision.streaks`."""

@@ -21,7 +21,7 @@ EPOCH = 2030.0
 class Scene:
     """A frame with its true motion and its stars, brightest first.
 
-    `stars` (n, 2) are positions at mid-exposure, px, and `electrons` (n,) their fluxes.
+    `stars` (n, 2) are the positions of the stars at mid-exposure, px, and `electrons` (n,) are their fluxes.
     """
 
     pixels: Image
@@ -46,7 +46,7 @@ class Scene:
 
 
 def turn_of(theta: float, length: float, roll: float, camera: StarCameraModel = CAMERA) -> FloatArray:
-    """Return a rotation (3,), rad, `theta` rad off the boresight, for streaks of about `length` px."""
+    """Return a rotation (3,), rad, about an axis `theta` rad off boresight, for streaks of `length` px."""
     pinhole = camera.pinhole
     axis = np.array([np.sin(theta) * np.cos(roll), np.sin(theta) * np.sin(roll), np.cos(theta)])
     off_axis = 0.5 * pinhole.columns / pinhole.focal_length
@@ -63,7 +63,7 @@ def real_sky(
     camera: StarCameraModel = CAMERA,
     faintest: float = 8.5,
 ) -> Scene:
-    """Return a random field of the real sky at a constant rate, which depends only on the seed."""
+    """Return a random field of the real sky at a constant rate. The field depends only on the seed."""
     rng = np.random.default_rng([seed, 777])
     turn = turn_of(theta, length, rng.uniform(0.0, 2.0 * np.pi), camera)
     return taken(rng, turn, np.zeros(3), exposure, camera, faintest)
@@ -77,7 +77,7 @@ def taken(
     camera: StarCameraModel = CAMERA,
     faintest: float = 8.5,
 ) -> Scene:
-    """Return a frame of a random field for a rate of turn + growth t, where `growth` is parallel to `turn`.
+    """Return a frame of a random field at the rate turn + growth t, where `growth` is parallel to `turn`.
 
     With a rolling shutter, the motion continues until all rows are read.
     """

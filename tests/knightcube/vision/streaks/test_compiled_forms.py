@@ -52,8 +52,8 @@ _FUNCTIONS = (
     (coupled_stars, "solution", 1e-4),
 )
 _SMALL = replace(CAMERA, columns=300, rows=260)
-# Streak length (px) and relative change of the rate of each frame: crossing streaks, a motion from rest, and
-# streaks without ends.
+# Streak length (px) and relative change of the rate of each frame: streaks that cross, a motion from rest,
+# and streaks without ends in the frame.
 _FRAMES = ((60.0, 0.0), (60.0, 1.95), (220.0, 0.0))
 _MOST_CALLS = 30
 
@@ -63,13 +63,13 @@ def _size(arguments: tuple[Any, ...]) -> int:
 
 
 class _AllCalled(Exception):
-    """Ends a fit that has called all functions."""
+    """Exception that ends a fit in which all functions were called."""
 
 
 def _record(patch: pytest.MonkeyPatch, most: int) -> dict[str, list[tuple[Any, ...]]]:
     """Record the arguments of the first `most` calls of each function of `_FUNCTIONS`.
 
-    A call raises _AllCalled when all functions have been called `most` times.
+    When all functions have been called `most` times, the next call raises _AllCalled.
     """
     calls: dict[str, list[tuple[Any, ...]]] = {name: [] for _, name, _ in _FUNCTIONS}
     for module, name, _ in _FUNCTIONS:
@@ -87,7 +87,7 @@ def _record(patch: pytest.MonkeyPatch, most: int) -> dict[str, list[tuple[Any, .
 
 
 def _fit(camera: StarCameraModel, length: float, growth: float) -> None:
-    """Fit the motion of a frame with streaks of `length` px whose rate grows by the fraction `growth`."""
+    """Fit the motion of a frame with streaks of `length` px, whose rate grows by the fraction `growth`."""
     turn = turn_of(1.1, length, 0.4, camera)
     one = taken(np.random.default_rng(8), turn, growth * turn, 0.2, camera)
     settings = LikelihoodSettings(saturation=SATURATION)
@@ -109,7 +109,10 @@ def test_the_compiled_forms_equal_those_in_numpy(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_loops_return_the_same_as_numpy_without_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first steps of a fit of streaks without ends call all functions."""
+    """Without compilation, the loops of all functions return the same values as numpy.
+
+    All functions are called in the first steps of a fit of streaks without ends.
+    """
     with monkeypatch.context() as patch, suppress(_AllCalled):
         calls = _record(patch, 1)
         _fit(replace(CAMERA, columns=160, rows=140), 160.0, 0.0)

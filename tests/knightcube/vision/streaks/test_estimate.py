@@ -42,7 +42,10 @@ def _squared(error: FloatArray, covariance: FloatArray) -> float:
     [(0.0, 51.0), (0.0, 205.0), (10.0, 102.0), (45.0, 51.0), (45.0, 205.0), (90.0, 102.0), (90.0, 205.0)],
 )
 def test_the_rate_is_within_what_its_covariance_and_the_bound_allow(theta: float, length: float) -> None:
-    """A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
+    """The rate error agrees with its covariance and with the Cramer-Rao bound.
+
+    A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand frames.
+    """
     scene = real_sky(int(theta) + int(length), np.radians(theta), length, 0.2)
     found = _estimated(scene)
     assert found.status is StreakStatus.RATE
@@ -60,7 +63,7 @@ def test_stars_have_their_true_positions_at_mid_exposure() -> None:
     off = found.stars[found.used] - scene.stars[nearest]
     squares = [_squared(o, c) for o, c in zip(off, found.star_covariance[found.used], strict=True)]
     assert np.median(squares) < 4.0
-    # The faintest of the used stars are accurate only to a few tenths of a pixel.
+    # The positions of the faintest stars used are accurate only to a few tenths of a pixel.
     assert np.median(np.abs(off[:8])) < 0.1
 
 
@@ -141,7 +144,10 @@ def test_a_changing_rate_fits_the_accelerating_model_and_not_the_constant_one() 
 
 @pytest.mark.parametrize("growth", [0.0, 0.1])
 def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
-    """With `auto`, the fit selects the true model, and its error agrees with the covariance."""
+    """The pixels decide whether the rate changes: with `auto`, the fit selects the true model.
+
+    The rate error then agrees with its covariance.
+    """
     turn = turn_of(np.radians(60.0), 102.0, 0.4)
     scene = taken(np.random.default_rng(24), turn, growth * turn, 0.2)
     found = _estimated(scene)
@@ -154,7 +160,11 @@ def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
 
 @pytest.mark.parametrize(("growth", "length"), [(1.0, 50.0), (2.0, 16.0), (-2.0, 90.0)])
 def test_a_rate_that_begins_or_ends_at_zero_is_fitted(growth: float, length: float) -> None:
-    """The rate changes by up to 200 % of its mean, so that one end of each streak is bright and one dim."""
+    """A rate that is zero at the start or the end of the exposure is fitted.
+
+    The rate changes by up to 200 % of its mean, so that one end of each streak is bright and the other is
+    dim.
+    """
     turn = turn_of(np.radians(60.0), length, 0.4)
     found = _estimated(taken(np.random.default_rng(25), turn, growth * turn, 0.2))
     assert found.rate is not None
@@ -165,7 +175,10 @@ def test_a_rate_that_begins_or_ends_at_zero_is_fitted(growth: float, length: flo
 
 
 def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() -> None:
-    """The camera rests for a third of the exposure and then accelerates, which is not linear in time."""
+    """A step within the exposure is fitted with the time profile of the rate from navigation.
+
+    The camera rests for a third of the exposure and then accelerates, which is not linear in time.
+    """
     turn = turn_of(np.radians(70.0), 40.0, 0.9)
     share = 1.0 / 3.0
 
@@ -204,9 +217,10 @@ def test_a_rotation_that_reverses_within_the_exposure_is_rejected() -> None:
 
 
 def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
-    """The bright regions have wrong lengths.
+    """Streaks of half the field of view are fitted, although few of them are entirely in the frame.
 
-    A scan along the circles about the rotation axis finds the angle.
+    The bright regions have wrong lengths, and a scan along the circles about the rotation axis finds the
+    angle.
     """
     scene = real_sky(26, np.radians(75.0), 512.0, 0.2)
     found = _estimated(scene)
@@ -218,7 +232,10 @@ def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
 
 
 def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
-    """A line time of 20 us changes the lengths of 100 px streaks by 1 % for an exposure of 0.2 s."""
+    """A rolling shutter biases the rate unless the shutter is modelled.
+
+    For an exposure of 0.2 s, a line time of 20 us changes the lengths of 100 px streaks by 1 %.
+    """
     camera = replace(CAMERA, line_time=2e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
     scene = taken(np.random.default_rng(21), turn, np.zeros(3), 0.2, camera)
@@ -234,7 +251,10 @@ def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
 
 
 def test_a_rolling_shutter_distinguishes_a_rotation_from_its_reverse() -> None:
-    """The rates of both signs differ by 5 %. Without a prior rate, the covariance includes both rates."""
+    """A rolling shutter distinguishes a rotation from its reverse, because both rates differ by 5 %.
+
+    Without a prior rate, the covariance includes both rates.
+    """
     camera = replace(CAMERA, line_time=5e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
     scene = taken(np.random.default_rng(22), turn, np.zeros(3), 0.2, camera)
@@ -281,7 +301,7 @@ def test_invalid_arguments_raise_an_error() -> None:
 
 
 def _brightest(scene: Scene, factor: float) -> tuple[FitProblem, StreakScene]:
-    """Return a frame and its 12 brightest stars under `factor` times the true rotation."""
+    """Return a frame, and its 12 brightest stars for `factor` times the true rotation."""
     frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), _SETTINGS, 1.0)
     motion = CameraMotion.steady(factor * scene.rate * scene.exposure)
@@ -320,9 +340,10 @@ def test_the_light_of_the_whole_frame_gives_the_angle_about_an_approximate_axis(
 
 @pytest.mark.parametrize("width", [5, 485, 534])
 def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
-    """On a circle about the rotation axis, streaks are found by boxes of samples.
+    """No box of samples is wider than half a circle.
 
-    A frame in which the best box has 534 of the 1,081 samples of a circle must not raise an error.
+    Streaks are found by boxes of samples on circles about the rotation axis. A frame whose best box has 534
+    of the 1,081 samples of a circle must not raise an error.
     """
     widths = sharper_widths(width, 1081 // 2)
     assert width in widths
@@ -330,7 +351,10 @@ def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
 
 
 def test_noise_gives_hardly_any_streaks_even_near_the_axis() -> None:
-    """Samples on slow circles share pixels, so that their noise is correlated."""
+    """Noise gives hardly any streaks, even near the axis.
+
+    Samples on small circles about the axis share pixels, so their noise is correlated.
+    """
     noise = np.random.default_rng(5).normal(500.0, 10.5, (1024, 1024))
     frame = reduce_frame(np.rint(noise).astype(np.uint16), SATURATION, 1.0)
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
@@ -358,14 +382,20 @@ def test_pieces_of_streaks_form_chains_and_entire_streaks_do_not() -> None:
 
 
 def test_a_rotation_supported_only_by_streaks_at_the_border_is_rejected() -> None:
-    """In run 216 of seed 2026, 1.37 times the true angle fits all streaks that the border truncates."""
+    """A rotation that is supported only by streaks at the border of the frame is rejected.
+
+    In run 216 of seed 2026, 1.37 times the true angle fits all streaks that the border truncates.
+    """
     camera = StarCameraModel(field_of_view=FIELD)
     scene, _ = RandomSlew.drawn(2026, 216).exposed(camera)
     _assert_right_or_refused(camera, scene)
 
 
 def test_a_rotation_is_rejected_if_the_only_entire_streak_is_longer() -> None:
-    """All bright streaks show only one end, and 0.88 times the true angle fits these ends."""
+    """A rotation is rejected if the only streak that is entirely in the frame is longer.
+
+    All other bright streaks show only one end, and 0.88 times the true angle fits these ends.
+    """
     camera, generator = StarCameraModel(field_of_view=FIELD), np.random.default_rng((4242, 2, 50, 7))
     theta = np.radians(generator.uniform(0.0, 90.0))
     _assert_right_or_refused(camera, slew(generator, float(theta), 0.5, 0.2, model=camera))
@@ -373,7 +403,10 @@ def test_a_rotation_is_rejected_if_the_only_entire_streak_is_longer() -> None:
 
 @pytest.mark.parametrize("run", [188, 970])
 def test_the_whole_frame_gives_the_angle_if_bright_regions_are_blends(run: int) -> None:
-    """In these crowded frames, 2.5 times the true angle explains a part of the flux."""
+    """If bright regions are blends, the whole frame gives the angle.
+
+    In these crowded frames, 2.5 times the true angle would explain a part of the flux.
+    """
     camera = StarCameraModel(field_of_view=FIELD)
     scene, _ = RandomSlew.drawn(62, run).exposed(camera)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
@@ -389,9 +422,9 @@ def _assert_right_or_refused(camera: StarCameraModel, scene: Drawn) -> None:
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:
-    """A chi-square with 36 degrees of freedom lies between 19 and 62 in 99 % of cases.
+    """The summed errors agree with a chi-square, which is from 19 to 62 in 99 % of cases.
 
-    The tested lower limit is half of the lower quantile.
+    The chi-square has 36 degrees of freedom. The tested lower limit is half of the lower quantile.
     """
     total = 0.0
     for seed in range(12):
@@ -405,7 +438,10 @@ def test_the_covariance_is_that_of_the_errors() -> None:
 
 
 def test_the_rate_reaches_the_bound_without_faint_stars() -> None:
-    """The ratio to the bound over 12 frames is below 1.31, the 99 % limit for 36 degrees of freedom."""
+    """Without faint stars, the rms rate error over 12 frames is below 1.31 times the bound.
+
+    This is the 99 % limit for 36 degrees of freedom.
+    """
     ratios = []
     for seed in range(12):
         theta = np.radians((0.0, 30.0, 60.0, 90.0)[seed % 4])

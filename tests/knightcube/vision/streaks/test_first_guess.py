@@ -1,4 +1,4 @@
-"""Tests of initial guesses of axis and angle from the bright regions of simulated frames."""
+"""Tests of initial guesses of axis and angle, from the bright regions of simulated frames."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ def _regions(scene: Scene) -> tuple[ReducedFrame, BrightRegions]:
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 60.0), (50.0, 150.0), (3.0, 150.0)])
 def test_regions_give_axis_and_angle(theta: float, length: float) -> None:
-    """The orientation of a region is uncertain by about 1 px over its length."""
+    """Bright regions give the axis and the angle of the rotation.
+
+    The orientation of a region is uncertain by about 1 px over its length.
+    """
     scene = real_sky(71, np.radians(theta), length, 0.5)
     rotation = scene.rate * scene.exposure
     angle = float(np.linalg.norm(rotation))
@@ -63,7 +66,10 @@ def test_a_scan_along_the_circles_gives_the_angle_nearest_to_a_prior_first() -> 
 
 @pytest.mark.parametrize("growth", [1.5, -1.5])
 def test_the_asymmetry_of_regions_shows_a_change_of_the_rate(growth: float) -> None:
-    """The sign is relative to the rotation, because the guessed axis may be opposite to the true axis."""
+    """The asymmetry of the regions shows a change of the rate, relative to the rotation.
+
+    The guessed axis may be opposite to the true axis, so the sign of the change is relative to the rotation.
+    """
     rotation = turn_of(np.radians(70.0), 120.0, 0.4)
     scene = taken(np.random.default_rng(74), rotation, growth * rotation, 0.5)
     _, regions = _regions(scene)

@@ -30,7 +30,7 @@ _LEAST = 12
 
 
 def _frame(mask: np.ndarray) -> ReducedFrame:
-    """Return a frame whose 3 x 3 sums exceed the threshold at the true pixels of `mask` (rows, columns)."""
+    """Return a frame whose 3 x 3 sums exceed the threshold where `mask` (rows, columns) is true."""
     light = np.where(mask, 100.0, 0.0).astype(np.float32).reshape(-1)
     light += mask.reshape(-1) * np.arange(mask.size, dtype=np.float32) % 7
     nothing = np.zeros(mask.size, dtype=np.bool_)
@@ -40,7 +40,10 @@ def _frame(mask: np.ndarray) -> ReducedFrame:
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.35, 0.45, 0.7])
 def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
-    """Regions are 8-connected for every pixel density, also near percolation."""
+    """Regions are 8-connected, as an independent labelling finds, for any pixel density.
+
+    Some densities are near percolation.
+    """
     rng = np.random.default_rng(5)
     mask = np.zeros(_SHAPE, dtype=np.bool_)
     mask[1:-1, 1:-1] = rng.random((_SHAPE[0] - 2, _SHAPE[1] - 2)) < share
@@ -58,7 +61,7 @@ def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
 
 
 def test_a_frame_without_light_has_no_regions() -> None:
-    """An empty frame raises no error."""
+    """A frame without light has no regions, and raises no error."""
     assert len(find_bright_regions(_frame(np.zeros(_SHAPE, dtype=np.bool_)), 4.5, 48)) == 0
 
 
@@ -83,14 +86,18 @@ def test_binning_keeps_light_and_saturation() -> None:
     sums, top = Binning.suited(Pinhole(8, 8, 10.0), 2.0).frame(pixels, 1000.0)
     assert sums.shape == (4, 4)
     assert sums[0, 0] == 16 * (0 + 1 + 8 + 9)
-    # The last sum contains a pixel of 1008 counts, and the previous sum at most 976.
+    # The last sum contains a pixel of 1008 counts, and the previous sum contains pixels of at most 976
+    # counts.
     assert top == 4 * 1008
     assert (sums >= top).sum() == 1
     assert np.all(sums % 16 == 0)
 
 
 def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> None:
-    """A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
+    """With a point spread of three pixels, the rate error agrees with its covariance.
+
+    A chi-square with 3 degrees of freedom exceeds 16.3 once in a thousand frames.
+    """
     camera = replace(CAMERA, psf_sigma=3.0)
     scene = real_sky(2, 1.0, 90.0, 0.5, camera)
     settings = LikelihoodSettings(saturation=SATURATION, psf_sigma=3.0)
@@ -103,7 +110,7 @@ def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> 
     assert np.linalg.norm(error) < 0.005 * np.linalg.norm(scene.rate)
     assert found.psf_sigma == pytest.approx(3.0, rel=0.05)
     assert found.length == pytest.approx(90.0, rel=0.3)
-    # The used stars are stars of the simulated sky, in pixels of the full frame.
+    # The stars used are stars of the simulated sky, at pixels of the full frame.
     apart = np.linalg.norm(found.stars[found.used][:, None] - scene.stars, axis=2).min(axis=1)
     assert np.median(apart) < 0.5
 

@@ -44,7 +44,10 @@ def test_velocity_and_acceleration_are_derivatives_of_the_position() -> None:
 
 @pytest.mark.parametrize("parameter", range(8))
 def test_sensitivities_are_derivatives_of_the_position(parameter: int) -> None:
-    """The derivative with respect to the acceleration has a second-order error of less than 0.1 %."""
+    """The sensitivities are the derivatives of a star's position.
+
+    The derivative with respect to the acceleration has a second-order error of less than 0.1 %.
+    """
     change = np.zeros(8)
     change[parameter] = 1e-5 if parameter < 6 else 1e-2
 

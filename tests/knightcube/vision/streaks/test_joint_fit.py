@@ -19,7 +19,7 @@ _STARS = 16
 
 
 def _seen(theta: float, length: float, turned: float) -> tuple[FitProblem, StreakScene, CameraMotion]:
-    """Return a frame, its brightest stars under `turned` times the true motion, and the true motion."""
+    """Return a frame, its brightest stars for `turned` times the true motion, and the true motion."""
     sky = real_sky(21, np.radians(theta), length, 0.2)
     frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
@@ -50,7 +50,10 @@ def test_a_motion_of_wrong_length_is_corrected(theta: float, length: float, turn
 
 
 def test_stars_with_one_correct_end_are_moved_between_their_ends() -> None:
-    """The rotation is 4 % too large and the first ends are correct, so that the centres are wrong by 6 px."""
+    """Stars with one correct end are moved, so that their centres are between their ends.
+
+    The rotation is 4 % too large and the first ends are correct, so that the centres are wrong by 6 px.
+    """
     camera, scene, true = _seen(90.0, 300.0, 1.0)
     ahead = positions(camera.pinhole, true, scene.stars, np.full(_STARS, 0.02))
     off = replace(scene, motion=CameraMotion.steady(1.04 * true.rate), stars=ahead)
@@ -66,7 +69,7 @@ _ROOM = 20
 
 
 def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
-    """Return a frame and its brightest stars at true positions; the first of them are trusted."""
+    """Return a frame and its brightest stars at their true positions. The first stars are trusted."""
     sky = real_sky(7, np.radians(theta), length, 1.0)
     frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
@@ -80,7 +83,10 @@ def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 60.0), (60.0, 400.0), (30.0, 400.0), (3.0, 250.0)])
 def test_the_number_of_pixels_of_windows_is_predicted(theta: float, length: float) -> None:
-    """The prediction is within a third for straight, oblique, curved and partly visible streaks."""
+    """The predicted number of pixels in windows is within a third of the true number.
+
+    The tested streaks are straight, oblique, curved, or only partly visible.
+    """
     camera, scene = _taken(theta, length)
     windows = camera.windows(scene)
     taken = windows.strips.index.size + windows.patches.index.size
@@ -89,7 +95,10 @@ def test_the_number_of_pixels_of_windows_is_predicted(theta: float, length: floa
 
 
 def test_the_brightest_stars_are_fitted_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The result does not depend on the stars' order, and the rate error agrees with its covariance."""
+    """The brightest stars are fitted up to the limit of pixels.
+
+    The result does not depend on the order of the stars, and the rate error agrees with its covariance.
+    """
     camera, scene = _taken(60.0, 300.0)
     room = float(window_areas(camera.pinhole, scene, camera.settings.reach)[:_ROOM].sum())
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", room * 1.001)
@@ -103,7 +112,7 @@ def test_the_brightest_stars_are_fitted_while_there_is_room(monkeypatch: pytest.
 
 
 def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A limit of one pixel leaves only the trusted stars."""
+    """Trusted stars are fitted regardless of the limit of pixels. A limit of one pixel leaves only them."""
     camera, scene = _taken(60.0, 300.0)
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", 1.0)
     done = joint_fit.joint_fit(camera, scene)
@@ -112,7 +121,7 @@ def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.Mon
 
 
 def test_a_fit_with_a_much_wider_point_spread_is_rejected() -> None:
-    """Stars twice as wide as the initial width are rejected as a wrong model."""
+    """A fit whose point spread is twice as wide as initially assumed is rejected as a wrong model."""
     camera, scene = _taken(60.0, 300.0)
     assert joint_fit.joint_fit(camera, scene) is not None
     assert joint_fit.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None

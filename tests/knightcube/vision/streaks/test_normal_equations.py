@@ -1,4 +1,4 @@
-"""Tests of the scatter of the stars' normal equations with randomly drawn noise."""
+"""Tests of the scatter of stars' normal equations, with randomly drawn noise."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _KEPT = np.array([0, 1, 2, 6])
 
 
 def _drawn(noise: float, blind: bool = False) -> StarEquations:
-    """Return normal equations of stars with very different fluxes.
+    """Return the normal equations of stars with very different fluxes.
 
-    The errors of the right-hand sides are `noise` times the errors that the equations state. If `blind`, each
-    star has no information in two random directions.
+    The errors of the right-hand sides are `noise` times the errors that the equations state. If `blind` is
+    set, each star has no information about two random directions.
     """
     rng = np.random.default_rng(3)
     change = rng.normal(size=(_STARS, 4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (_STARS, 1, 1))
@@ -31,7 +31,10 @@ def _drawn(noise: float, blind: bool = False) -> StarEquations:
 @pytest.mark.parametrize("blind", [False, True])
 @pytest.mark.parametrize("noise", [1.0, 3.0])
 def test_the_scatter_of_noise_is_one_per_degree_of_freedom(noise: float, blind: bool) -> None:
-    """The result depends neither on the units of the parameters nor on undetermined directions."""
+    """The scatter of pure noise is one per degree of freedom.
+
+    The result depends neither on the units of the parameters nor on undetermined directions.
+    """
     assert contradiction(_drawn(noise, blind)) == pytest.approx(noise**2, rel=0.1)
 
 

@@ -32,7 +32,7 @@ def test_running_sums_are_those_of_every_sample_of_every_circle(theta: float, le
     wrapped = there % columns.shape[1]
     held = running_sums(light.reshape(-1), pinhole, grid, 1.0)
     count = (exist[:, wrapped] & on_grid).sum(axis=2)
-    # Samples at the border of a pixel may be rounded differently in single precision.
+    # Samples at the border between two pixels may be rounded differently in single precision.
     assert np.mean(held.count != count) < 2e-3
     assert np.max(np.abs(held.count - count)) <= 2
     expected = (samples[:, wrapped] * on_grid).sum(axis=2)

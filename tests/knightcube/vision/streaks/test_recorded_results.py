@@ -1,7 +1,4 @@
-"""Tests that all attributes of estimated motions equal the recorded ones to five digits.
-
-The motions are estimated from small simulated frames.
-"""
+"""Tests that all attributes of estimated motions equal the recorded values to five digits."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ def scene(seed: int, theta: float, length: float, exposure: float = 0.2, **camer
 
 
 def found(one: Scene, settings: LikelihoodSettings = SETTINGS) -> MotionResult:
-    """Return the motion, with a prior that gives the direction of time."""
+    """Return the motion of a frame, with a prior that gives the direction of time."""
     return estimate_motion(one.pixels, one.camera.pinhole, one.exposure, settings, one.rate, 1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Tests of the streak model against thousands of instants, each integrated over every pixel."""
+"""Tests of the streak model against sums over thousands of instants, each integrated over every pixel."""
 
 from __future__ import annotations
 
@@ -43,10 +43,7 @@ def _brute(motion: CameraMotion, star: FloatArray, sigma: float) -> FloatArray:
 def _modelled(
     motion: CameraMotion, star: FloatArray, sigma: float
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return covered pixels, modelled counts, and derivatives (9, ...) of the counts.
-
-    The derivatives are with respect to the eight parameters of the geometry and to the PSF width.
-    """
+    """Return the covered pixels, the modelled counts, and the derivatives (9, ...) of the counts."""
     stars, width = star[None], float(np.sqrt(sigma**2 + 1.0 / 12.0))
     strips = cut_strips(_PINHOLE, motion, stars, np.array([[-0.5, 0.5]]), 5.0 * width)
     images = streak_model.images(_PINHOLE, motion, Shutter(), stars, width, strips).astype(float)
@@ -65,7 +62,10 @@ def _modelled(
 def test_the_light_is_that_of_brute_force(
     turn: list[float], star: list[float], sigma: float, allowed: float
 ) -> None:
-    """The error is below a thousandth of the peak, which is far below the noise of an unsaturated pixel."""
+    """The light of a streak differs from a sum over instants by less than a thousandth of its peak.
+
+    This is far below the noise of an unsaturated pixel.
+    """
     motion = CameraMotion.steady(np.array(turn))
     truth = _brute(motion, np.array(star), sigma)
     covered, light, _ = _modelled(motion, np.array(star), sigma)
@@ -76,7 +76,10 @@ def test_the_light_is_that_of_brute_force(
 @pytest.mark.parametrize("growth", [0.3, 1.0, 2.0, -2.0])
 @pytest.mark.parametrize("length", [16.0, 30.0, 90.0])
 def test_the_light_of_a_changing_rate_is_that_of_brute_force(growth: float, length: float) -> None:
-    """For a motion from rest, a patch models the bright slow end, and strips model the remaining streak."""
+    """The light of a streak with a changing rate agrees with a sum over instants.
+
+    For a motion from rest, a patch models the bright slow end, and strips model the rest of the streak.
+    """
     turn = np.array([0.4, 0.9, 0.1]) * length / _PINHOLE.focal_length
     motion, star = CameraMotion(turn, growth * turn), np.array([160.3, 155.2])
     truth = _brute(motion, star, 1.0).reshape(-1)
@@ -94,7 +97,10 @@ def test_the_light_of_a_changing_rate_is_that_of_brute_force(growth: float, leng
 
 @pytest.mark.parametrize(("turn", "star"), _CASES)
 def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[float]) -> None:
-    """An accuracy of 2 % suffices, because derivatives do not change the solution of the fit."""
+    """The derivatives agree with a sum over instants to 2 %.
+
+    This accuracy is sufficient, because derivatives do not change the solution of the fit.
+    """
     motion, place = CameraMotion.steady(np.array(turn)), np.array(star)
     covered, _, changes = _modelled(motion, place, 1.0)
     for k in range(5):
@@ -108,7 +114,11 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
 
 
 def test_strips_extend_beyond_both_ends_for_any_times() -> None:
-    """With a rolling shutter, the times are arbitrary, but both ends have the same number of pixels."""
+    """Strips extend beyond both ends for any times.
+
+    With a rolling shutter, the times of a streak are arbitrary. Both ends have the same number of additional
+    pixels.
+    """
     motion, star = CameraMotion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
     rng = np.random.default_rng(11)
     for begin, end in np.sort(rng.uniform(-0.55, 0.55, (200, 2)), axis=1):
@@ -123,7 +133,10 @@ def test_strips_extend_beyond_both_ends_for_any_times() -> None:
 
 @pytest.mark.parametrize("turn", [0.9, 2.5])
 def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: float) -> None:
-    """The selected pixels are compared with the distance of every pixel from a finely sampled path."""
+    """The strips of a curved streak contain each pixel near the path exactly once, in short lines.
+
+    The selected pixels are compared with the distances of all pixels from a finely sampled path.
+    """
     motion, star, width = CameraMotion.steady(np.array([0.0, 0.02, turn])), np.array([231.3, 214.6]), 3.7
     strips = cut_strips(_PINHOLE, motion, star[None], np.array([[-0.5, 0.5]]), width)
     times = np.bincount(strips.index[strips.inside], minlength=320 * 320).reshape(320, 320)
@@ -135,12 +148,16 @@ def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: fl
         np.minimum(apart, np.hypot(column - x, row - y), out=apart)
     assert times.max() == 1
     assert np.count_nonzero(times[apart <= width - 0.1]) > 0.995 * np.count_nonzero(apart <= width - 0.1)
-    # A row of pixels crosses a streak at 45 deg over sqrt(2) times its width, and more obliquely at its ends.
+    # A row of pixels crosses a streak at 45 deg over sqrt(2) times its width, and over a longer distance at
+    # its ends.
     assert strips.index.shape[2] <= 2.0 * np.sqrt(2.0) * width + 4.0
 
 
 def test_a_short_bent_streak_is_summed_exactly() -> None:
-    """The path of a star 5 px from the axis that is rotated by one radian is far from straight."""
+    """A short curved streak is summed exactly.
+
+    The star is 5 px from the rotation axis and rotates by one radian, so its path is far from straight.
+    """
     motion, star = CameraMotion.steady(np.array([0.0, 0.0, 1.0])), np.array([163.0, 155.0])
     patches = cut_patches(_PINHOLE, star[None], 10)
     light, _ = streak_model.spot_derivatives(_PINHOLE, motion, Shutter(), star[None], 1.0, patches)
@@ -165,7 +182,10 @@ def test_sensitivities_are_finite_differences_of_the_path() -> None:
 
 @pytest.mark.parametrize("growth", [[0.0, 0.0, 0.0], [0.02, 0.03, -0.05]])
 def test_velocities_with_the_sensitivities_equal_those_of_the_paths(growth: list[float]) -> None:
-    """The two functions use different formulas for constant and changing rates."""
+    """The velocities that are computed with the sensitivities equal the velocities of the paths.
+
+    The two functions use different formulas for constant and changing rates.
+    """
     motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array(growth))
     stars, time = np.array([[100.0, 250.0], [280.0, 40.0]]), np.array([-0.4, 0.3])
     _, velocity = sensitivities_and_velocity(_PINHOLE, motion, stars, time)
@@ -173,7 +193,7 @@ def test_velocities_with_the_sensitivities_equal_those_of_the_paths(growth: list
 
 
 def test_the_rotation_of_a_changing_rate_equals_many_small_rotations() -> None:
-    """The Magnus expansion is compared with 4,000 rotations at piecewise constant rates."""
+    """The rotation at a changing rate (Magnus expansion) equals 4,000 rotations at constant rates."""
     motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.15, 0.1]))
     vector = np.array([0.02, -0.03, 1.0])
     steps = 4000

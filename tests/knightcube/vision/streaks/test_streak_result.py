@@ -1,4 +1,4 @@
-"""Tests of status, sign and time reversal of results, and of the argument checks."""
+"""Tests of status, sign and time reversal of results, and of the checks of arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the uncertainty of the rotation: calibration errors, their correction, and residuals."""
+"""Tests of the uncertainty of the rotation: calibration errors, their corrections, and residuals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TURN = np.array([0.02, 0.03, 0.0])
 
 
 def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[FloatArray, FloatArray]:
-    """Return the apparent rotation (n, 3, m) of n stars for m errors, and their information (n, 3, 3)."""
+    """Return apparent rotations (n, 3, m) of n stars for m errors, and the stars' information (n, 3, 3)."""
     x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
     stars = np.stack([x.ravel(), y.ravel()], axis=1)
     ones = np.ones(len(stars))
@@ -47,7 +47,7 @@ def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[Floa
 
 
 def _together(seeming: FloatArray, information: FloatArray) -> FloatArray:
-    """Return the apparent rotation (3, m) of all stars together for each of m calibration errors."""
+    """Return the apparent common rotation (3, m) of all stars for each of m calibration errors."""
     return np.asarray(np.linalg.solve(information.sum(axis=0), np.sum(information @ seeming, axis=0)))
 
 
@@ -56,11 +56,11 @@ def test_an_exact_camera_has_no_errors() -> None:
 
 
 def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
-    """A shift by dx is to first order a rotation by dx / f about y, which rotates the rate vector.
+    """A wrong image centre appears as a rotated rate vector.
 
-    Only half of this rotation appears in the rate. The shift also changes the motion field in the image to
-    second order, which cancels the effect on one of the two components of the motion. The factor of one half
-    holds for stars on a square.
+    A shift by dx is, to first order, a rotation by dx / f about y. Only half of this rotation appears in the
+    rate. The shift also changes the motion field in the image to second order, which cancels the effect on
+    one of the two components of the motion. The factor of one half holds for stars on a square.
     """
     focal = CAMERA.pinhole.focal_length
     found = _together(*_seeming(replace(EXACT, centre=5.0)))
@@ -70,7 +70,10 @@ def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
 
 
 def test_wrong_focal_length_and_wrong_line_time_appear_as_another_rate() -> None:
-    """For an axis perpendicular to the boresight, the rate is a streak length divided by the focal length."""
+    """Wrong focal length and wrong line time appear as a different rate.
+
+    For an axis perpendicular to the boresight, the rate is the streak length divided by the focal length.
+    """
     found = _together(*_seeming(replace(EXACT, focal_length=0.01)))
     assert found[:, 0] == pytest.approx(0.01 * _TURN, abs=0.1 * 0.01 * float(np.linalg.norm(_TURN)))
     late = _together(*_seeming(replace(EXACT, line_time=1e-5)))
@@ -79,7 +82,10 @@ def test_wrong_focal_length_and_wrong_line_time_appear_as_another_rate() -> None
 
 
 def test_an_unstated_shutter_appears_as_a_larger_rotation_for_each_star() -> None:
-    """The delay of the rows lengthens the paths without changing their curvature."""
+    """An unknown shutter delay appears as a larger rotation of each star.
+
+    The delay of the rows makes the paths longer without changing their curvature.
+    """
     turn = np.array([0.07, 0.05, -0.05])
     late, _ = _seeming(replace(EXACT, line_time=1e-5), turn)
     size = float(np.linalg.norm(turn))
@@ -99,7 +105,10 @@ def test_a_shutter_counts_as_unstated_unless_line_time_or_accuracy_is_given() ->
 
 
 def test_significant_calibration_errors_are_corrected_and_others_widen_the_covariance() -> None:
-    """A distortion of 1 %, a hundred times the noise, is corrected, and a chance error is not."""
+    """Significant calibration errors are corrected, and other errors increase the covariance.
+
+    A distortion of 1 %, a hundred times the noise, is corrected. An error that may be due to chance is not.
+    """
     seeming, information = _seeming(replace(EXACT, distortion=0.01))
     precise = 1e4 * information
     score = np.einsum("nij,njk->ni", precise, seeming)
@@ -138,7 +147,7 @@ def test_an_uncertain_camera_widens_the_covariance_and_keeps_the_rate() -> None:
 def test_scatter_of_the_stars_beyond_their_noise_increases_the_rates_covariance(
     measure: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the stars differ by five times their noise, all variances that come from noise increase 25-fold."""
+    """If the scatter of the stars is five times their noise, all variances from noise increase 25-fold."""
     scene = real_sky(12, np.radians(70.0), 102.0, 0.2)
     settings = LikelihoodSettings(saturation=SATURATION, knowledge=EXACT)
     sizes = []
@@ -177,7 +186,10 @@ def test_two_stars_give_a_rate_with_a_large_covariance() -> None:
 
 
 def test_stars_hidden_in_streaks_do_not_move_the_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In crowded frames, a fit of the brightest streaks with all their hidden stars has smaller errors."""
+    """Undetected stars in streaks do not displace the ends.
+
+    In crowded frames, a fit of the brightest streaks that includes all undetected stars has smaller errors.
+    """
     camera = StarCameraModel(field_of_view=FIELD)
     settings = LikelihoodSettings(saturation=SATURATION, gain=camera.gain, knowledge=EXACT)
     errors = []
@@ -200,7 +212,7 @@ def test_stars_hidden_in_streaks_do_not_move_the_ends(monkeypatch: pytest.Monkey
 
 
 def _left(residual: float, noise: float, shift: str) -> tuple[StreakResiduals, StreakScene]:
-    """Return residuals of ends or sides that are displaced by `residual` px, with a noise factor `noise`."""
+    """Return residuals of ends or sides that are displaced by `residual` px, with a noise factor."""
     rng = np.random.default_rng(3)
     images = np.zeros((40, 7, 10, 9), dtype=np.float32)
     ends, sides = slice(0, 20), slice(20, 40)

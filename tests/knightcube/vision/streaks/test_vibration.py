@@ -1,4 +1,4 @@
-"""Tests of the vibration that all streaks of a frame show, on frames of an independent renderer."""
+"""Tests of a vibration that all streaks of a frame have in common, on frames of an independent renderer."""
 
 from __future__ import annotations
 
@@ -91,7 +91,10 @@ def test_a_motion_with_a_vibration_has_an_exact_time_reversal() -> None:
 
 @pytest.mark.parametrize(("cycles", "amplitude"), [(1.6, 0.8), (4.3, 0.6)])
 def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitude: float) -> None:
-    """Without a vibration in its model, the estimator refuses the frame."""
+    """If the streaks resolve a vibration, it leaves no error in the rate.
+
+    Without a vibration in its model, the estimator refuses the frame.
+    """
     frame = _frame(cycles, amplitude, 0)
     found = frame.motion()
     assert found.status is StreakStatus.RATE
@@ -101,9 +104,10 @@ def test_a_resolved_vibration_leaves_no_error_in_the_rate(cycles: float, amplitu
 
 
 def test_a_vibration_that_no_streak_resolves_is_refused_or_within_the_claim() -> None:
-    """The streaks look like those of a slightly wider point spread, but with displaced ends.
+    """A vibration that no streak resolves is refused, or the rate error is within its uncertainty.
 
-    A tolerance of 5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
+    The streaks look like those of a slightly wider point spread, but their ends are displaced. A tolerance of
+    5 % of the point spread's variance would leave an error of 5.7 sigma in the rate of seed 5.
     """
     for seed in (2, 5, 6):
         frame = _frame(41.0, 0.45, seed)
