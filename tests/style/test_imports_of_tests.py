@@ -1,4 +1,4 @@
-"""Tests of imports among tests: product tests share helpers, and import neither studies nor other tests."""
+"""Tests of the imports of tests: a product test imports neither studies nor another test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TESTS = Path(__file__).resolve().parents[1]
 
 
 def forbidden(module: str, path: str) -> bool:
-    """Return whether the file `path` below `tests` may not import `module`."""
+    """Return whether the file `path`, relative to `tests`, must not import `module`."""
     study = module == "tests.studies" or module.startswith("tests.studies.")
     return (study and not path.startswith("studies/")) or any(
         part.startswith("test_") for part in module.split(".") if module.startswith("tests.")
@@ -19,7 +19,7 @@ def forbidden(module: str, path: str) -> bool:
 
 
 def imports(source: str) -> list[str]:
-    """Return the modules that a source imports; `from a import b` counts as `a` and as `a.b`."""
+    """Return the modules that a source imports. `from a import b` counts as `a` and as `a.b`."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

@@ -1,4 +1,4 @@
-"""Tests that no text contains a forbidden phrase (`REFUSED`), which readers cannot understand easily."""
+"""Tests that no text contains a phrase that readers cannot understand easily (`REFUSED`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 EXEMPT = ("tests/style/test_phrases.py", "tests/studies/same_bytes/renamed_texts.yaml")
-"""This file, and the texts of former versions."""
+"""This file, and the texts of former versions, which are not checked."""
 
 REFUSED = {
     r"(?<!there )\b(?:is|are|was|were) no\b(?! (?:longer|more|less|fewer|later|earlier)\b)": "is not a ...",
@@ -36,7 +36,7 @@ REFUSED = {
 
 ANY = re.compile("|".join(REFUSED))
 BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"\b") for pattern in REFUSED))
-"""`REFUSED` without the conditions on preceding text: matches more often, and is six times as fast."""
+"""`REFUSED` without the conditions on preceding text. It matches more often, and is six times faster."""
 GAPS = str.maketrans('#"_', "   ")
 
 TEXT_TOKENS = (tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING))
@@ -47,7 +47,7 @@ def _masked(code: str) -> str:
 
 
 def texts_of_python(source: str) -> str:
-    """Return a Python source with all code masked except strings, comments and names of tests."""
+    """Return a Python source in which all code is masked except strings, comments and names of tests."""
     lines = source.splitlines(keepends=True)
     starts = [0]
     for line in lines:
@@ -68,7 +68,7 @@ def texts_of_python(source: str) -> str:
 
 
 def refused_phrases(text: str) -> list[tuple[int, str, str]]:
-    """Return the forbidden phrases, also across lines: line number, phrase and plain English."""
+    """Return the refused phrases of a text: line number, phrase and plain English. Phrases may span lines."""
     words = [
         (number, word)
         for number, line in enumerate(text.splitlines(), 1)
@@ -83,9 +83,9 @@ def refused_phrases(text: str) -> list[tuple[int, str, str]]:
 
 
 def may_have_any(text: str) -> bool:
-    """Return whether a text possibly contains a forbidden phrase; most files do not.
+    """Return whether a text may contain a refused phrase. Most texts contain none.
 
-    Code is searched too, so a true result needs a second, exact search.
+    Code is searched too, so a result of True needs an exact search.
     """
     flat = " ".join(text.lower().translate(GAPS).split())
     return bool(BEGINS.search(flat) and ANY.search(flat))

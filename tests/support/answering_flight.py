@@ -1,4 +1,4 @@
-"""A command socket that replies as the flight software does."""
+"""A command socket that answers as the flight software does."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from flight.link.telemetry.packets import Packer
 
 
 def answer(obeyed: bool) -> bytes:
-    """Return the reply packet of the flight software to a command, which it executed or refused."""
+    """Return the flight software's reply to a command that it has executed or refused."""
     fields = dict.fromkeys((field.name for field in COMMAND.fields), 0)
     texts = {field.name: "as commanded" for field in COMMAND.fields if field.kind.startswith("S")}
     return Packer().pack(COMMAND, 5, {**fields, **texts, "obeyed": int(obeyed), "mode": int(Mode.HOLD)})
 
 
 class Listener:
-    """A command socket that sends prepared replies in order and then repeats the last one."""
+    """A command socket that sends prepared replies in order, and then repeats the last reply."""
 
     def __init__(self, path: Path) -> None:
         self._reply = [answer(True)]
@@ -37,7 +37,7 @@ class Listener:
 
 
 def _listen(line: socket.socket, reply: list[bytes]) -> None:
-    """Reply to each datagram until the socket is shut down."""
+    """Answer each datagram until the socket is shut down."""
     while True:
         _, sender = line.recvfrom(LONGEST)
         if not sender:

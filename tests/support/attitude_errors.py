@@ -22,7 +22,7 @@ MOST_STAR_MISMATCH = 4.0 * 25.9
 
 
 def field_fraction(rate: FloatArray, exposure: float, field_of_view: float) -> float:
-    """Return the rotation during the exposure, relative to the field of view (3.28)."""
+    """Return the rotation during the exposure as a fraction of the field of view (3.28)."""
     return float(np.linalg.norm(rate)) * exposure / field_of_view
 
 
@@ -48,7 +48,7 @@ def star_errors(run: Run) -> tuple[FloatArray, FloatArray]:
     """Return the error (n, 3) of each star attitude against the truth, and its covariance (n, 3, 3)."""
     stars, truth = run["stars"], run["truth"]
     at = np.searchsorted(truth["time_ns"], stars["middle_ns"])
-    # The truth is logged every 25 ms, and one of these times is the middle of the exposure.
+    # The truth is logged every 25 ms, and the middle of an exposure is one of these times.
     np.testing.assert_array_equal(truth["time_ns"][at], stars["middle_ns"])
     error = to_rotation_vector(multiply(stars["quaternion"], conjugate(truth["quaternion"][at])))
     xx, yy, zz, xy, xz, yz = stars["covariance"].T
@@ -63,6 +63,6 @@ def star_mismatch(run: Run) -> FloatArray:
 
 
 def assert_solved(run: Run) -> None:
-    """Assert that each attitude comes from identified stars, and its error agrees with its covariance."""
+    """Assert that each attitude comes from identified stars, and has an error within its covariance."""
     assert set(run["stars"]["status"].tolist()) == {b"solved"}
     assert star_mismatch(run).max() < MOST_STAR_MISMATCH

@@ -1,9 +1,9 @@
 """Lists the system calls that the control loop's thread makes during a flight.
 
-`python -m tests.support.blocking_calls CONFIG OUT DEVICES` flies on emulated devices in real time. It prints,
-as a JSON list, the product function and the name of every call of a C function that may block. Methods of
-non-blocking sockets are left out. The calls at the start and the end of the flight, which may block, do not
-count.
+`python -m tests.support.blocking_calls CONFIG OUT DEVICES` runs a flight on emulated devices in real time.
+The program prints a JSON list of all calls of C functions that may block, each with the product function that
+makes the call. Methods of non-blocking sockets are omitted. Calls at the start and at the end of the flight
+may block, and are omitted too.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROOT = str(CONFIG.parents[1])
 MODULES = frozenset(
     {"posix", "time", "select", "_socket", "_posixsubprocess", "_io", "io", "fcntl", "mmap", "_thread"}
 )
-"""Modules of C functions, and of the types of C methods, that may enter the operating system and wait."""
+"""Modules of C functions, and of the types of C methods, that may wait in the operating system."""
 HARMLESS = frozenset({"monotonic_ns", "monotonic", "time_ns", "time", "perf_counter", "perf_counter_ns"})
 FIRST, LAST = 40, 200
 """First and last control cycle of the interval in which calls are recorded."""
@@ -37,11 +37,11 @@ class BlockingCalls:
         self.found: set[tuple[str, str]] = set()
 
     def start(self) -> None:
-        """Start collecting."""
+        """Start to record calls."""
         sys.setprofile(self._profile)
 
     def stop(self) -> None:
-        """Stop collecting."""
+        """Stop the recording of calls."""
         sys.setprofile(None)
 
     def _profile(self, frame: FrameType, event: str, called: Any) -> None:
@@ -61,7 +61,7 @@ class BlockingCalls:
 
 
 def _caller(frame: FrameType | None) -> str:
-    """Return the innermost function on the stack that belongs to the flight software."""
+    """Return the innermost function of the flight software on the stack."""
     while frame is not None:
         path = frame.f_code.co_filename.removeprefix(f"{ROOT}/")
         if path.startswith(("flight/", "hal/", "knightcube/")):
@@ -71,7 +71,7 @@ def _caller(frame: FrameType | None) -> str:
 
 
 def run(words: Sequence[str]) -> int:
-    """Run a flight, and print the calls that may block."""
+    """Run a flight, and print its calls that may block."""
     config, out, devices = words
     calls, fly = BlockingCalls(), ControlCycle.run
 

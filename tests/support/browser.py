@@ -1,4 +1,4 @@
-"""Debian's Chromium controlled by playwright, with a record of the page's errors and requests."""
+"""Debian's Chromium, controlled by playwright, with a record of the errors and requests of a page."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from urllib.parse import urlsplit
 HOST = "127.0.0.1"
 
 
-@dataclass  # without slots, because playwright sets attributes on objects whose methods it calls
+@dataclass  # no slots, because playwright sets attributes on objects whose methods it calls
 class Page:
     """A page of the console in the browser.
 
-    `complaints` are errors and warnings of the browser's console; `strangers` are requested addresses beyond
-    loopback.
+    `complaints` are errors and warnings of the browser's console. `strangers` are requested addresses other
+    than loopback.
     """
 
     page: Any
@@ -29,7 +29,7 @@ class Page:
     strangers: list[str] = field(default_factory=list)
 
     def heard(self, said: Any) -> None:
-        """Record an error or a warning of the browser's console."""
+        """Record an error or a warning in the browser's console."""
         if said.type in ("error", "warning"):
             self.complaints.append(said.text)
 
@@ -38,12 +38,12 @@ class Page:
         self.complaints.append(str(error))
 
     def asked(self, request: Any) -> None:
-        """Record a request to an address beyond loopback."""
+        """Record a request to an address other than loopback."""
         if urlsplit(request.url).hostname not in (HOST, None):
             self.strangers.append(request.url)
 
     def wait(self, condition: str, patience: float = 30.0) -> None:
-        """Wait until an expression is true.
+        """Wait until a JavaScript expression is true.
 
         Playwright's own function uses `eval`, which the page's security policy forbids.
         """
@@ -58,7 +58,7 @@ class Page:
 
     @property
     def shown(self) -> tuple[float, str]:
-        """Time (s) that the page shows, and the packet values that it shows for that time."""
+        """Time (s) that the page shows, and packet values that it shows for this time."""
         self.page.evaluate("document.getElementById('all').open = true")
         self.page.wait_for_timeout(300)
         both = "[document.body.dataset.time, document.getElementById('packets').textContent]"
@@ -66,13 +66,13 @@ class Page:
         return float(time), values
 
     def fill(self, name: str, **values: str) -> None:
-        """Choose a command, and fill in its form; the values are given by the names of the inputs."""
+        """Select a command, and fill in its form. The values are given by the names of the inputs."""
         self.page.select_option("#which", name)
         for label, value in values.items():
             self.fill_one(label, value)
 
     def fill_one(self, label: str, value: str) -> None:
-        """Fill in one visible input of the chosen command's form."""
+        """Fill in one visible input in the form of the selected command."""
         place = self.page.locator(f"#inputs label:visible:has-text('{label}')").first
         if place.locator("select").count():
             place.locator("select").select_option(label=value)
@@ -80,7 +80,7 @@ class Page:
             place.locator("input").fill(value)
 
     def command(self, name: str, **values: str) -> str:
-        """Fill in and confirm a command's form, and return the reply that the page shows."""
+        """Fill in and confirm the form of a command, and return the reply that the page shows."""
         self.fill(name, **values)
         self.page.click("#send-form")
         self.page.wait_for_selector("#confirm[open]")
@@ -90,7 +90,7 @@ class Page:
 
 
 def missing() -> str:
-    """Return which package the browser tests need and is missing, or an empty string."""
+    """Return the package of the browser tests that is missing, or an empty string."""
     try:
         import playwright.sync_api  # noqa: F401, PLC0415 - an extra of the tests
     except ModuleNotFoundError:
@@ -100,13 +100,13 @@ def missing() -> str:
 
 @contextlib.contextmanager
 def opened(url: str, width: int = 1600, height: int = 1150) -> Iterator[Page]:
-    """Open a page of the console and yield it once it shows a time."""
+    """Open a page of the console, and yield the page once it shows a time."""
     with browsing() as browser:
         yield open_page(browser, url, width, height)
 
 
 def open_page(context: Any, url: str, width: int = 1600, height: int = 1150, theme: str = "dark") -> Page:
-    """Open a page of the console in a browser or context, and return it once it shows a time."""
+    """Open a page of the console in a browser or context, and return the page once it shows a time."""
     page = context.new_page()
     page.set_viewport_size({"width": width, "height": height})
     page.emulate_media(color_scheme=theme)
@@ -143,7 +143,7 @@ def browsing(*arguments: str) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def another_origin(text: str = "<!doctype html><title>another page</title>") -> Iterator[str]:
-    """Serve a page with another origin (port) on loopback, and yield its address."""
+    """Serve a page from another origin, another port of loopback, and yield its address."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:

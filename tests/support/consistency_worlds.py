@@ -1,8 +1,8 @@
-"""Two true worlds to test the filter's covariance: sim_hal's testbed, and a body that is free in orbit.
+"""Two simulated worlds for tests of the filter's covariance: sim_hal's testbed, and a free body in orbit.
 
-Both have unmodelled errors: the coil currents have a uniform random error in each cycle in which the coils
-are driven, and there is an unknown torque. The free body is integrated by classical Runge-Kutta on Euler's
-equation with matrices, independently of the flight code.
+Both worlds have errors that the filter does not model: a uniform random error of the coil currents in each
+cycle in which the coils are driven, and an unknown torque. The motion of the free body is integrated by the
+classical Runge-Kutta method on Euler's equation with matrices, independently of the flight code.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ DRAG = Push(1e-4, 1e-5)
 
 
 class World(Protocol):
-    """Interface of a simulated true world."""
+    """Interface of a simulated world."""
 
     suspended: bool
     attitude: FloatArray
@@ -72,19 +72,19 @@ class World(Protocol):
     parameters: Parameters
 
     def field(self) -> FloatArray:
-        """Return the present field (3,), T, reference axes."""
+        """Return the present field (3,), T, in reference axes."""
 
     def command(self, currents: FloatArray) -> None:
-        """Drive the coils with currents (3,), A, to which noise is added."""
+        """Drive the coils with the currents (3,), A, plus noise."""
 
     def advance(self, span_ns: int) -> None:
         """Advance the time."""
 
 
 class SuspendedWorld:
-    """sim_hal's testbed on a thread that the filter does not know, with a torque of the air.
+    """The testbed of sim_hal, with a thread that the filter does not know, and with a torque of the air.
 
-    The torque of the air is simulated by the coil current that causes the same torque.
+    A coil current that causes the same torque represents the torque of the air.
     """
 
     suspended = True
@@ -139,7 +139,7 @@ class SuspendedWorld:
 
 
 class FreeWorld:
-    """A body that rotates about all axes under a torque with a random walk."""
+    """A free body that rotates about all axes under a torque with a random walk."""
 
     suspended = False
 

@@ -1,6 +1,6 @@
 """Random damage to bytes, drawn by hypothesis, for tests of the readers of files and of serial lines.
 
-A test draws a random generator and passes it on: `@given(chances()) def test(chance): offer(chance, ...)`.
+A test draws a random generator, as in `@given(chances()) def test(chance): offer(chance, ...)`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from random import Random
 from hypothesis import strategies as st
 
 Files = Mapping[str, bytes]
-"""File contents by file name, or the content of a single file under an arbitrary name."""
+"""Contents of files by name, or the content of a single file under any name."""
 
 _HOSTILE = (
     b"-1", b"0", b"1e999", b"-1e999", b"NaN", b"Infinity", b"null", b"true", b"{}", b"[]", b'""', b"9" * 5000,
@@ -23,7 +23,7 @@ _HOSTILE = (
 
 
 def chances() -> st.SearchStrategy[Random]:
-    """Return a strategy for random generators whose draws hypothesis shrinks."""
+    """Return a hypothesis strategy for random generators whose draws can be shrunk."""
     return st.randoms(use_true_random=False)
 
 
@@ -69,7 +69,7 @@ def offer(
         chance: random generator from `chances`.
         examples: contents that the reader accepts.
         read: function that reads and checks the result; its second argument is true for undamaged data.
-        refusals: the reader's own errors; an undamaged example must be accepted.
+        refusals: the errors by which the reader refuses a content; an undamaged example must be accepted.
         reseal: function that corrects checksums, so that damaged data pass the checksum test.
     """
     files = dict(chance.choice(examples))
@@ -95,7 +95,7 @@ def assert_one_line(error: Exception) -> None:
 
 
 def fill(folder: Path, files: Files) -> Path:
-    """Write files into a folder, replacing earlier files of the same names, and return the folder."""
+    """Write files into a folder, replace earlier files with the same names, and return the folder."""
     for name, data in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
@@ -103,6 +103,6 @@ def fill(folder: Path, files: Files) -> Path:
 
 
 def line_and_crc(data: bytes) -> bytes:
-    """Return the first line of the data with a correct checksum."""
+    """Return the first line of the data, with a corrected checksum."""
     line = data.rpartition(b"\n")[0].partition(b"\n")[0] + b"\n"
     return line + b"%08x\n" % zlib.crc32(line)

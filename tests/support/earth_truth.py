@@ -22,8 +22,8 @@ class LimbTruth:
     Attributes:
         points: pixels (n, 2).
         directions: unit vectors (n, 3) in camera axes.
-        solar_cosines: cosine (n,) of the Sun's zenith distance at the tangent point of each line of sight. It
-        is positive if the ground there is sunlit; the air is sunlit some degrees further.
+        solar_cosines: cosine (n,) of the Sun's zenith distance at the tangent point of each line of sight.
+            The cosine is positive if the ground is sunlit. The atmosphere is sunlit some degrees farther.
     """
 
     points: FloatArray
@@ -32,19 +32,19 @@ class LimbTruth:
 
 
 def sun_direction(scene: EarthScene) -> FloatArray:
-    """Return the unit vector (3,) from the camera to the Sun, camera axes, visible or not."""
+    """Return the unit vector (3,) from the camera to the Sun, camera axes, even if the Sun is hidden."""
     return towards_sun(scene)[0]
 
 
 def sun_point(scene: EarthScene, model: EarthCameraModel) -> FloatArray:
-    """Return the pixel (2,) of the Sun's centre, also off the detector; NaN outside the lens's field."""
+    """Return the pixel (2,) of the Sun's centre, even off the detector; NaN outside the field of the lens."""
     return np.asarray(model.lens.project(sun_direction(scene)[None, :])[0])
 
 
 def limb_directions(
     scene: EarthScene, count: int = 720, height: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors (count, 3), camera axes, around the limb, and the solar cosines (count,) there.
+    """Return unit vectors (count, 3) along the limb, camera axes, and their solar cosines (count,).
 
     The lines of sight touch the ellipsoid that is `height` m above that of WGS 84. If the axes are scaled so
     that this ellipsoid is the unit sphere, the tangent points q form a circle in the plane q p = 1, where p
@@ -82,7 +82,7 @@ def limb_truth(
 
 
 def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
-    """Return the unrounded counts (...) that `radiance` (...) causes in a pixel without noise or defect."""
+    """Return the unrounded counts (...) that `radiance` (...) causes in a pixel without noise and defects."""
     light = np.asarray(radiance, dtype=float)
     if model.response == "logarithmic":
         counts = model.pedestal + model.counts_per_decade * np.log10(1.0 + light / model.darkest)
@@ -92,7 +92,7 @@ def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
 
 
 def radiance_of(model: EarthCameraModel, counts: FloatArray) -> FloatArray:
-    """Return the radiance (...) that causes `counts` (...) in a pixel without noise or defect."""
+    """Return the radiance (...) that causes `counts` (...) in a pixel without noise and defects."""
     above = np.asarray(counts, dtype=float) - model.pedestal
     if model.response == "logarithmic":
         return np.asarray(model.darkest * (10.0 ** (above / model.counts_per_decade) - 1.0))

@@ -26,8 +26,8 @@ def sun_in_field(
 ) -> BoolArray:
     """Return whether the Sun is within `half_angle` + `buffer` (rad) of each `boresight` (m, 3) (2.16, 2.17).
 
-    `position` (m, 3) is the camera's position, and `sun` (m, 3) the Sun's. `buffer` accounts for stray light
-    past the baffle.
+    `position` (m, 3) is the position of the camera, and `sun` (m, 3) is the position of the Sun. `buffer`
+    accounts for stray light past the baffle.
     """
     to_sun = np.asarray(sun) - position
     return _within(boresight, to_sun, SUN_RADIUS, half_angle + buffer)
@@ -43,7 +43,7 @@ def earth_in_field(
 def in_field(
     camera: Pinhole, attitudes: FloatArray, directions: FloatArray, margin: float = 0.0
 ) -> BoolArray:
-    """Return which `directions` (m, 3), ICRS, are imaged on the detector or up to `margin` px outside it."""
+    """Return which `directions` (m, 3), ICRS, are on the detector or up to `margin` px outside of it."""
     seen = (quaternion.attitude_matrix(attitudes) @ directions[..., None])[..., 0]
     return camera.contains(camera.project(seen), margin)
 

@@ -17,12 +17,14 @@ from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalle
 from tests.support.process_watch import MIB, Look
 
 PERIOD_NS = 25_000_000
-"""Period (ns) of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.flight`)."""
+"""Period (ns) of the control group, which runs at 40 Hz. Mission time zero is a multiple of it
+(`flight.app.flight`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
-"""Time of flight (s) at which the fit of the memory slope starts, and shortest duration (s) of the fit.
+"""Time of flight (s) at which the fit of the slope of the memory starts, and shortest duration (s) of the
+fit.
 
-Before that time, buffers of some minutes fill up, and pages of libraries and of the sky index are touched for
+Before this time, buffers of some minutes fill up, and pages of libraries and of the sky index are loaded for
 the first time.
 """
 
@@ -40,7 +42,7 @@ ASKED: dict[str, float] = {
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """Times (monotonic ns) of a flight's start and of its READY message, and processor time (s) until READY.
+    """Times (monotonic ns) of a flight's start and READY message, and processor time (s) until READY.
 
     `utc_offset_ns` is UTC minus monotonic time.
     """
@@ -53,7 +55,10 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Samples of the flight's processes. Memory is in bytes; shared memory is divided among its users."""
+    """Samples of the processes of a flight.
+
+    Memory is in bytes, and shared memory is divided among its users.
+    """
 
     looks: list[Look]
     shared_with_others: float
@@ -61,7 +66,7 @@ class Watched:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Results of one flight, and the lateness of its cycles and of the bare loop that ran beside it."""
+    """Results of one flight, and the lateness of its cycles and of a bare loop that ran at the same time."""
 
     figures: Figures
     flight: Grid
@@ -71,7 +76,7 @@ class Flown:
 def evaluate(
     folder: Path, devices: Path, wakes: Path, began: Began, watched: Watched, warm_up: float
 ) -> Flown:
-    """Return the results of the flight in `folder`; `devices` has the true states of its emulated devices."""
+    """Return the results of the flight in `folder`. `devices` has the true states of its emulated devices."""
     truth = CoilTruth(folder, devices)
     run = truth.run
     start = run["run"][0]
@@ -139,7 +144,7 @@ def _jobs(run: Run, seconds: float) -> dict[str, Any]:
 
 
 def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
-    """Return processor and memory use after the monotonic time `warm_s`, and slopes after `settled_s`."""
+    """Return processor and memory use after the monotonic time `warm_s`, and the slopes after `settled_s`."""
     looks = [look for look in watched.looks if look.time >= warm_s]
     if len(looks) < 2:
         raise RuntimeError(f"only {len(looks)} looks at the processes after the warm-up: fly for longer")
@@ -172,9 +177,9 @@ def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
 
 
 def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
-    """Return the slope per hour and its 95 % interval; NaN if the samples span too short a time.
+    """Return the slope per hour and its 95 % interval, or NaN if the samples cover too short a time.
 
-    The memory fluctuates by tenths of a MiB, which over one minute alone causes a slope of tens of MiB/h.
+    The memory fluctuates by tenths of a MiB. Over one minute, this alone causes a slope of tens of MiB/h.
     """
     if not seconds or seconds[-1] - seconds[0] < SLOPE_SPAN:
         return np.nan, np.nan, np.nan
@@ -184,9 +189,9 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
 def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[Any]) -> Figures:
     """Return the fractions of time in which the control thread waited, from the first sample to the last.
 
-    `queued` is the time in which the thread was ready, but had no processor. `blocked` is the time within a
-    cycle in which the thread was neither running nor ready, for instance because it waited for a worker or a
-    disk. `blocked` is a lower limit that does not depend on the load.
+    `queued` is the fraction in which the thread was ready but had no processor. `blocked` is the fraction,
+    within cycles, in which the thread was neither running nor ready, for instance because it waited for a
+    worker or a disk. `blocked` is a lower limit that does not depend on the load.
     """
     first, last = looks[0], looks[-1]
     on, queued = np.subtract(last.turns["control"], first.turns["control"])
@@ -199,7 +204,7 @@ def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[An
 def _share(looks: list[Look], name: str) -> float:
     """Return the fraction of a core that a process and its replacements used."""
     spent = np.diff([look.processor[name] for look in looks])
-    if len(looks) < 2:  # the process was sampled once and then ended
+    if len(looks) < 2:  # a process that was sampled only once has ended
         return 0.0
     return float(spent[spent > 0.0].sum()) / (looks[-1].time - looks[0].time)
 
@@ -207,7 +212,8 @@ def _share(looks: list[Look], name: str) -> float:
 def misses(figures: Figures) -> list[str]:
     """Return the names of the results that exceed their limits.
 
-    The slope exceeds its limit if its whole interval does. A flight too short for a slope passes this check.
+    The slope exceeds its limit if its whole interval exceeds the limit. A flight that is too short for a
+    slope passes this check.
     """
     found = [name for name, limit in ASKED.items() if not _slope(name) and not figures[name] <= limit]
     steep = figures["memory_slope_interval"][0] > ASKED["memory_slope_mib_per_hour"]
@@ -219,7 +225,7 @@ def _slope(name: str) -> bool:
 
 
 def table(figures: Figures, name: str) -> str:
-    """Return the table of required and measured values."""
+    """Return the table of limits and measured values."""
     late, bare, spent = figures["lateness_s"], figures["lateness_of_bare_loop_s"], figures["execution_s"]
     wrong = misses(figures)
     rows = [
@@ -265,7 +271,7 @@ def table(figures: Figures, name: str) -> str:
 
 
 def _of_slope(figures: Figures) -> list[str]:
-    """Return the lines on the slope of memory, with its interval if the flight is long enough."""
+    """Return the lines about the slope of the memory, with its interval if the flight is long enough."""
     low, high = figures["memory_slope_interval"]
     if math.isnan(low):
         return [

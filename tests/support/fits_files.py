@@ -1,4 +1,4 @@
-"""FITS images that are built card by card, according to the FITS Standard 4.0."""
+"""FITS images that are built card by card by the FITS Standard 4.0."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ def _card(keyword: str, value: object) -> bytes:
 
 
 def fits_file(stored: Image, bits: int, **cards: object) -> bytes:
-    """Return a FITS file of `stored` (rows, columns); `cards` extend or replace the mandatory header."""
+    """Return a FITS file of `stored` (rows, columns).
+
+    `cards` are added to the mandatory header or replace its cards.
+    """
     header: dict[str, object] = {"SIMPLE": "T", "BITPIX": bits, "NAXIS": 2}
     header |= {"NAXIS1": stored.shape[1], "NAXIS2": stored.shape[0]} | cards
     text = b"".join(_card(keyword, value) for keyword, value in header.items() if value is not None)

@@ -1,4 +1,4 @@
-"""Short flights on simulated hardware, with faults on the device lines, for the scenario tests."""
+"""Short flights on simulated hardware, with faults of devices and lines, for the scenario tests."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FRAME_PERIOD, FRAME_EXPOSURE, FRAME_LATE = 2.0, 0.2, 1.0
 
 @dataclass(frozen=True)
 class Rigged:
-    """A prepared run; `at` schedules an action at a mission time (s)."""
+    """A prepared run. The method `at` schedules an action at a mission time (s)."""
 
     lock: LockStep
     loop: FlightLoop
@@ -39,7 +39,7 @@ class Rigged:
 
     @property
     def testbed(self) -> Testbed:
-        """The simulated world, which is the testbed."""
+        """The simulated world, which must be the testbed."""
         world = self.lock.hardware.world
         assert isinstance(world, Testbed)
         return world
@@ -58,7 +58,7 @@ def demo_config(duration: float, camera: bool = True) -> TestbedConfig:
 
 @cache
 def _demo() -> TestbedConfig:
-    """Return the configuration of the whole demonstration, which is read once for all flights."""
+    """Return the configuration of the whole demonstration, which is read only once."""
     return as_testbed(configuration.parse(TEXT))
 
 
@@ -71,7 +71,7 @@ def demo_world() -> Simulation:
 
 
 def thesis_config(duration: float) -> TestbedConfig:
-    """Return the demonstration without camera, with the thesis's receding-horizon planner and tracker."""
+    """Return the demonstration without a camera, with the thesis's receding-horizon planner and tracker."""
     config = demo_config(duration, camera=False)
     guidance = configuration.replace(config.guidance, strategy="receding", current_share=1.0)
     control = configuration.replace(config.control, tracker="thesis", state_weight=20.0)
@@ -88,17 +88,17 @@ def fly(
     section: Simulation | None = None,
     absent: Callable[[LockStep], None] | None = None,
 ) -> Run:
-    """Run a configuration in lock-step, and return its logs; `prepare` may schedule faults.
+    """Run a configuration in lock-step, and return its logs. The function `prepare` may schedule faults.
 
-    `section` describes the simulated world and its seed; the default is the demonstration's world. Devices in
-    `absent` are removed before they are opened, and the run then waits for them. The coils must be at zero
-    current after the devices are closed, however the flight ended.
+    `section` describes the simulated world and its seed; the default is the world of the demonstration.
+    Devices in `absent` are removed before they are opened, and the run waits for them. The coil currents must
+    be zero after the devices were closed, whatever ended the flight.
     """
     folder.mkdir(parents=True, exist_ok=True)
     section = section or configuration.replace(demo_world(), seed=seed)
     with ExitStack() as stack:
         lock = stack.enter_context(opened_lockstep(config, section, folder))
-        # No command can switch off a bridge leg that is stuck high.
+        # No command can end the current of a bridge leg that is stuck high.
         if not any("-high" in entry.fault for entry in section.faults):
             stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency
@@ -132,7 +132,7 @@ def event_time(run: Run, name: str) -> float:
 
 
 def config_for(mode: str, camera: bool, duration: float = DURATION) -> Config:
-    """Return the demonstration, half a minute long in one mode, optionally with a small and fast camera."""
+    """Return the demonstration, shortened to half a minute in one mode, or with a small and fast camera."""
     config = demo_config(duration)
     eye = None
     if camera and config.camera is not None:

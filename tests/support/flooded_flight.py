@@ -27,7 +27,7 @@ _WARM_UP_S = 5.0
 
 @contextmanager
 def process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `python -m flight WORDS`, and end the process on exit."""
+    """Run `python -m flight WORDS`, and end the process when the context ends."""
     line = [sys.executable, "-m", "flight", *map(str, words)]
     with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
@@ -56,7 +56,7 @@ def wait_for(path: Path) -> None:
 def flood(
     port: int, datagrams: Sequence[bytes], a_second: int, ended: threading.Event, sent: list[int]
 ) -> None:
-    """Send `a_second` random datagrams per second until `ended`, and record the size of each burst."""
+    """Send `a_second` random datagrams per second until `ended` is set, and record the size of each burst."""
     draw = np.random.default_rng(1)
     burst = round(a_second * _BURST_S)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
@@ -70,7 +70,7 @@ def flood(
 
 
 def lateness(run: Path) -> dict[str, Any]:
-    """Return the number of cycles after a run's first seconds, and quantiles (ms) of the cycles' lateness."""
+    """Return the number of cycles after the first seconds of a run, and quantiles (ms) of their lateness."""
     cycles = read_run(run)["cycle_timing"]
     late = cycles["lateness"][cycles["time_ns"] > _WARM_UP_S * 1e9]
     figures = {name: round(1e3 * float(np.quantile(late, part)), 3) for name, part in QUANTILES.items()}

@@ -1,4 +1,4 @@
-"""Gains of the pointing law along a given motion, without the planner's search for a motion."""
+"""Gains of the pointing law along a given motion, without a search by the planner."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def table_along(
     inertia: FloatArray,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the gain table for a given motion (n + 1,) on which no other torques act.
+    """Return the gain table for a given motion (n + 1,) without disturbance torques.
 
     `field` (n + 1, 3) is in T, `position` (n + 1, 3) in m, both in ICRS; `inertia` (3, 3) is in kg m^2. The
     gains near the end are computed from a shorter prediction.

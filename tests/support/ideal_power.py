@@ -1,4 +1,4 @@
-"""Mean power that an ideal controller needs, which knows the true plant and the disturbances in advance."""
+"""Mean power of an ideal controller that knows the true plant and all disturbances in advance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ REACHED_AFTER = 10.0
 
 
 def clairvoyant_power(config: TestbedConfig, world: Simulation) -> float:
-    """Return the mean R I^2 (W) of the clairvoyant optimum for a demonstration's steps in a world."""
+    """Return the mean R I^2 (W) of the optimum for a demonstration's steps in a world that is fully known."""
     true = SingleAxisPlant(
         world.truth.inertia or config.plant.inertia,
         config.plant.coil_turns * config.plant.coil_area * (world.truth.field or config.plant.field),

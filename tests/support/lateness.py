@@ -1,4 +1,4 @@
-"""Lateness and lost slots of a periodic loop, and which slots were lost because the machine was busy."""
+"""Lateness and lost slots of a periodic loop, and the slots that were lost because the machine was busy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
 
 @dataclass(frozen=True)
 class Grid:
-    """Lateness (s) of a loop at each slot; slot k is due at (first + k) periods of monotonic time."""
+    """Lateness (s) of a loop at each slot. Slot k is due at (first + k) periods of monotonic time."""
 
     first: int
     period_ns: int
@@ -26,7 +26,7 @@ class Grid:
         return np.asarray(2.0 * self.lateness >= self.period_ns * 1e-9)
 
     def figures(self) -> dict[str, float]:
-        """Return quantiles (s) of the lateness; the lateness of a lost slot lasts until the loop resumes."""
+        """Return quantiles (s) of the lateness. The lateness of a lost slot lasts until the loop resumes."""
         return {name: float(np.quantile(self.lateness, part)) for name, part in QUANTILES.items()}
 
 
@@ -44,7 +44,7 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 
 
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
-    """Return the slots that the bare loop lost, including their neighbours.
+    """Return the slots that the bare loop lost, and the slots before and after them.
 
     A stall of the machine may begin and end in different slots of the two loops, because one loop may be
     working while the other sleeps.
@@ -53,7 +53,7 @@ def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
 
 
 def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
-    """Return the slots that are late because the host took the processor (stolen time).
+    """Return the slots that are late because the virtual machine's host took the processor (stolen time).
 
     The stolen time of such a slot is at least half the period and at least half the lateness. A slot lasts
     from the due time of its predecessor to the first sample after the slot was served. `stolen_ns` is the
@@ -71,11 +71,12 @@ def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool
 def slope_per_hour(
     seconds: npt.ArrayLike, values: npt.ArrayLike, blocks: int = 20
 ) -> tuple[float, float, float]:
-    """Return the slope per hour of a noisy level with its 95 % interval (low, high); NaN if too short.
+    """Return the slope per hour of a noisy level and its 95 % interval (low, high), or NaN.
 
-    A process allocates and frees memory as it works. The level of each block of time is therefore its 10 %
-    quantile, which a leak raises as well. The slope is the median of all pairwise slopes of the blocks, and
-    its interval follows from Kendall's tau (Sen 1968, doi 10.1080/01621459.1968.10480934).
+    The slope is NaN if the samples cover too short a time. A process allocates and frees memory as it works.
+    The level of each block of time is therefore its 10 % quantile, which a leak increases too. The slope is
+    the median of all pairwise slopes of the blocks, and its interval follows from Kendall's tau (Sen 1968,
+    doi 10.1080/01621459.1968.10480934).
     """
     from scipy import stats  # noqa: PLC0415 - the bench is not to share the flight's libraries while it flies
 
@@ -90,7 +91,7 @@ def slope_per_hour(
 
 
 def draw(grids: dict[str, Grid], path: Path) -> None:
-    """Draw the histograms of the lateness with two logarithmic axes."""
+    """Draw histograms of the lateness with two logarithmic axes."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")

@@ -1,4 +1,4 @@
-"""Frames of the Earth's limb, and the prior knowledge of the satellite."""
+"""Frames of the Earth's limb, and the prior information of the satellite."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sim_hal.earth_camera.scene import Atmosphere
 from tests.sim_hal.earth_camera.scenes import random_direction
 
 KNOWN_LIMB = 1000.0
-"""Standard deviation (m) of the limb's height if the atmosphere is known."""
+"""Standard deviation (m) of the height of the limb if the atmosphere is known."""
 
 
 SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
@@ -35,19 +35,19 @@ K1, K2 = -0.05, 0.01
 
 
 def camera_model() -> EarthCameraModel:
-    """Return the campaign's camera."""
+    """Return the camera model of the campaign."""
     return EarthCameraModel.fuga15d(seed=1, k1=K1, k2=K2)
 
 
 def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSettings:
-    """Return the default limb settings with the camera's response, for an atmosphere kind of `AIRS`."""
+    """Return the default limb settings with the response of the camera, for an atmosphere of `AIRS`."""
     response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
     settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
     return replace(settings, limb_height_sigma=KNOWN_LIMB) if air == "known" else settings
 
 
 def random_air(generator: np.random.Generator) -> Atmosphere:
-    """Return an atmosphere other than the standard; its limb is some 2 km lower or higher."""
+    """Return an atmosphere that differs from the standard. Its limb is some 2 km lower or higher."""
     standard = Atmosphere()
     return replace(
         standard,
@@ -57,7 +57,7 @@ def random_air(generator: np.random.Generator) -> Atmosphere:
 
 
 def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> HorizonKnowledge:
-    """Return the prior knowledge of a satellite in the scene, with random errors of its coarse sensors."""
+    """Return the prior information of a satellite in the scene, with random errors of its coarse sensors."""
     sun, field = scene.sun / np.linalg.norm(scene.sun), random_direction(generator)
     sensed = tuple(
         SensedDirection(misread(scene.camera_matrix @ true, sigma, generator), true, sigma)

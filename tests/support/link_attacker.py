@@ -1,4 +1,4 @@
-"""An attacker between ground and satellite who knows every frame and everything else except the keys."""
+"""An attacker between ground and satellite, who knows every frame and everything except the keys."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class LinkAttacker:
         self.gate = self.restarted()
 
     def restarted(self) -> Gate:
-        """Return a new frame gate that reads the satellite's stored keys and counters."""
+        """Return a new frame gate with the satellite's stored keys and counters, as after a restart."""
         return Gate(self._vault, COMMAND_SPIS, parser_of(_SPACECRAFT), TELECOMMAND_MASK)
 
     def attack(self, chance: Random) -> None:
-        """Send one frame, and assert that the gate admits new genuine frames and nothing else."""
+        """Send one frame, and assert that the gate admits only new authentic frames."""
         kind, frame = self.frame(chance)
         if chance.random() < 0.02:
             self.gate = self.restarted()
@@ -55,9 +55,9 @@ class LinkAttacker:
         self.highest[admitted.spi] = admitted.counter
 
     def frame(self, chance: Random) -> tuple[str, bytes]:
-        """Return the kind and the bytes of the next frame."""
+        """Return the type and the bytes of the next frame."""
         if not self._seen or chance.random() < 0.1:
-            self._held.clear()  # the delayed frames have become too old to be admitted
+            self._held.clear()  # the delayed frames are too old to be admitted
             return "fresh", self._new(chance)
         if chance.random() < 0.05:
             self._held.append(self._new(chance))

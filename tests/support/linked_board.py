@@ -1,4 +1,4 @@
-"""A board with a radio link: its keys, and a configuration whose `link` section has its addresses."""
+"""A board with a radio link: its keys, and a configuration with the addresses of the link."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
-    """Return a free port of the loopback address for each kind of socket."""
+    """Return a free port of loopback for each socket type."""
     with ExitStack() as stack:
         lines = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for kind in kinds]
         for line in lines:
@@ -24,7 +24,7 @@ def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
 
 
 def write_linked_config(place: Path, **lines: Any) -> Path:
-    """Create keys in `place`, and write beside them a board's configuration with a link; return its path."""
+    """Create keys in `place`, and write a board's configuration with a link; return its path."""
     make_keys(place / "keys")
     section = {"keys": str(place / "keys" / "satellite"), **lines}
     commands = json.dumps({"socket": str(place / "commands")})

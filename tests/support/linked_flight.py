@@ -21,7 +21,7 @@ _RATE = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class LinkedFlight:
-    """Folder of a flight, address and keys of its gateway, and its processes by name, with `flight` last."""
+    """Folder of a flight, address and keys of its gateway, and its processes by name, `flight` last."""
 
     run: Path
     gateway: str
@@ -36,7 +36,7 @@ class LinkedFlight:
         _wait((self.run / "flight-0001.ccsds").exists, "the flight", self._log)
 
     def end(self) -> None:
-        """End the flight, while link and gateway transmit the rest of its log."""
+        """End the flight. Link and gateway transmit the rest of its log meanwhile."""
         end(self.processes["flight"])
 
     def stop(self) -> None:
@@ -53,9 +53,9 @@ def free_port() -> int:
 
 @contextmanager
 def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]:
-    """Open link and gateway of a flight with the configuration `text`; `start` starts the flight.
+    """Open link and gateway of a flight with the configuration `text`. The method `start` starts the flight.
 
-    The end of the block ends all processes.
+    All processes are ended at the end of the `with` block.
     """
     place.mkdir(parents=True)
     make_keys(place / "keys")
@@ -80,7 +80,10 @@ def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]
 
 @contextmanager
 def service(log: Path, ready: str, *words: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `python -m flight WORDS` during a `with` block, which begins when the output contains `ready`."""
+    """Run `python -m flight WORDS` during a `with` block.
+
+    The block begins when the output contains `ready`.
+    """
     process = _started([sys.executable, "-m", "flight", *map(str, words)], log)
     try:
         _wait(lambda: ready in log.read_text(), str(words[0]), log)
@@ -103,7 +106,7 @@ def _wait(done: Callable[[], bool], name: str, log: Path) -> None:
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """End a process, and kill it if it does not end by itself."""
+    """End a process, and kill it if it does not end."""
     process.terminate()
     try:
         process.wait(_END_S)

@@ -1,4 +1,4 @@
-"""Passes of an object by a satellite on integrated orbits, and the sightings of a camera."""
+"""Passes of an object near a satellite on integrated orbits, and the sightings by a camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Pass:
 
     @property
     def directions(self) -> FloatArray:
-        """True lines of sight (n, 3)."""
+        """True lines of sight (n, 3) from the observer to the object."""
         return np.asarray(self.relative / np.linalg.norm(self.relative, axis=1, keepdims=True))
 
     @property
@@ -53,7 +53,7 @@ def a_pass(rng: np.random.Generator, rate: float, times: FloatArray, before: flo
 
 
 def _at(state: FloatArray, time: float) -> FloatArray:
-    """Return the state (6,) after `time` s by a Runge-Kutta integration with steps of at most 10 s."""
+    """Return the state (6,) after `time` s, by a Runge-Kutta integration with steps of at most 10 s."""
     steps = max(int(np.ceil(abs(time) / 10.0)), 1)
     h = time / steps
 
@@ -77,7 +77,7 @@ def sightings(
     attitude_sigma: float,
     magnitudes: FloatArray | None = None,
 ) -> FrameSightings:
-    """Return the sightings of objects in a frame, with independent errors and one common rotation error."""
+    """Return the sightings of objects in a frame, with independent errors and a common rotation error."""
     turn = rng.normal(scale=attitude_sigma, size=3)
     seen = directions + np.cross(turn, directions) + rng.normal(scale=sigma, size=directions.shape)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)

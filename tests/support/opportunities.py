@@ -4,8 +4,8 @@
     for opportunity in opportunities(scenario, cadence=60.0, exposure=0.5):
         times, attitudes = exposure_attitudes(scenario, opportunity.start, 0.5)
 
-An object is observable if it is in the field, in sunlight and not behind the Earth, and if neither the Sun
-nor the Earth is in the field.
+An object is observable if it is in the field of view, in sunlight and not behind the Earth, and if neither
+the Sun nor the Earth is in the field of view.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Opportunity:
         index: number of the object in the scenario.
         start: start of the exposure, s.
         first: pixel (x, y) of the object at the start of the exposure.
-        last: pixel (x, y) at its end.
+        last: pixel (x, y) of the object at the end of the exposure.
         distance: distance (m) from the camera at mid-exposure.
     """
 
@@ -103,12 +103,13 @@ def table_4_3(
     pinhole: Pinhole | None = None,
     half_angle: float | None = None,
 ) -> Scenario:
-    """Return the thesis's ten orbits of Table 4.3; the camera rotates at 0.05 rad/s about its y axis.
+    """Return the ten orbits of Table 4.3 of the thesis. The camera rotates at 0.05 rad/s about its y axis.
 
-    The initial attitude is the identity. The thesis states neither a date nor the period of the frames:
-    `epoch` (Julian date TT) determines the position of the Sun. `pinhole` is by default that of 1024 x 1024
-    pixels over 20 degrees, and `half_angle` its half diagonal; the thesis uses half the field of view (2.17,
-    2.19). The scenario lasts ten orbits of the camera, 15.3 h; the thesis's text states "approximately 14".
+    The initial attitude is the identity. The thesis states neither a date nor the interval of the frames, so
+    `epoch` (Julian date TT) determines the position of the Sun. By default, `pinhole` has 1024 x 1024 pixels
+    over 20 degrees, and `half_angle` is its half diagonal. The thesis uses half the field of view (2.17,
+    2.19). The scenario lasts ten orbits of the camera, 15.3 h. The text of the thesis states "approximately
+    14".
     """
     pinhole = pinhole or Pinhole.from_field_of_view(1024, 1024, math.radians(20.0))
     camera = KeplerianElements(semi_major_axis=6748e3, inclination=math.radians(28.5))
@@ -133,18 +134,18 @@ def table_4_3(
 def exposure_attitudes(
     scenario: Scenario, start: float, exposure: float, step: float = 0.01
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times (k,), s, at most `step` s apart, and attitudes (k, 4) of an exposure."""
+    """Return times (k,), s, at most `step` s apart, and the attitudes (k, 4) of an exposure."""
     times = np.linspace(start, start + exposure, max(2, math.ceil(exposure / step) + 1))
     return times, scenario.attitude(times)
 
 
 def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
-    """Return whether object `index` is observable at `times` (m,), with half the Sun's disc or more."""
+    """Return whether object `index` is observable at `times` (m,), with at least half of the Sun's disc."""
     camera = scenario.camera.positions_at(times)
     position = scenario.objects[index].orbit.positions_at(times)
     attitudes = scenario.attitude(times)
     good = in_field(scenario.pinhole, attitudes, directions(camera, position))
-    # The slower tests run only at the few times that passed the others.
+    # The slower tests are made only at the few times that passed all faster tests.
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
     sun_at = sun_position(scenario.epoch + np.asarray(times)[left] / DAY)
@@ -159,8 +160,8 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
 def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> list[Window]:
     """Return all windows in which an object is observable, in order of time.
 
-    The search uses a grid of `step` s, and bisects the ends to `precision` s. It may miss a window that is
-    shorter than `step`. Raises OutOfRange for a step that is not positive.
+    The search uses a grid of `step` s, and finds the ends to `precision` s by bisection. A window that is
+    shorter than `step` may be missed. Raises OutOfRange for a step that is not positive.
     """
     _check("step", step)
     grid = np.append(np.arange(0.0, scenario.duration, step), scenario.duration)

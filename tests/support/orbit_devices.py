@@ -1,4 +1,4 @@
-"""A configuration with every device of a satellite, in the world of a free body."""
+"""A configuration with every type of device of a satellite, in the world of a free body."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def orbit_config(camera: bool = False) -> TestbedConfig:
 
 
 def orbit_world(boresight: FloatArray | None = None) -> Simulation:
-    """Return an orbit whose ascending node is under the Sun; body +z points to `boresight`, ICRS."""
+    """Return an orbit whose ascending node is below the Sun. Body +z points along `boresight`, ICRS."""
     attitude = None
     if boresight is not None:
         boresight = boresight / np.linalg.norm(boresight)

@@ -1,7 +1,8 @@
 """Attitudes relative to the local vertical, and visibility of limb and Sun to cameras in orbit.
 
-The Earth is a sphere with its equatorial radius. The paper's orbit is that of a Shuttle deployment at 380 km
-(Meller et al., sections 1 and 4.1), with an inclination of 51.6 deg [assumed: the Shuttle's to the Station].
+The Earth is a sphere with the equatorial radius. The orbit of the paper is that of a Shuttle deployment at
+380 km (Meller et al., sections 1 and 4.1). Its inclination is assumed to be 51.6 deg, as of Shuttle flights
+to the Station.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def suite(name: str) -> SensorSuite:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """One revolution: times (n,), s, positions and velocities (n, 3), and the Julian date UTC at time 0."""
+    """One revolution: times (n,), s, positions and velocities (n, 3), and Julian date UTC at time zero."""
 
     julian_date: float
     times: FloatArray
@@ -59,7 +60,7 @@ def revolution(
 
 
 def local_frame(positions: FloatArray, velocities: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) from ICRS to forward, right and down axes."""
+    """Return the matrices (n, 3, 3) from ICRS axes to forward, right and down axes."""
     down = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
     right = np.cross(velocities, positions)
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
@@ -91,7 +92,7 @@ def limb_in_daylight(positions: FloatArray, directions: FloatArray, sun: FloatAr
 
 
 def in_field(camera: WideCamera, directions: FloatArray) -> BoolArray:
-    """Return which body directions (..., 3) fall onto the camera's detector."""
+    """Return which body directions (..., 3) are on the detector of the camera."""
     x, y, z = np.moveaxis(directions @ camera.to_camera.T, -1, 0)
     half = np.tan(np.radians(0.5 * camera.field_of_view_deg))
     return np.asarray(
@@ -100,6 +101,6 @@ def in_field(camera: WideCamera, directions: FloatArray) -> BoolArray:
 
 
 def in_cone(camera: WideCamera, directions: FloatArray) -> BoolArray:
-    """Return which body directions (..., 3) are within half the field of the boresight, as in the paper."""
+    """Return which body directions (..., 3) are within half the field of view of the boresight (paper)."""
     cosine = directions @ camera.to_camera[2]
     return np.asarray(cosine > np.cos(np.radians(0.5 * camera.field_of_view_deg)))

@@ -1,11 +1,11 @@
-"""The true satellite of the campaign `orbit-attitude`, and its sensors.
+"""The simulated satellite of the campaign `orbit-attitude`, and its sensors.
 
 The simulation covers one revolution that ends with an eclipse, with a random date and node. The body follows
-the local vertical, with two side cameras towards the Sun's side of the orbit. Torques with a random walk
-disturb it (3 deg rms), and a control law corrects it; the filter knows neither. The sensors have the noise of
-the suite: gyros with a random walk of the bias, a magnetometer with hard iron, and Sun and nadir if a camera
-has them in its field. The true field is IGRF-14 with a ring current and an ionosphere (first-order
-Gauss-Markov); the filter uses WMM2025.
+the local vertical, with two side cameras on the Sun's side of the orbit. Random-walk torques disturb the
+attitude (3 deg rms), and a control law corrects it. The filter knows neither of the two. The sensors have the
+noise of the suite. They are gyros with a random walk of the bias, a magnetometer with hard iron, and cameras
+that give Sun and nadir if these are in their field of view. The true field is IGRF-14 with a ring current and
+an ionosphere (first-order Gauss-Markov); the filter uses WMM2025.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _COARSE = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """True states at n instants that are STEP apart, and whether the cameras can measure Sun and nadir.
+    """True states at n instants at intervals of STEP, and whether the cameras can measure Sun and nadir.
 
     Attributes:
         pass_: orbit of the satellite.
@@ -82,11 +82,15 @@ class World:
 
 
 def world(suite: SensorSuite, rng: np.random.Generator, seconds: float | None = None) -> World:
-    """Return a random world; with `seconds`, only an interval of that length around sunset."""
+    """Return a random world.
+
+    If `seconds` is given, it covers only an interval of this length around sunset.
+    """
     pass_ = _revolution_to_eclipse(rng, seconds)
     frame = local_frame(pass_.positions, pass_.velocities)
     sun = _sun(pass_)
-    # The first camera looks across the orbit away from the Sun, so that the other two look to the Sun's side.
+    # The first camera looks away from the Sun, normal to the orbit, so that the other two cameras look to the
+    # Sun's side.
     away = -np.sign(np.sum(frame[:, 1] * sun))
     attitudes = multiply(from_rotation_vector(np.array([0.0, 0.0, 0.5 * np.pi * away])), _sway(frame, rng))
     turns = rotation_vector(multiply(attitudes[1:], conjugate(attitudes[:-1]))) / STEP
@@ -97,7 +101,7 @@ def world(suite: SensorSuite, rng: np.random.Generator, seconds: float | None = 
 
 
 def _revolution_to_eclipse(rng: np.random.Generator, seconds: float | None) -> Pass:
-    """Return a revolution that ends at sunrise, with a random date and node that have an eclipse."""
+    """Return a revolution that ends at sunrise, for a random date and node with an eclipse."""
     while True:
         date, node = FIRST_DATE + rng.uniform(0.0, 730.0), rng.uniform(0.0, 2.0 * np.pi)
         whole = revolution(date, node, 5.0)
@@ -105,7 +109,7 @@ def _revolution_to_eclipse(rng: np.random.Generator, seconds: float | None) -> P
         rises = np.flatnonzero(lit & ~np.roll(lit, 1))
         if rises.size and np.count_nonzero(~lit) * 5.0 > 1500.0:
             break
-    # The revolution lasts from one sunrise to shortly before the next.
+    # The revolution lasts from a sunrise until shortly before the next sunrise.
     found = revolution(date, node, STEP, begin=float(whole.times[rises[0]]))
     found = Pass(date, found.times - found.times[0], found.positions, found.velocities)
     dark = np.flatnonzero(~_sunlit(found, _sun(found)))
@@ -128,13 +132,13 @@ def dates(pass_: Pass) -> FloatArray:
 
 
 def _sunlit(pass_: Pass, sun: FloatArray) -> BoolArray:
-    # The Sun's directions from the satellite and from the Earth's centre differ too little to change the
-    # shadow.
+    # The directions of the Sun from the satellite and from the Earth's centre are so similar that the shadow
+    # is the same.
     return np.asarray(sunlit_share(pass_.positions, ASTRONOMICAL_UNIT * sun) > 0.5)
 
 
 def _sun(pass_: Pass) -> FloatArray:
-    """Return the Sun's apparent directions (n, 3), interpolated linearly between instants 10 s apart."""
+    """Return the Sun's apparent directions (n, 3), interpolated linearly from instants 10 s apart."""
     every = max(1, len(pass_.times) // 600)
     nodes = np.unique(np.append(np.arange(0, len(pass_.times), every), len(pass_.times) - 1))
     known = np.array(
@@ -145,7 +149,7 @@ def _sun(pass_: Pass) -> FloatArray:
 
 
 def _sway(frame: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return random attitudes (n, 4) near the local frame (n, 3, 3): white jerk filtered by three poles."""
+    """Return random attitudes (n, 4) near the local frame (n, 3, 3): white jerk, filtered by three poles."""
     a = AGILITY
     chain = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-(a**3), -3.0 * a**2, -3.0 * a]])
     # The matrix is the stationary covariance of a system with three equal poles under white jerk of density
@@ -184,7 +188,7 @@ def _field(pass_: Pass, rng: np.random.Generator) -> FloatArray:
 def _in_fields(
     suite: SensorSuite, pass_: Pass, frame: FloatArray, attitudes: FloatArray, sun: FloatArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Return whether any camera has the Sun (n,), and enough of the lit limb (n,), in its field of view."""
+    """Return whether a camera sees the Sun (n,), and whether a camera sees enough of the lit limb (n,)."""
     turn = attitude_matrix(attitudes)
     sun_body = np.einsum("nij,nj->ni", turn, sun)
     sees_sun = np.zeros(len(sun), bool)
@@ -218,7 +222,7 @@ class Readings:
 
 
 def readings(suite: SensorSuite, truth: World, rng: np.random.Generator) -> Readings:
-    """Return random readings at every instant; `truth` states when Sun and nadir are available."""
+    """Return random readings at all instants. `truth` states when Sun and nadir can be measured."""
     gyros, magnetometer = suite.gyros, suite.magnetometer
     if gyros is None or magnetometer is None:
         raise ValueError(f"suite {suite.name} lacks gyros or a magnetometer")
@@ -242,7 +246,7 @@ def readings(suite: SensorSuite, truth: World, rng: np.random.Generator) -> Read
 
 
 def _seen(turn: FloatArray, directions: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return directions (n, 3) in body axes with errors of OPTICAL_SIGMA per axis."""
+    """Return directions (n, 3) in body axes, with errors of OPTICAL_SIGMA per axis."""
     there = np.einsum("nij,nj->ni", turn, directions)
     off = there + OPTICAL_SIGMA * rng.standard_normal(there.shape)
     return np.asarray(off / np.linalg.norm(off, axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""A run of a few packets, with values given by a test and zeros in all other fields."""
+"""A run of a few packets. A test gives some values, and all other fields are zero."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class WritablePackets(dict[str, Any]):
 
 
 def packed_run(folder: Path = Path("run"), **packets: Rows) -> Run:
-    """Return a run from rows (mission time in s, values by field) for each packet type."""
+    """Return a run from rows (mission time in s, values by field) of each packet type."""
     packer, raw = Packer(), []
     for name, rows in packets.items():
         packet = LAYOUTS[name].packet

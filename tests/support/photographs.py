@@ -21,7 +21,7 @@ from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky
 PHOTOGRAPHS = Path(__file__).parents[3] / "shared" / "data" / "sky"
 
 
-# Standard deviation (rad) of the prior attitude for tracking, equivalent to 1.5 px.
+# Standard deviation (rad) of the prior attitude in tracking, which corresponds to 1.5 px.
 _PRIOR_SIGMA = 3e-4
 
 
@@ -39,7 +39,7 @@ ARCSECONDS = math.degrees(1.0) * 3600.0
 
 @dataclass(frozen=True)
 class Photograph:
-    """Result of one photograph; errors (arcsec) and times (ms) are NaN without a solution."""
+    """Result for one photograph. Errors (arcsec) and times (ms) are NaN without a solution."""
 
     name: str
     known: bool
@@ -50,7 +50,7 @@ class Photograph:
 
 
 def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a camera with a field of `fov_deg`, and its scale range for fields of `low` to `high` (deg)."""
+    """Return a camera with a field of `fov_deg`, and its scales for fields from `low` to `high` (deg)."""
     middle = math.tan(0.5 * math.radians(fov_deg))
     rows, columns = pixels.shape
     scale = tuple(math.tan(0.5 * math.radians(angle)) / middle for angle in (low, high))
@@ -90,7 +90,7 @@ def direction(right_ascension: float, declination: float) -> FloatArray:
 
 
 def angle_arcsec(one: FloatArray, other: FloatArray) -> float:
-    """Return the angle between two unit vectors (3,)."""
+    """Return the angle (arcsec) between two unit vectors (3,)."""
     return ARCSECONDS * math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
 
 
@@ -100,7 +100,7 @@ class Solved:
 
     Attributes:
         across: error (arcsec) of the boresight; NaN for a refusal.
-        across_bound: lower bound (arcsec) of the rms of that error.
+        across_bound: lower bound (arcsec) of the rms error of the boresight.
         nees: squared error of the attitude over its covariance, per degree of freedom.
         rate, rate_bound: error and bound (%) of the rate's magnitude; NaN without a rate.
     """
@@ -115,7 +115,7 @@ class Solved:
 
 
 def solved(scene: SkyFrame, length: float) -> Solved:
-    """Return the star tracker's result for a simulated frame, lost in space and with a prior."""
+    """Return the star tracker's result for a simulated frame, both lost in space and with a prior."""
     low, high = NARROW_DEG - _NARROW_KNOWN_DEG, NARROW_DEG + _NARROW_KNOWN_DEG
     camera, scale = believed(scene.pixels, NARROW_DEG, low, high)
     rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings(uncalibrated_lens=False)

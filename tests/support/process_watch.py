@@ -1,9 +1,9 @@
 """Samples of the processor time and memory of running processes, read from /proc.
 
-The proportional set (PSS) divides each page among the processes that map it, so a sum over processes counts
-no page twice (proc_pid_smaps(5)). A page that unwatched processes map too is divided among all of them, so
-the sum is smaller. `unshared` computes the memory that the watched processes would hold if no other process
-shared it.
+The proportional set size (PSS) divides each page among the processes that map it, so a sum over processes
+counts no page twice (proc_pid_smaps(5)). If processes that are not watched map a page too, the sum includes
+only a part of this page. `unshared` computes the memory that the watched processes would hold if no other
+process shared their memory.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Look:
     """One sample: monotonic time (s), and processor time (s) and proportional set (bytes) by process name.
 
-    `own` is the part of the proportional set that is not mapped from files; other processes do not change it.
-    `turns` has two times (s) of each main thread since its start: time running, and time ready but without a
-    processor.
+    `own` is the part of the proportional set that is not mapped from files, which other processes do not
+    change. `turns` contains two times (s) of each main thread since its start: the time in which it ran, and
+    the time in which it was ready but had no processor.
     """
 
     time: float
@@ -82,7 +82,7 @@ def look(processes: Mapping[str, int]) -> Look:
 
 @contextmanager
 def answering(module: str, *words: str) -> Iterator[None]:
-    """Run `python -m MODULE WORDS` during a `with` block, which begins after the first line of output."""
+    """Run `python -m MODULE WORDS` during a `with` block. The block begins after the first line of output."""
     root = Path(__file__).parents[2]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     with subprocess.Popen(
@@ -107,7 +107,7 @@ def below(parent: int) -> list[int]:
 
 
 def command(process: int) -> str:
-    """Return a process's command line, or an empty string for a process that has just ended."""
+    """Return the command line of a process, or an empty string if the process has just ended."""
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
     except (FileNotFoundError, ProcessLookupError):
@@ -118,7 +118,7 @@ def unshared(processes: Mapping[str, int]) -> float:
     """Return the memory (bytes) that some processes would hold if no other process mapped their files.
 
     The result is the sum of their private memory and, for each mapped segment of a file, the largest amount
-    that any of them holds, because all use the same libraries in the same way.
+    that any of the processes holds. All processes use the same libraries in the same way.
     """
     private = 0.0
     of_files: defaultdict[tuple[str, str], float] = defaultdict(float)
@@ -146,16 +146,16 @@ def stolen_ns() -> int:
 
 
 def _processor(process: int) -> float:
-    # The name in brackets may contain any character; user and system time are words 14 and 15 (proc(5)).
+    # The name in brackets may contain any character. User and system time are the words 14 and 15 (proc(5)).
     words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(words[11]) + int(words[12])) / _TICKS
 
 
 def _turns(process: int) -> tuple[float, float]:
-    """Return the main thread's running and ready times (s); NaN if the kernel does not count them."""
+    """Return the times (s) in which the main thread ran and was ready; NaN if the kernel has no counts."""
     try:
         words = Path(f"/proc/{process}/task/{process}/schedstat").read_text().split()
-    except FileNotFoundError:  # the kernel does not count it
+    except FileNotFoundError:  # the kernel does not count these times
         return math.nan, math.nan
     return 1e-9 * int(words[0]), 1e-9 * int(words[1])
 

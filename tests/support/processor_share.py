@@ -1,10 +1,10 @@
-"""A limited share of a core that makes processes under test as slow as on a slower processor.
+"""Limits processes under test to a share of a core, so that they are as slow as on a slower processor.
 
 The kernel enforces the share on one core (CFS bandwidth of the controller `cpu`, cgroup v1 or v2). The period
 is 5 ms, and longer for shares below 20 %, because the kernel grants at least 1 ms per period. Within the
-share, the control process has priority over its workers, as on a board: it is in a group of its own with a
-far greater weight. Stopping by SIGSTOP and SIGCONT would not work, because the flight replaces a stopped
-worker.
+share, the control process has priority over its workers, as on a board, because it is in a separate group
+with a far greater weight. A limitation by SIGSTOP and SIGCONT would not work, because the flight replaces a
+stopped worker.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def measure() -> Yardstick:
 
 @dataclass(frozen=True, slots=True)
 class Used:
-    """Resources that a control group with limits used: periods (throttled, total), memory (bytes), refusals.
+    """Resources that a limited control group used: periods (throttled, total), memory (bytes), refusals.
 
     The memory is NaN with a kernel before Linux 5.19, whose cgroup v2 does not record the largest use.
     """
@@ -93,7 +93,7 @@ class Used:
 
 
 class Limits:
-    """Groups of one run: `control` and `workers` inside the limit, `devices` outside it."""
+    """Control groups of a run: `control` and `workers` are within the limit, and `devices` is outside."""
 
     def __init__(self, share: float, memory: int, root: Path = ROOT) -> None:
         """Create the groups below `root`.
@@ -129,14 +129,14 @@ class Limits:
         for part in ("control", "workers"):
             (self._cpu / part).mkdir()
         weight, most, least = ("cpu.weight", 10000, 1) if self._is_v2 else ("cpu.shares", 262144, 2)
-        # The groups have priority over other work on this machine, which would otherwise take part of the
+        # The groups have priority over other work on this machine, which would otherwise use a part of the
         # share.
         for folder in (self._cpu, self._devices, self._cpu / "control"):
             _write(folder / weight, str(most))
         _write(self._cpu / "workers" / weight, str(least))
 
     def line(self) -> str:
-        """Return a line of Python by which a process enters the group of the control process."""
+        """Return a line of Python code by which a process enters the group of the control process."""
         places = {self._cpu / "control", self._memory if not self._is_v2 else self._cpu / "control"}
         files = [str(place / "cgroup.procs") for place in sorted(places)]
         core = sorted(os.sched_getaffinity(0))[-1]
@@ -148,7 +148,7 @@ class Limits:
         self._enter(self._cpu / "workers", process)
 
     def release(self, process: int) -> None:
-        """Move a process out of the limit, to the devices."""
+        """Move a process out of the limit, into the group of the devices."""
         self._enter(self._devices, process)
 
     @staticmethod
@@ -189,7 +189,7 @@ def _write(file: Path, text: str) -> None:
 
 @contextmanager
 def limited(share: float, memory: int) -> Iterator[Limits]:
-    """Create the groups, and remove them at the end of the block."""
+    """Create the groups, and remove them at the end of the `with` block."""
     limits = Limits(share, memory)
     try:
         yield limits

@@ -63,7 +63,10 @@ def _whenever(end: AttitudeEnd) -> EndLaw:
 
 
 def slews(count: int, seed: int, with_cones: bool) -> Iterator[tuple[str, SlewTask]]:
-    """Yield slew tasks with their names; with exclusion cones, only tasks that start and end outside."""
+    """Yield slew tasks with their names.
+
+    With exclusion cones, all tasks start and end outside of the cones.
+    """
     rng = np.random.default_rng(seed)
     made = 0
     while made < count:

@@ -1,10 +1,10 @@
 """Short simulated flights whose packets are recorded in `recorded_flights.json`.
 
-`python -m tests.support.recorded_flights` writes the record, after an intended change of the behaviour. For
-each number the record has the count of finite values, and their mean, root mean square and last value over
-the flight. The components of an array are weighted by 1, 2, 3, ..., so that swapping two components changes
-the recorded values. Only texts that are names are recorded, because the wording of messages may change.
-Values that depend on the computer are left out.
+After an intended change of the behaviour, `python -m tests.support.recorded_flights` writes the record again.
+The record of a number contains the count of finite values, and their mean, root mean square and last value
+over the flight. The components of an array are weighted by 1, 2, 3, ..., so that an exchange of two
+components changes the recorded values. Only texts that are names are recorded, because the wording of
+messages may change. Values that depend on the computer are omitted.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ Record = dict[str, dict[str, Any]]
 
 
 def record_of(run: Run) -> Record:
-    """Return the record of a flight: the packet count of each packet type, and each field's statistics."""
+    """Return the record of a flight: the number of packets of each type, and the statistics of each field."""
     found: Record = {}
     for name, layout in LAYOUTS.items():
         rows = run[name]
@@ -82,7 +82,7 @@ def _fields(packet: Packet, rows: Any) -> dict[str, Any]:
 
 
 def _figures(values: Any) -> list[float]:
-    """Return the number of finite values, and the mean, root mean square and last of these values."""
+    """Return the number of finite values, and the mean, root mean square and last finite value."""
     weighted = values.astype(float).reshape(len(values), -1)
     weighted = weighted * np.arange(1, weighted.shape[1] + 1)
     finite = weighted[np.isfinite(weighted)]
@@ -93,7 +93,7 @@ def _figures(values: Any) -> list[float]:
 
 
 def differences(record: Record, found: Record) -> list[str]:
-    """Return the packets and fields of a flight that differ from its record, one per line."""
+    """Return the packets and fields of a flight that differ from its record, one text per field."""
     lines = [f"{name}: in one of them only" for name in sorted(record.keys() ^ found.keys())]
     for name in sorted(record.keys() & found.keys()):
         for field, known in record[name].items():
@@ -119,12 +119,12 @@ def recorded(name: str) -> Record:
 
 
 def faults(*entries: tuple[str, float, float]) -> tuple[FaultEntry, ...]:
-    """Return fault entries, each given by its text, start (s) and duration (s)."""
+    """Return fault entries. Each fault is given by its text, start (s) and duration (s)."""
     return tuple(FaultEntry(fault=text, at=at, span=span) for text, at, span in entries)
 
 
 def commanded(config: Any, *steps: dict[str, Any], **modes: Any) -> Any:
-    """Return a configuration with a timeline of commands and other settings of the modes."""
+    """Return a configuration with scheduled commands and other settings of the modes."""
     timeline = tuple(CommandStep(**step) for step in steps)
     section = configuration.replace(config.modes, **modes)
     return configuration.replace(config, modes=section, commands=Commands(timeline=timeline))
@@ -239,7 +239,7 @@ def flown(name: str, folder: Path) -> Run:
 
 
 def unlike_record(name: str, session_folder: Path) -> list[str]:
-    """Return the differences of a flight from its record; the flight runs once per test session."""
+    """Return the differences of a flight from its record. The flight runs once per test session."""
     folder = session_folder / "recorded_flights"
     folder.mkdir(exist_ok=True)
     found = made_once(folder, name, lambda: record_of(flown(name, folder / name)))

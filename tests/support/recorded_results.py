@@ -1,10 +1,10 @@
 """Results of estimators and planners, compared with a record of their numbers.
 
-A test module that compares results with a record has one test function for each case. `check(__file__, name,
+A test module that compares results with a record has one test function per case. `check(__file__, name,
 result)` compares a result with the file `recorded_results.json` beside the module. `KNIGHTCUBE_RECORD=1
-python -m pytest -n 0 MODULE` writes the record, after an intended change of the results.
+python -m pytest -n 0 MODULE` writes the record again, after an intended change of the results.
 
-For an array, the record has its shape, the number of finite values, and their mean, root mean square and
+The record of an array contains its shape, the number of finite values, and their mean, root mean square and
 weighted mean. Texts are not recorded, because their wording may change.
 """
 
@@ -42,7 +42,7 @@ _DEPTH = 6
 
 
 def figures_of(value: Any, depth: int = 0) -> Any:
-    """Return the numbers of a result as JSON: dataclasses and mappings by name, arrays as statistics."""
+    """Return the numbers of a result as JSON: dataclasses and mappings by name, and statistics of arrays."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str | Enum):
@@ -93,9 +93,10 @@ def _array(value: Any) -> Any:
 
 
 def differences(record: Any, found: Any, tolerance: float, place: str = "", zero: float = 0.0) -> list[str]:
-    """Return the key paths at which values differ from their record, one per line.
+    """Return the key paths at which values differ from their record, one path per line.
 
-    Numbers also agree if their difference is at most `zero`, the rounding error of an exact zero.
+    Numbers also agree if their difference is at most `zero`, the rounding error of a value that is exactly
+    zero.
     """
     if isinstance(record, dict) and isinstance(found, dict):
         lines = [f"{place}.{key}: in one of them only" for key in sorted(record.keys() ^ found.keys())]
@@ -120,7 +121,7 @@ def differences(record: Any, found: Any, tolerance: float, place: str = "", zero
 
 
 def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zero: float = ZERO) -> None:
-    """Fail unless a result agrees with its record, a file beside the test module.
+    """Fail if a result differs from its record, a file in the folder of the test module.
 
     Numbers agree if they differ by at most the fraction `tolerance`, or by `zero`. If compiled functions are
     used, the fraction is `COMPILED_TOLERANCE` for all values except the `ANSWERS`.
@@ -139,7 +140,7 @@ def check(module: str, name: str, result: Any, tolerance: float = TOLERANCE, zer
 def unlike(record: Any, found: Any, tolerance: float, zero: float, compiled: bool) -> list[str]:
     """Return the key paths at which results differ from their record.
 
-    If `compiled` is true, compiled functions were used, which have a larger tolerance.
+    If `compiled` is true, compiled functions were used, whose results have a larger tolerance.
     """
     lines = differences(record, found, tolerance, zero=zero)
     if not compiled:

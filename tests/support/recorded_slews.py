@@ -1,7 +1,7 @@
 """Slews with known optima, and a model of the motion that shares no code with the planner.
 
-The file's problems, magnetic field series and optima come from an independent direct collocation. `flown`
-integrates the equations of the file's `model`.
+Problems, magnetic fields and optima in the file are those of an independent direct collocation. `flown`
+integrates the equations of motion that the file states as `model`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def matrix(q: FloatArray) -> FloatArray:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the cross product (3,) of two vectors; numpy's general function takes ten times as long."""
+    """Return the cross product (3,) of two vectors. The general function of numpy takes ten times longer."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
@@ -78,7 +78,7 @@ def along_of(case: dict[str, Any]) -> EnvironmentAt:
 
 
 def task_of(case: dict[str, Any], horizon: float, **options: Any) -> SlewTask:
-    """Return the planner's task of a problem over `horizon` s."""
+    """Return the planner's task of a problem with a duration of `horizon` s."""
     craft = recorded()["craft"][case["craft"]]
     end = AttitudeEnd(np.array(case["qf"]), matrix(np.array(case["qf"])).T @ np.array(case["wf"]))
     model = SlewCraft(
@@ -92,7 +92,7 @@ def task_of(case: dict[str, Any], horizon: float, **options: Any) -> SlewTask:
 
 
 def flown(plan: SlewPlan, task: SlewTask) -> FloatArray:
-    """Return the final state (7,) of a body on which only the plan's dipoles act.
+    """Return the final state (7,) of a body on which only the dipoles of the plan act.
 
     The integrator is the Runge-Kutta method of fourth order with STEPS steps per collocation interval.
     """

@@ -1,7 +1,8 @@
-"""Frames of a rolling shutter, summed instant by instant, independent of the estimator's model.
+"""Frames of a rolling shutter, summed over instants, independent of the estimator's model.
 
-At each instant a star is a Gaussian that is integrated over each pixel of a patch. The instant's light counts
-only in the rows that are exposed at that time. The method is simple and slow. The noise is the simulator's.
+At each instant a star is a Gaussian that is integrated over each pixel of a patch. The light of an instant is
+added only to the rows that are exposed at this instant. The method is simple and slow. The noise is that of
+the simulator.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ Turns = Callable[[FloatArray], FloatArray]
 """Function that returns rotation vectors (m, 3), rad, since mid-exposure at times (m,), s, camera frame."""
 
 _LIMIT = 7.0
-# Largest step (px) of a star between instants, and half width of the patch in units of the point spread's
+# Largest step (px) of a star between two instants, and half width of the patch in units of the point spread's
 # sigma.
 _STEP = 0.25
 _REACH = 5.5
@@ -88,14 +89,14 @@ def _add(
     exposure: float,
     electrons: float,
 ) -> None:
-    """Add a star of `electrons` at `path` (m, 2), px, at evenly spaced `times` (m,), to the image `light`."""
+    """Add a star of `electrons` at `path` (m, 2), px, at evenly spaced `times` (m,), to `light`."""
     reach = math.ceil(_REACH * camera.psf_sigma) + 1
     kept = camera.pinhole.contains(np.nan_to_num(path, nan=-1e6), float(reach))
     path, step = path[kept], times[1] - times[0]
     corner = np.rint(path).astype(int) - reach
     across, down = (corner[:, k, None] + np.arange(2 * reach + 1) for k in (0, 1))
     x, y = (_shares(pixel, path[:, k], camera.psf_sigma) for k, pixel in ((0, across), (1, down)))
-    # Fraction of the interval around the instant that lies within the exposure of each row.
+    # Fraction of the interval around the instant within the exposure of each row.
     begin = (down - 0.5 * (camera.rows - 1)) * camera.line_time - 0.5 * exposure
     first = np.maximum(times[kept, None] - 0.5 * step, begin)
     last = np.minimum(times[kept, None] + 0.5 * step, begin + exposure)
@@ -109,6 +110,6 @@ def _add(
 
 
 def _shares(pixels: IntArray, place: FloatArray, sigma: float) -> FloatArray:
-    """Return the fraction (m, p) of points at `place` (m,) that falls on `pixels` (m, p)."""
+    """Return the fraction (m, p) of points at `place` (m,) on each of the `pixels` (m, p)."""
     away = (pixels - place[:, None]) / sigma
     return np.asarray(ndtr(away + 0.5 / sigma) - ndtr(away - 0.5 / sigma))

@@ -28,7 +28,7 @@ _MOST_SKIES = 1000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A frame and its truth.
+    """A frame with its true motion and stars.
 
     Attributes:
         pixels: (rows, columns).
@@ -54,7 +54,7 @@ class Scene:
 
 @lru_cache(maxsize=4)
 def catalogue(limit: float) -> tuple[StarCatalogue, FloatArray]:
-    """Return the catalogue of stars brighter than magnitude `limit`, and their directions (n, 3)."""
+    """Return the catalogue of stars brighter than the magnitude `limit`, and their directions (n, 3)."""
     stars = load().brighter_than(limit)
     return stars, stars.directions_at(YEAR)
 
@@ -73,7 +73,7 @@ def slew(
     limit: float = 8.5,
     model: StarCameraModel | None = None,
 ) -> Scene:
-    """Return a random sky during a rotation of `fraction` of the field, `theta` (rad) off the boresight."""
+    """Return a random sky during a rotation by `fraction` of the field, `theta` (rad) off the boresight."""
     camera = model or StarCameraModel(field_of_view=FIELD)
     azimuth = generator.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
@@ -108,7 +108,7 @@ class RandomSlew:
         return cls(seed, run, theta, percent, float(draw.choice(EXPOSURES)))
 
     def exposed(self, camera: StarCameraModel) -> tuple[Scene, int]:
-        """Return the frame, and the number of skies drawn until one had enough usable stars."""
+        """Return the frame, and the number of skies that were drawn until one had enough usable stars."""
         generator = np.random.default_rng((self.seed, self.run, 1))
         theta, fraction = np.deg2rad(self.theta), self.percent / 100.0
         for drawn in range(1, _MOST_SKIES + 1):
@@ -126,7 +126,7 @@ def exposed(
     generator: np.random.Generator,
     limit: float = 8.5,
 ) -> Scene:
-    """Return a frame with the attitude `middle` (4,) at mid-exposure and a rate (3,), rad/s."""
+    """Return a frame with the attitude `middle` (4,) at mid-exposure and a constant rate (3,), rad/s."""
     stars, directions = catalogue(limit)
     times = np.linspace(0.0, exposure, SAMPLES)
     turns = from_rotation_vector((times - 0.5 * exposure)[:, None] * rate)
@@ -166,5 +166,5 @@ def usable(scene: Scene, camera: StarCameraModel, significance: float = 8.0) -> 
 
 
 def noise_floor(camera: StarCameraModel, exposure: float) -> float:
-    """Return the variance (e-^2) of a pixel without star light: read noise, dark current, rounding."""
+    """Return the variance (e-^2) of a pixel without starlight: read noise, dark current and rounding."""
     return camera.read_noise**2 + camera.dark_current * exposure + camera.gain**2 / 12.0

@@ -1,4 +1,4 @@
-"""Defaults of configuration sections as plain values, for the comparison with the published defaults."""
+"""Defaults of configuration sections as plain values, to be compared with the published defaults."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ Defaults = dict[str, dict[str, Any]]
 def defaults_of(*modules: ModuleType) -> Defaults:
     """Return the defaults of all sections of modules: numbers, texts and lists by section and key.
 
-    An inherited default is listed under the section that defines it. Missing values and subsections are left
-    out.
+    An inherited default is listed under the section that defines it. Missing values and subsections are
+    omitted.
     """
     found: Defaults = {}
     for module in modules:

@@ -1,7 +1,7 @@
-"""Attitude sensors of a satellite and their mounting, from one YAML file of `config/sensors` per satellite.
+"""Attitude sensors of a satellite and their mounting. Each satellite has a YAML file in `config/sensors`.
 
-Body axes (Meller et al., Fig. 2) in the nominal attitude: z down to nadir, x forward along the orbit, y to
-the right. Units are SI unless the name has another one.
+In the nominal attitude, the body axes are z down to nadir, x forward along the orbit, and y to the right
+(Meller et al., Fig. 2). Units are SI unless the name states another unit.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _UNIT_TOLERANCE = 1e-6
 
 
 class WideCamera(Section, frozen=True, kw_only=True):
-    """A horizon and Sun camera.
+    """A camera for horizon and Sun.
 
     `mounting` rotates body axes to camera axes (boresight z, columns x, rows y). `field_of_view_deg` is the
-    angle across the columns; because pixels are square, it also determines the angle across the rows.
+    angle across the columns. As pixels are square, it also determines the angle across the rows.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]
@@ -44,7 +44,7 @@ class WideCamera(Section, frozen=True, kw_only=True):
 class SolarString(Section, frozen=True, kw_only=True):
     """A string of solar cells on one face.
 
-    Its current is proportional to the cosine of the Sun's incidence angle.
+    The current is proportional to the cosine of the Sun's incidence angle.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]
@@ -56,7 +56,7 @@ class Gyros(Section, frozen=True, kw_only=True):
     """Three rate gyros along the body axes.
 
     `noise` is in rad/s per sqrt(Hz), `bias_start` in rad/s, and `bias_walk` in rad/s per sqrt(s). `rate_hz`
-    is the sample rate; each sample is the mean over its period.
+    is the sample rate. Each sample is the mean over its period.
     """
 
     noise: Positive
@@ -66,7 +66,7 @@ class Gyros(Section, frozen=True, kw_only=True):
 
     @property
     def sample_sigma(self) -> float:
-        """Standard deviation (rad/s) of one sample."""
+        """Standard deviation (rad/s) of one gyro sample."""
         return self.noise * math.sqrt(self.rate_hz)
 
 

@@ -1,4 +1,4 @@
-"""Results that the tests of a session share, in whatever worker process each test runs."""
+"""Results that all tests of a session share, whichever worker process a test runs in."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 
 
 def made_once(folder: Path, name: str, make: Callable[[], Any]) -> Any:
-    """Return the result of `make` in its JSON form; only the first caller of a session calls `make`.
+    """Return the result of `make` in its JSON form. Only the first caller in a session calls `make`.
 
-    `folder` is below the fixture `session_folder`. A caller in another process waits for the result. If
-    `make` raises an exception, the next caller calls it again.
+    `folder` is below the fixture `session_folder`. Callers in other processes wait for the result. If `make`
+    raises an exception, the next caller calls `make` again.
     """
     kept = folder / f"{name}.json"
     with (folder / f"{name}.lock").open("w") as lock:

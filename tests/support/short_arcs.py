@@ -1,4 +1,4 @@
-"""Passes of objects over a satellite, integrated with J2, for orbit determination."""
+"""Passes of objects near a satellite, integrated with J2, for tests of orbit determination."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EARTH, FLATTENING, EQUATOR, LIGHT = 3.986004418e14, 1.0826359e-3, 6_378_136.6, 2
 
 
 def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
-    """Return a state at `radius` over `place`, with `speed` times the circular speed horizontally."""
+    """Return a state at `radius` over `place` that moves horizontally at `speed` times the circular speed."""
     up = place / np.linalg.norm(place)
     ahead = np.cross(up, rng.normal(size=3))
     ahead /= np.linalg.norm(ahead)
@@ -22,8 +22,8 @@ def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: 
 def passing_object(rng: np.random.Generator, own: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     """Return a random object 100 to 3,020 km away from an observer with state `own` (6,), m and m/s.
 
-    The result is the unit vector (3,) to the object, its distance (m) and its state (6,). The orbit of the
-    object is nearly circular; its altitude is not limited.
+    Returns the unit vector (3,) to the object, its distance (m) and its state (6,). The orbit of the object
+    is nearly circular, and its altitude is not limited.
     """
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -34,7 +34,7 @@ def passing_object(rng: np.random.Generator, own: FloatArray) -> tuple[FloatArra
 
 
 def flown_states(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
-    """Return the states (n, 6) at `times`; `state` is that at `times[middle]`."""
+    """Return the states (n, 6) at `times` of a free fall; `state` is that at `times[middle]`."""
     parts = []
     for sense in (times[middle::-1], times[middle:]):
         found = solve_ivp(

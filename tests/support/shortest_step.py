@@ -1,9 +1,9 @@
-"""Shortest time of a single-axis slew by shooting, with full current in one direction, then in the other.
+"""Shortest time of a single-axis slew, by shooting with full current in one direction and then in the other.
 
 The method is independent of planner and collocation. The motion is integrated forward from the start at one
-current limit, and backward from the end at the other. The current switches where the two curves meet in the
-phase plane. One switch is optimal if the slew takes less than half a period of the thread (more than 20 s
-here).
+current limit, and backward from the end at the opposite limit. The current switches where both curves meet in
+the phase plane. A single switch is optimal if the slew takes less than half a period of the thread. In the
+tests, half a period is more than 20 s.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _stepped(slew: Slew, state: FloatArray, sign: float, dt: float) -> FloatArra
 
 
 def _run(slew: Slew, state: tuple[float, float], sign: float, dt: float) -> FloatArray:
-    """Return states (m, 2) every `dt` s until the coil loses its authority or the time limit is reached."""
+    """Return states (m, 2) every `dt` s until the coil has no more authority or the time limit is reached."""
     now = np.array(state)
     states = [now]
     for _ in range(round(_LONGEST / abs(dt))):

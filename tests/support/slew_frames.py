@@ -72,8 +72,8 @@ def compared(
 ) -> tuple[int, int, int, FloatArray]:
     """Return three counts of the slew's frames (all, with a rate, used), and the NEES per axis (n,).
 
-    Only frames from `first` to `last` (s) count. The comparison is in body axes. The covariance of a frame is
-    in camera axes, and the accuracy of the camera's mounting is added.
+    Only frames from `first` to `last` (s) are counted. Rates are compared in body axes. The covariance of a
+    frame is in camera axes, and the accuracy of the camera's mounting is added.
     """
     frames, truth = run["streak"], run["truth"]
     times, rates = truth["time_ns"] * 1e-9, truth["rate"].astype(float)

@@ -1,9 +1,9 @@
 """Synthetic star lists: the output of a perfect detector for a random part of the sky.
 
 A camera of 1024 x 1024 pixels has a random pointing and roll. The guide stars brighter than its limiting
-magnitude are imaged with Gaussian centroid noise. Some are missing. False stars are uniform over the frame,
-with the brightness of random true ones. The list is ordered by magnitudes with errors, as a detector measures
-them.
+magnitude are imaged with Gaussian centroid noise, and some stars are missing. False stars are distributed
+uniformly over the frame, with the brightness of random true stars. The list is ordered by magnitudes with
+errors, as a detector measures them.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class ListKind:
         magnitude_error: standard deviation of the instrumental magnitudes.
         lost: fraction of the stars that is missing.
         order: "brightness", or "none" for a shuffled list without magnitudes.
-        known_deg: largest difference (deg) between true and assumed field of view; None if `searched_deg`
-            applies.
+        known_deg: largest difference (deg) between true and assumed field of view; None if the range
+            `searched_deg` is searched.
         distortion_px: radial distortion at the corner.
         searched_deg: lowest and highest assumed field of view if `known_deg` is None.
-        bright: whether the false stars are all brighter than the true ones.
+        bright: whether all false stars are brighter than all true stars.
         mirrored: whether the image is mirrored left to right.
     """
 
@@ -57,7 +57,7 @@ class ListKind:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarList:
-    """One synthetic star list and its truth.
+    """One synthetic star list, with the true stars, attitude and camera.
 
     Attributes:
         pixels: centroids (n, 2), x and y.
@@ -87,7 +87,7 @@ class StarList:
 
 
 def believed_field(kind: ListKind) -> tuple[float, tuple[float, float]]:
-    """Return the assumed field of view (deg) and the corresponding range of scale."""
+    """Return the assumed field of view (deg) and the corresponding range of the scale."""
     if kind.known_deg is None:
         low, high = kind.searched_deg
         believed = float(np.rad2deg(2.0 * np.arctan(np.sqrt(_tangent(low) * _tangent(high)))))
@@ -102,7 +102,7 @@ def _tangent(field_deg: float) -> float:
 
 
 def draw(kind: ListKind, stars: GuideStars, rng: np.random.Generator) -> StarList:
-    """Return a list of the sky; the camera's true field of view is uniform within its tolerance."""
+    """Return a list of the sky. The true field of view of the camera is uniform within its tolerance."""
     off = 0.0 if kind.known_deg is None else rng.uniform(-kind.known_deg, kind.known_deg)
     camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(kind.field_deg + off)))
     attitude = normalise(rng.standard_normal(4))
@@ -143,7 +143,7 @@ def draw_random(kind: ListKind, count: int, rng: np.random.Generator) -> StarLis
 
 
 def _distort(pixels: FloatArray, camera: Pinhole, corner: float) -> FloatArray:
-    """Return pixels with radial distortion: cubic in the distance, `corner` px at the corner."""
+    """Return pixels with a radial distortion that is cubic in the distance, and `corner` px at the corner."""
     centre = np.array(camera.centre)
     off = (pixels - centre) / (PIXELS / np.sqrt(2.0))
     return np.asarray(pixels + corner * off * np.sum(off**2, axis=-1, keepdims=True))

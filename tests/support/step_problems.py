@@ -21,7 +21,7 @@ OPTIMUM_FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / 
 
 @dataclass(frozen=True)
 class Problem:
-    """Plant, boundary states (q2, rad/s) and duration (s) of one slew."""
+    """Plant, boundary states (q2, rad/s) and duration (s) of a slew."""
 
     plant: SingleAxisPlant
     start_q2: float
@@ -36,7 +36,7 @@ class Problem:
         return plan(self.plant, *states, self.horizon, **options)
 
     def slew(self, horizon: float) -> Slew:
-        """Return the same slew for the collocation oracle, with a duration of `horizon` s."""
+        """Return the same slew for the collocation oracle, with the duration `horizon` s."""
         plant = self.plant
         return Slew(
             angle_of(self.start_q2),
@@ -56,7 +56,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class KnownOptimum:
-    """A problem of the data file with its optimum (J) and its shortest feasible duration (s)."""
+    """A problem of the data file, with its optimum (J) and its shortest feasible duration (s)."""
 
     problem: Problem
     energy: float
@@ -71,7 +71,7 @@ STEPS = [
 
 
 def known_optima() -> list[KnownOptimum]:
-    """Return the 20 problems of the data file; skip the test if it is missing."""
+    """Return the 20 problems of the data file; skip the test if the file is missing."""
     if not OPTIMUM_FILE.exists():
         pytest.skip(f"{OPTIMUM_FILE.name}: the shared data folder is not beside the repository")
     content = json.loads(OPTIMUM_FILE.read_text())
@@ -102,7 +102,7 @@ def known_optima() -> list[KnownOptimum]:
 
 
 def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0, 20.0)) -> list[Problem]:
-    """Return random slews over the testbed's range, a third of them on a thread."""
+    """Return random slews over the range of the testbed. A third of the slews has a thread."""
     rng = np.random.default_rng(seed)
     problems = []
     for _ in range(count):
@@ -126,8 +126,8 @@ def feasible_problems(
 ) -> list[tuple[Problem, float]]:
     """Return slews that last `share` times their shortest feasible duration, each with this duration (s).
 
-    A third of the plants has no thread, and two thirds a thread of one of two stiffnesses. Half of the plants
-    have a disturbance, and half of the slews end with a rate.
+    A third of the plants has no thread, and two thirds have a thread of one of two stiffnesses. Half of the
+    plants have a disturbance, and half of the slews end with a rate.
     """
     rng = np.random.default_rng(seed)
     problems: list[tuple[Problem, float]] = []

@@ -3,7 +3,7 @@
 The electrons of a pixel are Poisson distributed, and the read noise is Gaussian. The Fisher information of
 parameters p is the sum over pixels of (dm/dp)(dm/dp)^T / (floor + m), with the mean signal m and the variance
 `floor` of all other noise (read noise squared, dark current, rounding). The signal is that of a point that
-moves under a constant rate, with a Gaussian point spread integrated over each pixel. It is summed by
+moves at a constant rate, with a Gaussian point spread integrated over each pixel. The signal is integrated by
 Gauss-Legendre quadrature in time, exact to rounding, and independent of the faster model that the estimator
 fits. Position, flux and background of every star are unknown, and optionally also the common width of the
 point spread. The signal of one star in the pixels of another is ignored, which can only make the bound too
@@ -23,7 +23,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.geometry import CameraMotion, paths, sensitivities
 
 # Number of parameters that stars share: rotation (3) and point spread. Each star also has position (2),
-# electrons and background.
+# electrons and background as parameters.
 _SHARED = 4
 _ALONE = 4
 _REACH_SIGMAS = 6.0
@@ -55,7 +55,7 @@ def rate_bound(
 ) -> RateBound:
     """Return the bound on the rate (3,), rad/s, from stars at pixels `stars` (n, 2) at mid-exposure.
 
-    `electrons` (n,) are counted over the whole exposure; `floor` is the variance of other noise, e-^2 per
+    `electrons` (n,) are counted over the whole exposure. `floor` is the variance of other noise, e-^2 per
     pixel. Raises numpy.linalg.LinAlgError if the stars do not determine the rate.
     """
     motion = CameraMotion.steady(np.asarray(rate) * exposure)
@@ -77,10 +77,10 @@ def rate_bound(
 def endpoint_bound(
     length: float, electrons: float, psf_sigma: float, floor: float, angle: float = 0.0, fit_psf: bool = False
 ) -> tuple[float, float]:
-    """Return the bounds (px) on one end point of an isolated straight streak, along and across the streak.
+    """Return the bounds (px) of an end point of an isolated straight streak, along and across the streak.
 
-    Both ends, `electrons` and background are unknown. `angle` (rad) is the angle between the streak and the
-    rows. The bounds are averaged over the positions of the ends within a pixel.
+    Both ends, `electrons` and background are unknown. `angle` (rad) is the angle between streak and rows. The
+    bounds are averaged over the positions of the ends within a pixel.
     """
     phases = np.array([[0.0, 0.0], [0.3, 0.7], [0.5, 0.2], [0.8, 0.4]])
     variance = np.zeros(2)
@@ -90,7 +90,7 @@ def endpoint_bound(
         node, weight = _quadrature(length, psf_sigma)
         mean = np.asarray(phase)
         points = mean + length * node[:, None] * direction
-        # Derivatives of each point with respect to the first and the last end, each (x, y).
+        # Derivatives of each point with respect to the first end (x, y) and the last end (x, y).
         blend = np.zeros((len(node), 2, 4))
         blend[:, 0, 0] = blend[:, 1, 1] = 0.5 - node
         blend[:, 0, 2] = blend[:, 1, 3] = 0.5 + node
@@ -109,7 +109,7 @@ def endpoint_bound(
 def star_information(
     pinhole: Pinhole, motion: CameraMotion, star: FloatArray, electrons: float, psf_sigma: float, floor: float
 ) -> FloatArray:
-    """Return one star's Fisher information (8, 8).
+    """Return the Fisher information (8, 8) of one star.
 
     The parameters are rotation (3), rad, PSF sigma, px, position (2), px, electrons and background. `star`
     (2,) is the pixel at mid-exposure. Signal off the detector gives no information.
@@ -129,7 +129,7 @@ def star_information(
 
 
 def _quadrature(length: float, psf_sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return times (m,) from -1/2 to 1/2 and normalised weights for a path of `length` px."""
+    """Return times (m,) from -1/2 to 1/2 and normalised weights, for a path of `length` px."""
     pieces = max(1, math.ceil(length / (4.0 * psf_sigma)))
     node, weight = np.polynomial.legendre.leggauss(10)
     times = (np.arange(pieces)[:, None] + 0.5 * (node + 1.0)) / pieces - 0.5
@@ -144,9 +144,9 @@ def _images(
     electrons: float,
     shape: tuple[int, int] | None,
 ) -> FloatArray:
-    """Return derivatives (k + 3, pixels) of the signal with respect to k path parameters and three others.
+    """Return the derivatives (k + 3, pixels) of the signal with respect to k + 3 parameters.
 
-    The others are sigma, electrons and background.
+    The parameters are k path parameters, sigma, electrons and background.
 
     The row of `electrons`, multiplied by `electrons`, is the signal itself. Each of the `points` (m, 2) has a
     fraction `weight` (m,) of the signal; `change` (m, 2, k) are the derivatives of the points with respect to
@@ -160,7 +160,8 @@ def _images(
     if np.any(low > high):
         return np.zeros((change.shape[2] + 3, 0))
     rows = np.zeros((change.shape[2] + 3, high[1] - low[1] + 1, high[0] - low[0] + 1))
-    # The path is processed in short segments, because the signal of a segment fits a small patch of pixels.
+    # The path is processed in short segments, because the signal of a short segment is in a small patch of
+    # pixels.
     for start in range(0, len(points), _PIECE):
         piece = slice(start, start + _PIECE)
         near, far = points[piece].min(axis=0), points[piece].max(axis=0)
@@ -192,7 +193,7 @@ def _near_path(light: FloatArray) -> IntArray:
 def _profile(
     pixels: FloatArray, place: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the fraction (m, p) of each point's signal per pixel, and its position and sigma derivatives."""
+    """Return the fraction (m, p) of the signal per pixel, and its derivatives by position and sigma."""
     right = (pixels + 0.5 - place[:, None]) / sigma
     left = (pixels - 0.5 - place[:, None]) / sigma
     bell_right = np.exp(-0.5 * right**2) / math.sqrt(2.0 * math.pi)

@@ -1,7 +1,7 @@
 """Simulated star frames for the tests of image processing, independent of the simulator's camera.
 
-Fixed point stars move as v' = -omega x v. They are sampled along the motion at 0.1 px or finer, spread by a
-Gaussian that is integrated over each pixel (erf), and get photon, dark and read noise.
+Fixed point stars move as v' = -omega x v. Their paths are sampled at steps of 0.1 px or less, and each sample
+is a Gaussian that is integrated over each pixel (erf). Photon, dark and read noise are added.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.special import erf
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Pinhole
 
-# Magnitudes V, and numbers of stars on the whole sky that are brighter (Hipparcos).
+# V magnitudes, and numbers of brighter stars in the whole sky (Hipparcos).
 _COUNTS_V = (6.0, 6.5, 7.0, 8.0, 8.5)
 _COUNTS = (4995.0, 8789.0, 15404.0, 41074.0, 61320.0)
 _CHUNK_PX = 10.0
@@ -44,14 +44,14 @@ def star_camera(size: int = 1024, psf_sigma: float = 1.0) -> Camera:
 
 
 def rate_at(theta: float, speed: float, roll: float = 0.0) -> FloatArray:
-    """Return a rate (3,) of `speed` rad/s whose axis is `theta` (rad) off the boresight, by default to +y."""
+    """Return a rate (3,) of `speed` rad/s about an axis `theta` (rad) off boresight, by default to +y."""
     return speed * np.array([np.sin(theta) * np.sin(roll), np.sin(theta) * np.cos(roll), np.cos(theta)])
 
 
 def random_stars(
     rng: np.random.Generator, pinhole: Pinhole, reach: float, faintest: float = 7.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Return random stars on a cap of the sky: directions (n, 3), and magnitudes (n,) up to `faintest`."""
+    """Return random stars in a cap of the sky: directions (n, 3), and magnitudes (n,) up to `faintest`."""
     cap = min(pinhole.half_diagonal + reach, np.pi)
     part = 0.5 * (1.0 - np.cos(cap))
     on_sky = 10.0 ** np.interp(faintest, _COUNTS_V, np.log10(_COUNTS))
@@ -59,7 +59,8 @@ def random_stars(
     z = rng.uniform(np.cos(cap), 1.0, n)
     around = rng.uniform(0.0, 2.0 * np.pi, n)
     r = np.sqrt(1.0 - z**2)
-    # log10 of the counts grows by 0.49 per magnitude near V = 6.5; this slope is extended to bright stars.
+    # log10 of the counts increases by 0.49 per magnitude near V = 6.5. This slope is extrapolated to bright
+    # stars.
     magnitudes = faintest + np.log10(rng.uniform(0.0, 1.0, n)) / 0.49
     return np.stack([r * np.cos(around), r * np.sin(around), z], axis=-1), magnitudes
 
@@ -109,8 +110,8 @@ def expose(
 ) -> FloatArray:
     """Return the mean electrons (rows, columns) of stars (n, 3) while the camera rotates by `rotation` (3,).
 
-    `growth` is the relative change of the rate over the exposure. `directions` are in camera axes at the
-    attitude half-way in angle.
+    `growth` is the relative change of the rate over the exposure. `directions` are in the camera axes at half
+    of the rotation.
     """
     image = np.zeros((camera.pinhole.rows, camera.pinhole.columns))
     electrons = camera.zero_magnitude * 10.0 ** (-0.4 * magnitudes) * exposure
@@ -119,7 +120,8 @@ def expose(
     seen = camera.pinhole.contains(ends.mean(axis=1), margin=float(np.nanmax(length, initial=0.0)) + 10.0)
     for star in np.flatnonzero(seen):
         chunks = max(1, int(np.ceil(length[star] / _CHUNK_PX)))
-        # The number is 1.5 times as large, because an arc is longer than its chord and the speed varies.
+        # The number of samples is 1.5 times larger, because an arc is longer than its chord and the speed
+        # varies.
         steps = chunks * int(np.ceil((1.5 + growth) * _CHUNK_PX / _STEP_PX)) if length[star] > 0.0 else 1
         time = (np.arange(steps) + 0.5) / steps - 0.5
         fraction = time + 0.5 * growth * (time**2 - 0.25)
@@ -130,7 +132,7 @@ def expose(
 
 
 def _along(direction: FloatArray, rotation: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return one star's directions (m, 3) at fractions (m,) of the rotation from mid-exposure."""
+    """Return the directions (m, 3) of one star at fractions (m,) of the rotation from mid-exposure."""
     angle = np.linalg.norm(rotation)
     if angle == 0.0:
         return np.tile(direction, (len(fraction), 1))
@@ -158,7 +160,7 @@ def read_out(
 
 
 def star_frame(camera: Camera, rate: FloatArray, exposure: float, seed: int, faintest: float = 7.5) -> Image:
-    """Return a frame of a random star field at a rate (3,), rad/s; `seed` determines it."""
+    """Return a frame of a random star field at a rate (3,), rad/s. The star field depends only on `seed`."""
     rng = np.random.default_rng(seed)
     rotation = rate * exposure
     directions, magnitudes = random_stars(rng, camera.pinhole, float(np.linalg.norm(rotation)), faintest)

@@ -1,4 +1,4 @@
-"""Simulated frames of the Sun, and the Sun sensor's results for them."""
+"""Simulated frames of the Sun, and the results of the Sun sensor for these frames."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CAMERAS: dict[str, tuple[EarthCameraModel, SunSettings]] = {
 
 @dataclass
 class Outcome:
-    """Results for each frame: errors (rad), normalised squared errors, statuses, CPU times (s)."""
+    """Results for a number of frames: errors (rad), normalised squared errors, statuses, CPU times (s)."""
 
     errors: list[float] = field(default_factory=list)
     whole: list[float] = field(default_factory=list)

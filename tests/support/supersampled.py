@@ -1,8 +1,9 @@
 """Independent renderer of frames of streaks, for any point spread, lens and motion.
 
 The estimator's model and `sim_hal.star_camera` use one Gaussian point spread and analytic streaks. This
-renderer uses neither of these two approximations. It lays points along each star's path on a grid of three by
-three cells per pixel, convolves the grid with a sampled point spread, and sums the cells of each pixel.
+renderer uses neither of these two approximations. The renderer adds points along each star's path to a grid
+of three by three cells per pixel, convolves the grid with a sampled point spread, and sums the cells of each
+pixel.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _STARS_AT_ONCE = 64
 def gaussian(sigma: float, ratio: float = 1.0, angle: float = 0.0) -> Spread:
     """Return an elliptical Gaussian.
 
-    Its axes are sigma sqrt(ratio), at the angle `angle` (rad), and sigma / sqrt(ratio), px.
+    The semi-axes are sigma sqrt(ratio), at the angle `angle` (rad), and sigma / sqrt(ratio), px.
     """
     cosine, sine = np.cos(angle), np.sin(angle)
 
@@ -49,7 +50,7 @@ def gaussian(sigma: float, ratio: float = 1.0, angle: float = 0.0) -> Spread:
 
 
 def moffat(sigma: float, beta: float) -> Spread:
-    """Return a Moffat profile whose half-width is that of a Gaussian of `sigma` px."""
+    """Return a Moffat profile with the half-width of a Gaussian of `sigma` px."""
     alpha = np.sqrt(2.0 * np.log(2.0)) * sigma / np.sqrt(2.0 ** (1.0 / beta) - 1.0)
     return lambda dx, dy: np.asarray((1.0 + (dx * dx + dy * dy) / alpha**2) ** -beta)
 
@@ -64,7 +65,7 @@ def disc(diameter: float) -> Spread:
 
 
 def ring(diameter: float, hole: float) -> Spread:
-    """Return a defocused point of a telescope with a central obstruction: a disc with a hole (px)."""
+    """Return a defocused point in a telescope with a central obstruction: a disc with a hole (px)."""
     whole, dark = disc(diameter), disc(hole)
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
@@ -74,7 +75,7 @@ def ring(diameter: float, hole: float) -> Spread:
 
 
 def halo(sigma: float, share: float, width: float) -> Spread:
-    """Return a Gaussian core plus a Gaussian of `width` px with the fraction `share` of the signal."""
+    """Return a Gaussian core, plus a Gaussian of `width` px with the fraction `share` of the signal."""
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
         square = dx * dx + dy * dy
@@ -85,7 +86,7 @@ def halo(sigma: float, share: float, width: float) -> Spread:
 
 
 def coma(sigma: float, length: float, angle: float) -> Spread:
-    """Return a point with a tail of fainter and wider Gaussians at `angle` (rad), up to `length` px away."""
+    """Return a point with a tail of fainter and wider Gaussians, at `angle` (rad), up to `length` px long."""
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
         total = np.zeros(np.broadcast_shapes(dx.shape, dy.shape))
@@ -103,9 +104,9 @@ class Optics:
     """Optics of a camera.
 
     Attributes:
-        spreads: point spreads from the field's centre to its corner; the signal is interpolated between them.
+        spreads: point spreads from the field's centre to its corner; between them the signal is interpolated.
         radius: distance (px) beyond which a point has no signal.
-        distortion: relative outward displacement of the corner, with the cube of the radius.
+        distortion: relative outward displacement of the corner; it increases with the cube of the radius.
         offset: distance (px) of the optical axis from the centre of the detector.
         scintillation: relative rms variation of each star's brightness between segments of its path.
     """
@@ -119,7 +120,7 @@ class Optics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """Stars: directions (n, 3), and electrons (n,) of each over the exposure."""
+    """Stars with directions (n, 3), and the electrons (n,) of each star over the exposure."""
 
     directions: FloatArray
     electrons: FloatArray
@@ -140,7 +141,7 @@ def light(
 ) -> FloatArray:
     """Return the expected electrons (rows, columns) of a sky.
 
-    `length` (px) bounds the length of paths. `delay` is the time between rows (rolling shutter) in units of
+    `length` (px) limits the length of paths. `delay` is the time between rows (rolling shutter) in units of
     the exposure.
     """
     layers = len(optics.spreads)
@@ -157,8 +158,9 @@ def light(
         weight = np.full(place.shape[:2], 1.0) * sky.electrons[some, None] * (2.0 * room / count)
         if delay:
             late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
-            # The first and the last point of a path are weighted by their exposed fraction. Otherwise all
-            # stars of some rows would be displaced by part of the distance between points.
+            # The first and the last point of a path are weighted by the fraction of their interval within the
+            # exposure. Otherwise all stars of some rows would be displaced by part of the distance between
+            # points.
             weight *= np.clip((0.5 - np.abs(late)) * count / (2.0 * room) + 0.5, 0.0, 1.0)
         if optics.scintillation:
             knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)
@@ -175,7 +177,7 @@ def light(
 
 
 def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> FloatArray:
-    """Return the pixels (..., 2) of `vectors` (..., 3), NaN behind the camera."""
+    """Return the pixels (..., 2) of `vectors` (..., 3), or NaN for vectors behind the camera."""
     z = np.where(vectors[..., 2] > 0.2, vectors[..., 2], np.nan)
     tangent = vectors[..., :2] / z[..., None]
     corner = np.tan(pinhole.half_diagonal)
@@ -185,7 +187,10 @@ def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> Float
 
 
 def _lay(grid: Cells, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -> None:
-    """Add points of light, each shared by the four nearest cells and by the two layers nearest in radius."""
+    """Add points of light.
+
+    Each point is shared by the four nearest cells, and by the two layers nearest in radius.
+    """
     cell = CELLS * (place + 0.5) - 0.5
     corner = np.floor(cell).astype(np.int64)
     inside = ((corner >= 0) & (corner < np.array(grid.shape[:0:-1]) - 1)).all(axis=1)

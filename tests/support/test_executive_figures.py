@@ -1,4 +1,4 @@
-"""Tests of lateness, lost slots, memory and waits with known samples."""
+"""Tests of lateness, lost slots, memory and waits, with samples of known results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _IN_TIME = np.full(12, 100_000)
 
 
 def _grid(late_ns: npt.ArrayLike) -> Grid:
-    """Return a loop with the given lateness at each slot; lateness above one period skips the next slot."""
+    """Return a loop with a given lateness at each slot. A lateness above one period skips the next slot."""
     late = np.asarray(late_ns, dtype=np.int64)
     starts = np.maximum.accumulate((FIRST + np.arange(len(late))) * PERIOD_NS + late)
     return on_grid(np.unique(starts), PERIOD_NS, FIRST, len(late))
@@ -64,7 +64,7 @@ def test_a_lost_slot_is_the_machines_only_when_the_bare_loop_lost_it_or_its_neig
     [
         (15, 20, True),
         (15, 10, False),
-        # The small load that is always present is not accepted as the cause of the loop's lateness.
+        # A small load that is always present is not taken as the cause of the loop's lateness.
         (90, 40, False),
         (90, 50, True),
     ],
@@ -82,7 +82,10 @@ def test_a_slot_is_the_hosts_when_it_took_what_makes_it_lost(
 
 
 def test_a_leak_is_seen_through_the_memory_of_jobs_that_come_and_go() -> None:
-    """Half of the samples include a job of 50 MiB; 16 or more of the 95 % intervals contain the slope."""
+    """A leak is detected in spite of jobs whose memory comes and goes.
+
+    Half of the samples include a job of 50 MiB. The true slope is in at least 16 of the 95 % intervals.
+    """
     seconds = np.arange(0.0, 600.0, 0.5)
     held = {0.0: 0, 5.0: 0}
     for seed in range(20):
@@ -100,9 +103,12 @@ def test_a_flight_too_short_for_a_slope_has_none() -> None:
 
 
 def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> None:
-    """The best of three measurements is checked, because other processes that end change shared pages."""
+    """The memory that a process touches, and its processor time, are measured.
+
+    The best of three measurements is checked, because the ends of other processes change shared pages.
+    """
     me = {"me": os.getpid()}
-    process_watch.unshared(me)  # the first call allocates the memory that sampling itself needs
+    process_watch.unshared(me)  # the first call allocates the memory that sampling needs
     proportional, private = [], []
     for _ in range(3):
         before, alone = process_watch.look(me), process_watch.unshared(me)
@@ -129,7 +135,10 @@ def test_a_slope_is_given_from_minutes_on_and_not_before() -> None:
 
 
 def test_a_cycle_that_waits_is_blocked_and_one_without_a_processor_is_queued() -> None:
-    """Each cycle of 20 ms has 2 ms of work; then the thread waits for a worker or for the processor."""
+    """A cycle that waits for a worker is blocked, and a cycle that waits for the processor is queued.
+
+    Each cycle of 20 ms has 2 ms of work, and then the thread waits for a worker or for the processor.
+    """
     starts, execution = np.arange(0.0, 4.0, 0.025), np.full(160, 0.02)
 
     def found(on: float, queued: float) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Tests of the groups that limit processor and memory, with recorded files of cgroup v1 and v2.
+"""Tests of the control groups that limit processor and memory, with recorded files of cgroup v1 and v2.
 
-The v2 files come from a user-mode Linux 6.1 (`tests/studies/bench/user_mode_linux.sh`), and the v1 files from
+The v2 files are from a user-mode Linux 6.1 (`tests/studies/bench/user_mode_linux.sh`), and the v1 files from
 Linux 6.18. They were recorded after a process with a limit of 30 % and 64 MiB had requested 100 MB.
 """
 
@@ -50,7 +50,7 @@ def separate(root: Path) -> Path:
 
 
 def settings(root: Path) -> dict[str, str]:
-    """Return the text of each file below `root` by its path."""
+    """Return the texts of all files below `root`, by path."""
     files = (path for path in root.rglob("*") if path.is_file())
     return {str(path.relative_to(root)).replace(NAME, "BOARD"): path.read_text() for path in files}
 
@@ -121,7 +121,10 @@ def test_what_groups_of_cgroup_v1_used_is_read(separate: Path) -> None:
 
 
 def test_a_refused_controller_is_named_and_leaves_no_group(unified: Path) -> None:
-    """In a container, the kernel refuses controllers in the group of the processes (errno EBUSY)."""
+    """A controller that the kernel refuses is named in the error, and no group remains.
+
+    In a container, the kernel refuses controllers in the group of the processes (errno EBUSY).
+    """
     (unified / "cgroup.subtree_control").mkdir()
     with pytest.raises(OSError, match=r"the kernel refuses '\+cpu \+memory': .*cgroup.subtree_control"):
         Limits(0.3, 64 << 20, unified)

@@ -1,4 +1,4 @@
-"""Tests of the comparison of results with their record, with and without compiled functions."""
+"""Tests of the comparison of results with their records, with and without compiled functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests that the three satellites' sensors are mounted as in the paper, and that wrong files are refused."""
+"""Tests that the sensors of three satellites are mounted as in the paper, and wrong files are refused."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def angles(first: FloatArray, second: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("name", SUITES)
 def test_every_camera_is_the_paper_s_and_its_picture_hangs_right(name: str) -> None:
-    """The cameras have 512 x 512 px over 67 deg.
+    """Every camera has 512 x 512 px over 67 deg, as in the paper, and its image is upright.
 
-    Row numbers increase towards nadir, unless the camera looks up.
+    The row numbers increase towards nadir, except if the camera looks up.
     """
     for camera in suite(name).cameras:
         assert (camera.columns, camera.rows, camera.field_of_view_deg) == (512, 512, 67.0)
@@ -39,7 +39,11 @@ def test_every_camera_is_the_paper_s_and_its_picture_hangs_right(name: str) -> N
 
 @pytest.mark.parametrize("name", ["vt", "uw"])
 def test_three_side_cameras_look_level_120_deg_apart(name: str) -> None:
-    """Sections 4.1 and 4.2 of the paper: the cameras are on alternate sides, 53 deg between their fields."""
+    """Three side cameras look horizontally, 120 deg apart.
+
+    In the paper (sections 4.1, 4.2), the cameras are on alternate sides, with 53 deg between their fields of
+    view.
+    """
     side = boresights(name)[:3]
     np.testing.assert_allclose(angles(side, side)[np.triu_indices(3, 1)], 120.0)
     np.testing.assert_allclose(side @ DOWN, 0.0, atol=1e-9)
@@ -53,24 +57,28 @@ def test_the_fourth_camera_of_uw_looks_out_of_the_top_and_vt_has_none() -> None:
 
 
 def test_vt_uses_its_cameras_for_the_earth_alone() -> None:
-    """Section 1 of the paper: VT uses its cameras for the Earth only, UW and USU for Earth and Sun."""
+    """VT uses its cameras only for the Earth, and UW and USU for Earth and Sun (paper, section 1)."""
     assert not any(camera.sun for camera in suite("vt").cameras)
     assert all(camera.sun for name in ("uw", "usu") for camera in suite(name).cameras)
 
 
 def test_the_cameras_of_usu_are_tipped_like_the_satellite() -> None:
-    """Section 4.3 of the paper: one camera is 55 deg from nadir, the others 45 deg to either side of it."""
+    """The cameras of USU are tilted with the satellite.
+
+    One camera is 55 deg from nadir, and the other cameras are 45 deg to either side of it (paper, section
+    4.3).
+    """
     middle, forward, aft = boresights("usu")
     assert angles(middle, DOWN) == pytest.approx(55.0)
     for other, turned in ((forward, 45.0), (aft, -45.0)):
-        # A rotation about y by 45 deg moves the component of the boresight that is perpendicular to y.
+        # A rotation about y by 45 deg moves the component of the boresight that is normal to y.
         found = np.degrees(np.arctan2(other[0], other[2]) - np.arctan2(middle[0], middle[2]))
         assert found == pytest.approx(turned)
         assert other[1] == pytest.approx(middle[1])
 
 
 def written(tmp_path: Path, old: str, new: str) -> Path:
-    """Write the file of the suite VT with one text replaced, and return its path."""
+    """Write the file of the suite VT with one replaced text, and return the path of the file."""
     text = Path("config/sensors/vt.yaml").read_text()
     assert old in text
     path = tmp_path / "suite.yaml"

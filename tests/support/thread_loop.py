@@ -31,10 +31,10 @@ def fly(
     seed: int = 1,
     noise: float = 1.0,
 ) -> FloatArray:
-    """Return rows (t, theta, omega, current) of a run whose noise is `noise` times that of the testbed.
+    """Return rows (t, theta, omega, current) of a run with `noise` times the noise of the testbed.
 
-    The filter assumes the plant without thread. The filter's input is the current commanded in the previous
-    cycle, with the testbed's uncertainty.
+    The filter assumes a plant without a thread. Its input is the current of the previous cycle's command,
+    with the uncertainty of the testbed.
     """
     rng = np.random.default_rng(seed)
     filter_ = SingleAxisFilter(BELIEVED, FilterSettings(2e-3, PERIOD, 5e-4))
@@ -67,11 +67,11 @@ def fly(
 
 
 def held(angle: float) -> Callable[[float], PathSample]:
-    """Return a reference path that stays at a constant angle."""
+    """Return a reference path with a constant angle."""
     return lambda _: PathSample(angle, 0.0, 0.0)
 
 
 def largest_error(rows: FloatArray, angle: float, last: float) -> float:
-    """Return the largest |theta - angle| (deg) over the last `last` s."""
+    """Return the largest |theta - angle| (deg) in the last `last` s."""
     tail = rows[rows[:, 0] > rows[-1, 0] - last, 1]
     return math.degrees(float(np.abs(tail - angle).max()))

@@ -1,4 +1,4 @@
-"""Flights of a body that differs from its configuration, and the findings of their coil monitor."""
+"""Flights of a body that differs from its configuration, and the results of their coil monitor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.flights import CONFIG
 
 
 def configured(name: str) -> tuple[OrbitConfig, Simulation]:
-    """Return a configuration of config/ and its simulated world."""
+    """Return a configuration of the folder `config`, and its simulated world."""
     path = CONFIG.parent / f"{name}.yaml"
     section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
     assert section is not None
@@ -32,7 +32,7 @@ def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
 
 
 def with_fault(world: Simulation, seed: int, fault: str = "", at: float = 0.0) -> Simulation:
-    """Return a world whose random errors are drawn with another seed, optionally with a fault at `at` s."""
+    """Return a world with random errors of another seed, and optionally with a fault at `at` s."""
     entries = (FaultEntry(fault=fault, at=at),) if fault else ()
     return configuration.replace(world, seed=seed, faults=entries)
 
@@ -55,10 +55,10 @@ def with_other_body(
 
 
 def coil_judgement(flown: Run, broken: str) -> dict[str, Any]:
-    """Return what the monitor reported about each coil, and when (s) it reported the `broken` one.
+    """Return the monitor's reports on each coil, and the time (s) of its report on the coil `broken`.
 
     `broken` is the axis of the broken coil, or empty. `flown_with` is the last factor that the flight applied
-    to the broken coil's dipole, or 1 without a correction.
+    to the dipole of the broken coil, or 1 without a correction.
     """
     isolated: dict[str, float] = {}
     named: dict[str, float] = {}

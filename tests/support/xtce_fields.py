@@ -1,4 +1,4 @@
-"""Compares all packet fields as read by `space-packet-parser` with our XTCE, and by our own reader.
+"""Compares all packet fields that `space-packet-parser` reads by the XTCE file with those of our reader.
 
 `python -m tests.support.xtce_fields RUN...` prints the number of equal fields in the logs of the runs. The
 exit status is 1 if a field differs, a packet is not read, or a deliberately shifted field is not detected.
@@ -57,7 +57,7 @@ def compare(data: bytes, text: str) -> dict[str, int]:
 
 
 def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
-    """Return the values that our reader finds in a packet, by their XTCE names."""
+    """Return the values that our reader finds in a packet, by their names in the XTCE file."""
     sequence = int(layout.sequence_counts(raw)[0])
     values: dict[str, Any] = {
         "time_ns": int(row["time_ns"]),
@@ -79,7 +79,7 @@ def single_bits(field: Field, value: int) -> list[int]:
 
 
 def _alike(read: Any, wanted: Any) -> bool:
-    """Return whether both readers found the same value; named or scaled fields are compared as raw values."""
+    """Return whether both readers found the same value. Named or scaled fields are compared as raw values."""
     if read is None:
         return False
     value = read if isinstance(wanted, str) else read.raw_value

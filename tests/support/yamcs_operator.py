@@ -1,4 +1,4 @@
-"""Actions of an operator who uses Yamcs's own Python client (`yamcs-client`)."""
+"""Actions of an operator, by the Python client of Yamcs (`yamcs-client`)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ENDED = {"SUCCESSFUL", "FAILED", "CANCELLED"}
 
 
 class Operator:
-    """A connection to Yamcs with the actions of an operator."""
+    """A connection to Yamcs, with the actions of an operator."""
 
     def __init__(self, port: int, password: str) -> None:
         """Connect to Yamcs on a port of loopback."""
@@ -29,7 +29,7 @@ class Operator:
         self._files = self._client.get_file_transfer_client(INSTANCE).get_service(CFDP)
 
     def wait_for(self, parameter: str, wanted: str) -> None:
-        """Wait until a parameter has a value."""
+        """Wait until a parameter has a given value."""
         name = f"/{SPACE}/{parameter}"
 
         def value() -> object:
@@ -39,14 +39,14 @@ class Operator:
         _until(lambda: value() == wanted)
 
     def archived(self, packet: str, number: int) -> int:
-        """Wait for `number` packets of one kind until a timeout, and return how many the archive has."""
+        """Wait until the archive has `number` packets of a type, or until a timeout; return their number."""
         archive, counts = self._client.get_archive(INSTANCE), [0]
 
         def complete() -> bool:
             counts.append(len(list(archive.list_packets(name=f"/{SPACE}/{packet}"))))
             return counts[-1] == number
 
-        with contextlib.suppress(AssertionError):  # the caller compares the numbers
+        with contextlib.suppress(AssertionError):  # the caller checks the number
             _until(complete)
         return counts[-1]
 
@@ -78,7 +78,7 @@ class Operator:
         return alarm.severity, alarm.is_acknowledged, alarm.acknowledge_message
 
     def sent(self) -> list[str]:
-        """Return the names of the sent commands, the oldest first."""
+        """Return the names of the sent commands, oldest first."""
         history = self._client.get_archive(INSTANCE).list_command_history()
         return [entry.name.rpartition("/")[2] for entry in history]
 
@@ -104,7 +104,7 @@ class Operator:
         assert transfer.is_success(), transfer.error
 
     def passes(self) -> list[tuple[datetime, float]]:
-        """Return start and duration (s) of the passes on the timeline."""
+        """Return the start and duration (s) of each pass on the timeline."""
         items = self._client.get_timeline_client(INSTANCE).list_items()
         found = [(item.start, item.duration.total_seconds()) for item in items if PASS in item.tags]
         return sorted(found)

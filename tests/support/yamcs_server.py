@@ -1,4 +1,4 @@
-"""A Yamcs process and its HTTP interface, both on loopback only."""
+"""A Yamcs process and its HTTP interface, both only on loopback."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _TROUBLE = ("WARNING", "SEVERE", "Exception")
 
 
 def troubles(log: str) -> list[str]:
-    """Return the lines of a log that are warnings or worse."""
+    """Return the lines of a log that are warnings or errors."""
     return [line for line in log.splitlines() if any(word in line for word in _TROUBLE)]
 
 
 @contextmanager
 def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
-    """Start Yamcs with a configuration, yield it when it responds, and end it after the block.
+    """Start Yamcs with a configuration, yield the server when it responds, and end it after the block.
 
-    Its log is `folder/log`.
+    The log of the server is `folder/log`.
     """
     log = folder / "log"
     compile_link(folder)
@@ -64,7 +64,7 @@ def credentials(folder: Path) -> str:
 
 @dataclass(frozen=True)
 class Yamcs:
-    """A running Yamcs."""
+    """A running Yamcs server."""
 
     url: str
     process: subprocess.Popen[bytes]
@@ -72,7 +72,7 @@ class Yamcs:
     credentials: str
 
     def wait(self) -> None:
-        """Wait until the instance runs. Raises RuntimeError with the end of its log if it does not."""
+        """Wait until the instance runs. Raises RuntimeError with the end of the log if it does not start."""
         until = time.monotonic() + _START_S
         while time.monotonic() < until and self.process.poll() is None:
             try:
@@ -107,7 +107,7 @@ class Yamcs:
         return str(self.ask(path, {"args": texts})["id"])
 
     def history(self, command: str) -> dict[str, Any]:
-        """Return a command's entries in the command history, by attribute."""
+        """Return the entries of a command in the command history, by attribute."""
         entry = self.ask(f"/archive/{INSTANCE}/commands/{quote(command)}")
         found = {}
         for attribute in entry.get("attr", entry.get("attributes", [])):

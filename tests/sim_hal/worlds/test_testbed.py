@@ -1,4 +1,4 @@
-"""Tests that the simulated testbed obeys its equation of motion and has a Helmholtz field."""
+"""Tests that the simulated testbed obeys its equation of motion, and has the field of a Helmholtz pair."""
 
 from __future__ import annotations
 
@@ -68,7 +68,10 @@ def test_damping_takes_the_rate_down_exponentially() -> None:
 
 
 def test_one_coil_under_constant_current_keeps_the_energy_of_a_dipole_in_a_field() -> None:
-    """J w^2/2 - n A B I sin(theta) is constant, since the torque is n A B I cos(theta) (5.4)."""
+    """Under a constant current, the energy J w^2/2 - n A B I sin(theta) is constant.
+
+    The torque is n A B I cos(theta) (5.4).
+    """
     world = bed(np.array([0.1, 0.0, 0.0]))
     world.advance_to(9 * SECOND)
     torque_constant = 80 * 0.0081 * 4.5e-4
@@ -79,7 +82,10 @@ def test_one_coil_under_constant_current_keeps_the_energy_of_a_dipole_in_a_field
 
 @pytest.mark.parametrize("angle", [-0.7, 0.0, 0.4])
 def test_the_torque_is_the_cross_product_of_dipole_and_field(angle: float) -> None:
-    """The motion from rest over a second is compared with m x B from the attitude matrix."""
+    """The torque is the cross product of dipole and field.
+
+    The motion from rest over one second is compared with m x B, by the attitude matrix.
+    """
     current = np.array([0.07, 0.05, -0.03])
     world = bed(current, angle=angle)
     field_body = attitude_matrix(about_axis_y(angle)) @ np.array([0.0, 0.0, -4.5e-4])
@@ -115,7 +121,8 @@ RADIUS, CURRENT, MEASURED = 0.15, 2.19, 9.98e-4
 """Radius (m), current (A) and field (T) by the thesis: "approximately 15 cm", "9.98 gauss ... at a current
 of 2.19 A"."""
 TURNS = 76
-"""Number of turns of each coil, which the thesis does not state, from eq. 5.34 and the measurement."""
+"""Number of turns of each coil, from eq. 5.34 and the measured field. The thesis does not state the number.
+"""
 
 
 def test_the_measured_field_is_that_of_76_turns() -> None:
@@ -125,7 +132,10 @@ def test_the_measured_field_is_that_of_76_turns() -> None:
 
 
 def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
-    """The thesis states 4.5 gauss, "approximately 9 times Earth's ambient magnetic field strength"."""
+    """The field of the thesis takes 0.99 A in the coils of the testbed.
+
+    The thesis states 4.5 gauss, "approximately 9 times Earth's ambient magnetic field strength".
+    """
     flown = as_testbed(reader.load(config_path("step_simulation"))).plant.field
     current = CURRENT * flown / MEASURED
     assert current == pytest.approx(0.99, abs=0.005)
@@ -134,7 +144,7 @@ def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
 
 
 def test_it_is_biot_and_savart_summed_over_the_two_coils() -> None:
-    """The field of two loops at z = R / 2 is the sum of mu0 I R^2 / (2 (R^2 + z^2)^1.5) for each loop."""
-    mu, radius = 1.25663706127e-6, 0.3  # CODATA 2022
+    """The field is the sum of mu0 I R^2 / (2 (R^2 + z^2)^1.5) for two loops at z = R / 2."""
+    mu, radius = 1.25663706127e-6, 0.3  # value of CODATA 2022
     loop = mu * radius**2 / (2.0 * (radius**2 + (radius / 2.0) ** 2) ** 1.5)
     assert helmholtz_field(10, 2.0, radius) == pytest.approx(2 * 10 * 2.0 * loop, rel=1e-8)
