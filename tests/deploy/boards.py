@@ -65,7 +65,7 @@ class FakeBoard:
     def python(self, label: str) -> Path:
         """Return a script that acts as a Python interpreter.
 
-        Its virtual environments contain the release `label`.
+        The virtual environments of this interpreter contain the release `label`.
         """
         home = self.root.parent / f"python-{label}"
         path = home / "bin/python"

@@ -72,8 +72,8 @@ def _why_no_cgroup() -> str:
 def needs_mount(place: Path) -> bool:
     """Return whether a folder of this machine must be mounted separately to be visible in the container.
 
-    The root of the container is an overlay of `/`. It does not contain folders of other file systems, and the
-    container's own mounts hide the folders `_HIDDEN`.
+    The root of the container is an overlay of `/`. This overlay does not contain folders of other file
+    systems, and mounts of the container hide the folders `_HIDDEN`.
     """
     real = place.resolve()
     covered = any(real.is_relative_to(hidden) for hidden in _HIDDEN)
@@ -140,7 +140,7 @@ def main(folder: Path, scenario: str) -> None:
         )
     finally:
         _leave_cgroup(home)
-    (root / _UNITS / "knightcube-devices.service").unlink()  # this unit belongs to the test
+    (root / _UNITS / "knightcube-devices.service").unlink()  # this unit belongs to the test alone
     _do("chroot", str(root), str(ROOT / "deploy/install.sh"), "--uninstall", "--purge")
     kept = subprocess.run(
         [
@@ -169,11 +169,11 @@ def _overlay() -> Path:
             folder.mkdir()
         layers = f"lowerdir={place},upperdir={upper},workdir={work}"
         _do("mount", "-t", "overlay", "overlay", "-o", layers, str(shown))
-        # The installer needs this mount. At the boot, the container's own mounts hide it, and nspawn mounts
-        # the folder again.
+        # The installer needs this mount of the folder. At the boot, mounts of the container hide the folder,
+        # and nspawn mounts it again.
         Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
         _do("mount", "--bind", str(shown), f"/mnt/root{place}")
-    # nspawn stores its files here; they are removed with the mount.
+    # nspawn stores files in this folder. They are removed together with the mount.
     _do("mount", "-t", "tmpfs", "tmpfs", "/run/systemd")
     return Path("/mnt/root")
 

@@ -96,10 +96,10 @@ def _served(site: Path) -> Iterator[str]:
 
 
 def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> list[str]:
-    """Return a text for each search whose first result is not the expected page. This check needs Chromium.
+    """Return a text for each search whose first result is not the expected page.
 
-    On a page that is opened as a file, all entries of `first_found` are searched. On a page from a server,
-    only the first three entries are searched.
+    The check of the search needs Chromium. On a page that is opened as a file, all entries of `first_found`
+    are searched. On a page from a server, only the first three entries are searched.
     """
     found: list[str] = []
     item = "li.md-search-result__item > a.md-search-result__link"
@@ -110,8 +110,8 @@ def wrong_searches(site: Path, first_found: Mapping[str, str] = FIRST_FOUND) -> 
             for words, right in list(first_found.items())[:most]:
                 page.goto(f"{address}/index.html")
                 page.click(".md-search__input")
-                # All words are entered at once. If they were typed, results of the first letters could remain
-                # on the page.
+                # All words are entered at once. If words were typed, results of the first letters could
+                # remain on the page.
                 page.fill(".md-search__input", words)
                 page.keyboard.press("End")  # the page reads the search words when a key is released
                 page.wait_for_selector(item)

@@ -58,7 +58,7 @@ def files_of(name: str) -> list[str]:
 def printed_by(script: str, *arguments: str) -> str:
     """Return the output of an example that changes no package.
 
-    It runs in this process, to avoid repeated imports.
+    The example runs in this process, to avoid repeated imports.
     """
     output = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output):

@@ -17,7 +17,7 @@ from tests.support.scenes import catalogue
 # Julian date (TT) of the great conjunction of Jupiter and Saturn, 2020 December 21, 18:20 UTC. The almanacs
 # give a separation of 6.1'.
 _CONJUNCTION = 2_459_205.264
-# The total eclipse of 2024 April 8 is greatest at 18:17 UTC. Its gamma is 0.3431 Earth radii.
+# The total eclipse of 2024 April 8 is greatest at 18:17 UTC, with a gamma of 0.3431 Earth radii.
 _ECLIPSE = 2_460_409.263
 
 

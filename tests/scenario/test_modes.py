@@ -264,7 +264,7 @@ def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
 
 
 def keeper_of(folder: Path) -> StateKeeper:
-    """Return a new state keeper, as a flight creates it at its start, that stores its states in `folder`."""
+    """Return a new state keeper with the folder `folder`, as a flight creates it at its start."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
     return StateKeeper(

@@ -48,9 +48,9 @@ def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_trac
     """After ten seconds without frames and IMU, the first frame is solved lost in space.
 
     The next frame is solved by tracking. The filter's model cannot predict the attitude of the camera. The
-    body has swung freely, and the full torque of the coil then rotates it back. The IMU resumes early enough
-    that the rate changes by less than half in the next exposure of one second. The motion fit does not permit
-    a larger change.
+    body has swung freely, and the full torque of the coil then rotates the body back. The IMU resumes early
+    enough that the rate changes by less than half in the next exposure of one second. The motion fit does not
+    permit a larger change.
     """
 
     def prepare(rigged: Rigged) -> None:

@@ -41,7 +41,8 @@ def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current
 def test_the_uncertainty_is_uniform_within_its_bound_and_drawn_at_each_command() -> None:
     """The current error is uniform within 3.5 mA, and is drawn at each command.
 
-    Its standard deviation is 3.5e-3/sqrt(3) A, which 2,000 random draws determine to within 8 % (5 sigma).
+    The standard deviation of the error is 3.5e-3/sqrt(3) A, which 2,000 random draws determine to within 8 %
+    (5 sigma).
     """
     rig = Rig(uncertainty=3.5e-3)
     rig.coils.start()

@@ -293,7 +293,8 @@ def test_the_sunlit_ground_is_found_at_the_limb_and_at_the_terminator() -> None:
 def test_aberration_moves_the_stars_towards_the_velocity() -> None:
     """Aberration displaces the stars towards the velocity.
 
-    It is 20.5 arcsec at 29.8 km/s normal to the line of sight, and zero along the line of sight.
+    The displacement is 20.5 arcsec at 29.8 km/s normal to the line of sight, and zero along the line of
+    sight.
     """
     attitude = quaternion.IDENTITY[None, :]
     moved = aberrated(attitude, np.array([29_800.0, 0.0, 0.0]))

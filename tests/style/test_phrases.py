@@ -36,7 +36,8 @@ REFUSED = {
 
 ANY = re.compile("|".join(REFUSED))
 BEGINS = re.compile("|".join(pattern.removeprefix("(?<!there )").removeprefix(r"\b") for pattern in REFUSED))
-"""`REFUSED` without the conditions on preceding text. It matches more often, and is six times faster."""
+"""`REFUSED` without the conditions on preceding text. A search for this pattern finds more, and is six times
+faster."""
 GAPS = str.maketrans('#"_', "   ")
 
 TEXT_TOKENS = (tokenize.STRING, tokenize.COMMENT, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING))

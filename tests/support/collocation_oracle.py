@@ -1,9 +1,9 @@
 """Independent optimum of a single-axis slew by direct collocation and an interior-point solver.
 
-The method is independent of the planner. Its states are theta and omega, and the planner's state is q2. The
-method discretises by the trapezoidal rule on some hundreds of intervals, and the planner by a polynomial. The
-method solves the banded optimality system by a primal-dual interior-point method, and the planner uses SLSQP.
-The discretisation error is of second order in the step.
+The method is independent of the planner. The states of the method are theta and omega, and the planner's
+state is q2. The method discretises by the trapezoidal rule on some hundreds of intervals, and the planner by
+a polynomial. The method solves the banded optimality system by a primal-dual interior-point method, and the
+planner uses SLSQP. The discretisation error is of second order in the step.
 """
 
 from __future__ import annotations

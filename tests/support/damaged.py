@@ -89,7 +89,7 @@ def offer(
 
 
 def assert_one_line(error: Exception) -> None:
-    """Assert that a refusal is one line of text."""
+    """Assert that the message of a refusal is one line."""
     assert str(error)
     assert "\n" not in str(error).strip()
 

@@ -2,7 +2,8 @@
 
 The boresight is the camera's +z axis, and the field is a cone around it. With half the field of view as half
 angle (the thesis's choice), a corner of the frame may still contain the Sun or the limb. With half the
-diagonal as half angle, no corner may contain them. Vectors are in ICRS, geocentric positions in m.
+diagonal as half angle, no corner may contain the Sun or the limb. Vectors are in ICRS, geocentric positions
+in m.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalle
 from tests.support.process_watch import MIB, Look
 
 PERIOD_NS = 25_000_000
-"""Period (ns) of the control group, which runs at 40 Hz. Mission time zero is a multiple of it
+"""Period (ns) of the control group, which runs at 40 Hz. Mission time zero is a multiple of this period
 (`flight.app.flight`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
@@ -66,7 +66,7 @@ class Watched:
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """Results of one flight, and the lateness of its cycles and of a bare loop that ran at the same time."""
+    """Results of one flight, and the lateness of its cycles and of a loop without work at the same time."""
 
     figures: Figures
     flight: Grid
@@ -179,7 +179,8 @@ def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
 def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
     """Return the slope per hour and its 95 % interval, or NaN if the samples cover too short a time.
 
-    The memory fluctuates by tenths of a MiB. Over one minute, this alone causes a slope of tens of MiB/h.
+    The memory fluctuates by tenths of a MiB. Over one minute, this fluctuation alone causes a slope of tens
+    of MiB/h.
     """
     if not seconds or seconds[-1] - seconds[0] < SLOPE_SPAN:
         return np.nan, np.nan, np.nan

@@ -44,7 +44,7 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 
 
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
-    """Return the slots that the bare loop lost, and the slots before and after them.
+    """Return the slots that the comparison loop without work lost, and the neighbours of these slots.
 
     A stall of the machine may begin and end in different slots of the two loops, because one loop may be
     working while the other sleeps.

@@ -47,7 +47,10 @@ def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSet
 
 
 def random_air(generator: np.random.Generator) -> Atmosphere:
-    """Return an atmosphere that differs from the standard. Its limb is some 2 km lower or higher."""
+    """Return an atmosphere that differs from the standard.
+
+    The limb of this atmosphere is some 2 km lower or higher.
+    """
     standard = Atmosphere()
     return replace(
         standard,

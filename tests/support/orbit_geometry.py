@@ -1,8 +1,8 @@
 """Attitudes relative to the local vertical, and visibility of limb and Sun to cameras in orbit.
 
 The Earth is a sphere with the equatorial radius. The orbit of the paper is that of a Shuttle deployment at
-380 km (Meller et al., sections 1 and 4.1). Its inclination is assumed to be 51.6 deg, as of Shuttle flights
-to the Station.
+380 km (Meller et al., sections 1 and 4.1). The inclination of the orbit is assumed to be 51.6 deg, as of
+Shuttle flights to the Station.
 """
 
 from __future__ import annotations

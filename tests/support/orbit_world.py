@@ -3,9 +3,9 @@
 The simulation covers one revolution that ends with an eclipse, with a random date and node. The body follows
 the local vertical, with two side cameras on the Sun's side of the orbit. Random-walk torques disturb the
 attitude (3 deg rms), and a control law corrects it. The filter knows neither of the two. The sensors have the
-noise of the suite. They are gyros with a random walk of the bias, a magnetometer with hard iron, and cameras
-that give Sun and nadir if these are in their field of view. The true field is IGRF-14 with a ring current and
-an ionosphere (first-order Gauss-Markov); the filter uses WMM2025.
+noise of the suite. The sensors are gyros with a random walk of the bias, a magnetometer with hard iron, and
+cameras that give the directions of Sun and nadir if these are in the field of view. The true field is IGRF-14
+with a ring current and an ionosphere (first-order Gauss-Markov); the filter uses WMM2025.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SWAY = np.radians(3.0)
 PUSH_WALK = SWAY * np.sqrt(16.0 * AGILITY**5 / 3.0)
 """Random walk of the angular acceleration (rad/s^2 per sqrt(s)).
 
-It causes a deviation of SWAY in a control loop with three equal poles.
+This random walk causes a deviation of SWAY in a control loop with three equal poles.
 """
 RING_CURRENT, IONOSPHERE, IONOSPHERE_TIME = 20e-9, 20e-9, 400.0
 """Standard deviations of ring current and ionosphere (T), and time constant of the ionosphere (s)."""
@@ -84,7 +84,7 @@ class World:
 def world(suite: SensorSuite, rng: np.random.Generator, seconds: float | None = None) -> World:
     """Return a random world.
 
-    If `seconds` is given, it covers only an interval of this length around sunset.
+    If `seconds` is given, the world covers only an interval of this length around sunset.
     """
     pass_ = _revolution_to_eclipse(rng, seconds)
     frame = local_frame(pass_.positions, pass_.velocities)

@@ -25,7 +25,8 @@ class WideCamera(Section, frozen=True, kw_only=True):
     """A camera for horizon and Sun.
 
     `mounting` rotates body axes to camera axes (boresight z, columns x, rows y). `field_of_view_deg` is the
-    angle across the columns. As pixels are square, it also determines the angle across the rows.
+    angle across the columns. As pixels are square, `field_of_view_deg` also determines the angle across the
+    rows.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=32)]

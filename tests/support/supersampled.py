@@ -1,9 +1,9 @@
 """Independent renderer of frames of streaks, for any point spread, lens and motion.
 
 The estimator's model and `sim_hal.star_camera` use one Gaussian point spread and analytic streaks. This
-renderer uses neither of these two approximations. The renderer adds points along each star's path to a grid
-of three by three cells per pixel, convolves the grid with a sampled point spread, and sums the cells of each
-pixel.
+renderer uses neither a Gaussian point spread nor analytic streaks. The renderer adds points along each star's
+path to a grid of three by three cells per pixel, convolves the grid with a sampled point spread, and sums the
+cells of each pixel.
 """
 
 from __future__ import annotations
@@ -159,8 +159,8 @@ def light(
         if delay:
             late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
             # The first and the last point of a path are weighted by the fraction of their interval within the
-            # exposure. Otherwise all stars of some rows would be displaced by part of the distance between
-            # points.
+            # exposure. Without these weights, all stars of some rows would be displaced by part of the
+            # distance between points.
             weight *= np.clip((0.5 - np.abs(late)) * count / (2.0 * room) + 0.5, 0.0, 1.0)
         if optics.scintillation:
             knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)

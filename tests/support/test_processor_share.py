@@ -1,7 +1,7 @@
 """Tests of the control groups that limit processor and memory, with recorded files of cgroup v1 and v2.
 
 The v2 files are from a user-mode Linux 6.1 (`tests/studies/bench/user_mode_linux.sh`), and the v1 files from
-Linux 6.18. They were recorded after a process with a limit of 30 % and 64 MiB had requested 100 MB.
+Linux 6.18. The files were recorded after a process with a limit of 30 % and 64 MiB had requested 100 MB.
 """
 
 from __future__ import annotations

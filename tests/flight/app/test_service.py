@@ -1,4 +1,4 @@
-"""Tests that a wrong configuration ends the start on a board, while other faults are waited out."""
+"""Tests that a wrong configuration ends the start on a board, and that other faults only delay the start."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_it_waits_twice_as_long_each_time_up_to_half_a_minute() -> None:
 
 
 class Attempts:
-    """Attempts to start, which fail one after another.
+    """Attempts to start a flight. Each attempt fails.
 
     The test double checks that the objects of an attempt are closed before the next attempt.
     """

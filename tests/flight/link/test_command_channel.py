@@ -136,7 +136,7 @@ def test_an_answer_of_a_mode_that_there_is_not_is_none(
 
 
 BEGINS = IDENTIFIERS[0].to_bytes(2, "big")
-"""First two bytes of a command. The kernel drops all datagrams without them."""
+"""First two bytes of a command. The kernel drops all datagrams that do not begin with these bytes."""
 
 
 def flood(to: Path, count: int, data: bytes) -> None:

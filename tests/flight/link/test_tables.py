@@ -89,7 +89,7 @@ def test_every_directive_has_its_published_packet() -> None:
 def test_a_command_begins_with_version_0_type_1_and_its_apid() -> None:
     """A telecommand begins with version 000, type 1, secondary header flag 1 and its APID.
 
-    This is the primary header of CCSDS 133.0-B-2, 4.1.3.
+    CCSDS 133.0-B-2, 4.1.3, defines this primary header.
     """
     for layouts in (commands.LAYOUTS, directives.LAYOUTS):
         for layout in layouts.values():

@@ -15,7 +15,7 @@ Names = dict[Path, int]
 
 
 class PowerLostError(BaseException):
-    """Simulated power loss. It is not an OSError, so that the tested code cannot catch it."""
+    """Simulated power loss. PowerLostError is not an OSError, so that the tested code cannot catch it."""
 
 
 @dataclass

@@ -1,6 +1,6 @@
 """Jobs for worker processes.
 
-They have a module of their own, because a worker imports only the job's module.
+The jobs have a separate module, because a worker imports only the module of its job.
 """
 
 from __future__ import annotations

@@ -33,11 +33,12 @@ STALE = 12
 
 
 def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list[float], int]:
-    """Drive coil x by a loop that stalls repeatedly. The gyro samples of a stall arrive together after it.
+    """Drive coil x by a loop that stalls repeatedly.
 
-    During a stall the driver zeroes the coils and reports the time, or a guardian zeroes them without a
-    report. With `informed`, the loop knows that the currents of that time are unknown. Returns the trusted
-    gains of coil x, and the number of times that an axis was found reversed.
+    The gyro samples of a stall arrive together at the end of the stall. During a stall the driver zeroes the
+    coils and reports the time, or a guardian zeroes them without a report. With `informed`, the loop knows
+    that the currents of that time are unknown. Returns the trusted gains of coil x, and the number of times
+    that an axis was found reversed.
     """
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
     response, noise = CoilResponse(settings), np.random.default_rng(3)
@@ -264,7 +265,7 @@ def test_a_coil_reversed_in_a_tumble_is_used_with_its_sign_changed_and_reviewed_
     assert watch.available.all()
     assert not watch.resting.any()
     assert watch.suspicion == ""
-    watch.tumble_rate = 10.0  # the monitor takes any rate for a slow one
+    watch.tumble_rate = 10.0  # the monitor regards any rate as slow
     body.fly(40.0)
     assert watch.correction.factors.tolist() == signs.tolist()
     assert watch.correction.unreviewed == frozenset()
@@ -502,7 +503,7 @@ def _point_in_dense_air(
 ) -> tuple[dict[Finding, int], FloatArray]:
     """Simulate coils with the given `gains`, which hold an attitude for 150 s against a varying torque.
 
-    Returns, for each finding, how many fits had it on how many axes, and the errors of the gains in standard
+    Returns how many fits had each finding on how many axes, and the errors of the gains in standard
     deviations.
     """
     settings = ResponseSettings(

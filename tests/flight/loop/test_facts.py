@@ -1,7 +1,7 @@
 """Tests of facts, which are monitored conditions such as a silent sensor.
 
-A fact becomes true after N consecutive updates, and is reported once. It is reset in modes in which it is not
-monitored. Some facts latch.
+A fact becomes true after N consecutive updates, and is reported once. A fact is reset in modes in which it is
+not monitored. Some facts latch.
 
 Age, rate and validity of a stream are checked separately. A stale stream is never good.
 """

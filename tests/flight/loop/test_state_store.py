@@ -90,7 +90,7 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
 def test_the_model_of_power_loss_finds_a_write_that_forgets_to_sync(forgotten: str) -> None:
     """Without one of the two syncs, the model of the disk can lose the new state.
 
-    This shows that the tests of power loss can fail.
+    This result shows that the tests of power loss can fail.
     """
     disk = Disk(forget=forgotten)
     _stored(disk, Reports()).store(state_of(3))
@@ -298,7 +298,7 @@ print(midway)
 
 
 def test_two_hundred_kills_at_random_moments_leave_the_old_state_or_the_new(tmp_path: Path) -> None:
-    """After each of 200 SIGKILLs during a write, the stored state is the last one or the one in progress."""
+    """After each of 200 SIGKILLs during a write, the stored state is the last state or the new state."""
     seed = 20260115
     done = subprocess.run(
         [sys.executable, "-c", WRITER, str(tmp_path), "200", str(seed)],

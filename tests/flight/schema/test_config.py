@@ -58,7 +58,7 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
 def test_the_simulation_case_is_the_thesis_s() -> None:
     """step_simulation.yaml is the case of chapter 5 of the thesis, without a thread and a camera.
 
-    Its control, plant and devices are those of step_thesis.yaml.
+    Control, plant and devices in step_simulation.yaml are those of step_thesis.yaml.
     """
     loop, case = (
         as_testbed(reader.load(FOLDER / name)) for name in ("step_thesis.yaml", "step_simulation.yaml")
@@ -411,7 +411,7 @@ def test_the_error_of_the_residual_dipole_follows_from_the_mass_unless_it_is_giv
     config = as_orbit(reader.parse(ORBIT))
     craft = reader.replace(config.craft, mass=2.0)
     assert reader.replace(config, craft=craft).dipole_errors() == pytest.approx((7e-3, 2.1e-3))
-    # These are the moments of inertia of a box of 3 kg with edges of 0.1, 0.2 and 0.3 m.
+    # The values are the moments of inertia of a box of 3 kg with edges of 0.1, 0.2 and 0.3 m.
     inertia = tuple((0.25 * np.array([0.13, 0.10, 0.05])).tolist())
     box = reader.replace(config.craft, mass=None, size=(0.1, 0.2, 0.3), inertia=inertia)
     assert reader.replace(config, craft=box).dipole_errors()[0] == pytest.approx(1.05e-2, rel=0.05)

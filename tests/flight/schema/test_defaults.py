@@ -79,7 +79,8 @@ OTHERS = {
 
 def _modules(package: ModuleType) -> Iterator[ModuleType]:
     for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        # Basilisk is an optional dependency. Its simulated world reads its values from the configuration.
+        # Basilisk is an optional dependency. The simulated world of Basilisk reads its values from the
+        # configuration.
         if not found.name.endswith("__main__") and ".basilisk" not in found.name:
             yield importlib.import_module(found.name)
 

@@ -81,8 +81,8 @@ LEVEL = limb_scene(
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
     """Return a folder with three images, and their nadir directions by name.
 
-    A horizontal camera took the images `first` and `later` at two times. A camera that points to the right of
-    it took the image `right`.
+    A horizontal camera took the images `first` and `later` at two times. A camera that points farther to the
+    right took the image `right`.
     """
     folder = tmp_path_factory.mktemp("paper")
     model = EarthCameraModel.fuga15d(seed=1)

@@ -185,7 +185,10 @@ def test_the_learned_sensors_are_combined_with_the_configured_ones(tmp_path: Pat
 
 
 def test_the_fragment_has_the_learned_lens_with_its_accuracy(flown: tuple[Path, dict[str, Any]]) -> None:
-    """The fragment contains the estimated lens. Its accuracies are those of the packet `lens`, rounded up."""
+    """The fragment contains the estimated lens.
+
+    The accuracies of the lens are those of the packet `lens`, rounded up.
+    """
     place, _ = flown
     config = as_orbit(load(place / "first" / "config.yaml"))
     found = learned_description(read_run(place / "first"), config)

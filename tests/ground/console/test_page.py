@@ -157,7 +157,7 @@ def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder
 def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:
     """A page on another port can neither embed the console nor read its data, even in an authorised browser.
 
-    Both pages have the same host, so the browser sends its cookies.
+    The console and the other page have the same host, so the browser sends the cookies of the console.
     """
     with serving(folder) as url, another_origin() as foreign, browsing() as chromium:
         context = chromium.new_context()

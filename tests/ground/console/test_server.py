@@ -53,7 +53,7 @@ def get(folder: Path, path: str, headers: dict[str, str] | None = None) -> tuple
 
 
 def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) -> None:
-    """All files that the page names are served. Together they have at most 250 kB."""
+    """All files that the page names are served. The files have at most 250 kB in total."""
     page = Path(__file__).parents[3] / "ground/console/page"
     names = [path.relative_to(page) for path in page.rglob("*") if path.is_file()]
     assert sum((page / name).stat().st_size for name in names) <= 250_000

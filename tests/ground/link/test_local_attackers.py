@@ -1,6 +1,6 @@
 """Tests that gateway and console refuse web pages and other users of the same machine.
 
-Both programs run as commands on one link. The test receives the frames of the link by a socket, and
+Gateway and console run as commands on one link. The test receives the frames of the link by a socket, and
 authenticates them with the satellite's keys. The tests in Chromium need the Debian package `chromium` and the
 Python extra `playwright`.
 """

@@ -30,7 +30,7 @@ STREAK_ERROR = 2e-4  # error of each streak rate about the thread, rad/s, altern
 
 @dataclass(frozen=True)
 class Recipe:
-    """Parameters of a run. It lasts `duration` of `planned` s, and has a new target every `hold` s.
+    """Parameters of a run. The run lasts `duration` of `planned` s, and has a new target every `hold` s.
 
     `bus_power` (W) is measured each second by a monitor in the coils' supply; None without a monitor.
     """

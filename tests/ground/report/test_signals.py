@@ -161,7 +161,7 @@ def test_star_attitudes_are_compared_with_the_truth_at_the_middle_of_the_exposur
 
 
 def test_the_true_misalignment_of_the_camera_is_not_an_error_of_its_frames() -> None:
-    """The rate of a frame is compared in camera axes, so the camera's misalignment is not an error of it."""
+    """The rate of a frame is compared in camera axes, so the misalignment of the camera causes no error."""
     tilt, body = np.array([2e-3, -1e-3, 3e-3]), from_rotation_vector(np.array([0.2, -0.7, 0.4]))
     camera, rate = from_rotation_vector(tilt), np.array([0.1, 0.2, -0.05])
     truth = [(float(t), {"quaternion": body.tolist(), "rate": rate.tolist()}) for t in range(4)]

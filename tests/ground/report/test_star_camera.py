@@ -52,7 +52,8 @@ def config() -> OrbitConfig:
 def flight(gave: list[float]) -> Run:
     """Return a run with frames at the times `gave`, which alternately have a rate and an attitude.
 
-    The camera points to the zenith, with the Sun behind the Earth. During `HIDDEN` it points to the limb.
+    The camera points to the zenith, with the Sun behind the Earth. During `HIDDEN` the camera points to the
+    limb.
     """
     seconds = [float(at) for at in range(END + 1)]
     limb = math.pi - math.asin(EARTH_RADIUS / 7e6) - 0.1

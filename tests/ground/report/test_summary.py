@@ -163,7 +163,10 @@ def test_frames_without_rate_and_attitude_are_listed_with_the_reason(full: Run, 
 
 
 def test_a_step_never_settled_is_a_miss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that has not settled after 40 s is a miss. This response is too slow to reach 90 % in 40 s."""
+    """A step that has not settled after 40 s is a miss.
+
+    The tested response is too slow to reach 90 % of the step in 40 s.
+    """
     monkeypatch.setattr("tests.ground.report.synthetic.FREQUENCY", 0.02)
     summary = summarise(short(tmp_path, duration=80.0, planned=80.0, hold=40.0))
     assert summary["steps"][1]["settling_s"] is None

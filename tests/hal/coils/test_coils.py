@@ -370,7 +370,8 @@ def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig
 def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
     """With a leg stuck low, the brake would drive the coil.
 
-    So the current is checked after a brake, and the brake is released if the current remains.
+    Therefore the current is checked after the bridge was braked, and the brake is released if the current
+    remains.
     """
     rig = stuck(CoilCondition.A_LOW)
     assert rig.currents() == [0.0, 0.0, 0.0]

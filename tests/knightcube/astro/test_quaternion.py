@@ -100,7 +100,10 @@ def test_matrix_round_trip(q: FloatArray) -> None:
 
 @pytest.mark.parametrize("axis", np.eye(3))
 def test_matrix_of_a_half_turn_has_no_singularity(axis: FloatArray) -> None:
-    """At a rotation by pi the scalar part is 0. The conversion from a matrix must not divide by it."""
+    """At a rotation by pi the scalar part is 0.
+
+    The conversion from a matrix must not divide by the scalar part.
+    """
     q = np.append(axis, 0.0)
     assert _close(np.abs(quaternion.from_matrix(quaternion.attitude_matrix(q))), np.abs(q))
 
@@ -153,7 +156,7 @@ def test_a_fixed_star_moves_with_minus_omega_cross_v(
 ) -> None:
     """The direction of a fixed star changes by -omega x v.
 
-    This derivative determines the sign of the rate.
+    The derivative of the direction determines the sign of the rate.
     """
     h = 1e-6
     ahead = quaternion.normalise(q + h * quaternion.derivative(q, rate))
@@ -171,7 +174,7 @@ def test_angle_between_is_the_angle_turned(q: FloatArray, axis: FloatArray, angl
 
 @given(st.floats(1e-12, 1e-6))
 def test_angle_between_is_accurate_near_zero(angle: float) -> None:
-    """Angles below 1e-8 are accurate. The arc cosine of a dot product would not resolve them."""
+    """Angles below 1e-8 are accurate. The arc cosine of a dot product would not resolve such angles."""
     q = quaternion.about_axis_y(angle)
     assert quaternion.angle_between(q, quaternion.IDENTITY) == pytest.approx(angle, rel=1e-9)
 

@@ -56,7 +56,7 @@ def test_the_streaks_of_every_detector_are_identified_and_both_ends_give_the_rat
 ) -> None:
     """With each detector, the attitude is correct to a third of a pixel (15"), and the rate to 2 %.
 
-    These are the accuracies of the thesis.
+    The thesis states the same accuracies.
     """
     frame = _frame(0)
     solution, found = _solve(_streaks(frame, detector))
@@ -165,7 +165,7 @@ def test_the_sign_is_that_of_a_star_fixed_in_the_sky() -> None:
 def test_the_equations_as_printed_hold_with_the_sign_corrected() -> None:
     """Equations 3.24-3.26 hold with the corrected sign.
 
-    They use the matrix Delta from start to end, its trace and its skew-symmetric part.
+    The equations use the matrix Delta from start to end, its trace and its skew-symmetric part.
     """
     rate = rate_at(np.deg2rad(50.0), 0.1, 0.3)
     stars = _field(3)

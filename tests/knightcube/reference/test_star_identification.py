@@ -159,9 +159,9 @@ def test_points_strewn_at_random_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_mirrored_sky_is_refused(name: str) -> None:
-    """A mirrored sky is refused.
+    """A mirrored sky is refused, although it has the same angles, areas and moments.
 
-    It has the same angles, areas and moments, and only its orientation differs.
+    Only the orientation of the patterns differs.
     """
     drawn = _drawn(_kind(), 4)[0]
     field = drawn.field()

@@ -111,7 +111,7 @@ def test_a_limb_that_does_not_move_teaches_nothing() -> None:
 def test_a_mask_that_becomes_wrong_is_discarded_at_once() -> None:
     """A mask that has become wrong is discarded with the first frame that contradicts it.
 
-    The structure was folded away, and this frame is searched without a mask.
+    The structure was folded away, and the first frame without the structure is searched without a mask.
     """
     known = learned(BOOM)
     gone = known.after(frame(64.0))

@@ -237,7 +237,8 @@ def test_the_camera_of_the_streak_fit_images_like_the_learned_lens(k1: float, k2
 def test_the_accuracy_of_the_lens_contains_the_scatter_of_the_corner() -> None:
     """The stated accuracy of the distortion equals the scatter of an image corner for random lenses.
 
-    This accuracy is the relative error of the distance of an image corner from the optical axis.
+    The accuracy of the distortion is the relative error of the distance of an image corner from the optical
+    axis.
     """
     rng = np.random.default_rng(111)
     known: Any = learned(TrueCamera.drawn(rng), LensKnowledge.of(DESCRIBED, KNOWN, scale_error=0.02), rng, 5)

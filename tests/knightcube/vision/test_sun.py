@@ -1,6 +1,6 @@
 """Tests of the Sun direction from simulated frames of one or several cameras, with and without the Sun.
 
-Solar strings select the camera that is read. If no camera finds the Sun, they give the Sun direction.
+Solar strings select the camera that is read. If no camera finds the Sun, the strings give the Sun direction.
 """
 
 from __future__ import annotations

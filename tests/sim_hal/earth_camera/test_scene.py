@@ -177,7 +177,7 @@ def test_over_the_pole_the_limb_is_a_circle_whose_angle_is_that_of_the_meridian_
 def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> None:
     """Over the equator, the angle from nadir to the limb is asin(a/r) along the equator.
 
-    Towards the poles it is smaller, atan(b/sqrt(r^2 - a^2)).
+    Towards the poles the angle is smaller, atan(b/sqrt(r^2 - a^2)).
     """
     distance = SEMI_MAJOR_AXIS + 500e3
     scene = EarthScene(np.array([distance, 0.0, 0.0]), quaternion.IDENTITY, SUN)
@@ -278,7 +278,7 @@ def test_distortion_moves_the_limb_as_the_lens_says() -> None:
 def test_a_tilted_pole_carries_the_flattening_with_it() -> None:
     """If the pole is tilted, the flattening is tilted with it.
 
-    With the pole towards the camera, the limb is a circle. With the default pole, it is no circle.
+    With the pole towards the camera, the limb is a circle. With the default pole, the limb is not a circle.
     """
     position = np.array([SEMI_MAJOR_AXIS + 400e3, 0.0, 0.0])
     upright = EarthScene(position, quaternion.IDENTITY, SUN)

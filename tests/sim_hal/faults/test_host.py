@@ -150,7 +150,7 @@ def test_without_such_faults_everything_is_handed_through() -> None:
     assert faults.jobs(runner, specs, JobResult) is runner
     assert faults.workers(specs) == specs
     assert faults.clock() is clock
-    assert faults.opener(open) is open  # any other function would also be suitable
+    assert faults.opener(open) is open  # any other function would do
 
 
 def test_a_corrupted_configuration_is_refused_in_one_line_or_still_a_valid_one() -> None:

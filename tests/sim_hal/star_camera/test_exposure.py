@@ -403,8 +403,8 @@ def test_stars_far_down_streak_later() -> None:
 def test_a_streak_that_runs_down_after_the_shutter_is_longer_and_brighter_in_all() -> None:
     """A star that moves down with the shutter is exposed 1 / (1 - 0.08) times longer than a row.
 
-    Its streak is longer and brighter by this factor. The star moves at 400 px/s, and the readout takes 0.2 ms
-    per line.
+    The streak of the star is longer and brighter by the factor 1 / (1 - 0.08). The star moves at 400 px/s,
+    and the readout takes 0.2 ms per line.
     """
     star = at_pixels(ROLLING_MODEL, [60.0, 3.0])
     times, attitudes = turning([400.0 / ROLLING_FOCAL, 0.0, 0.0], 0.1 + READOUT)

@@ -336,8 +336,8 @@ def test_the_thesis_placement_shares_a_star_among_four_pixels() -> None:
 def test_the_thesis_placement_and_kernel_together() -> None:
     """The placement and the kernel of the thesis are combined, for a star at (30.5, 20).
 
-    Across, the weights are g1/2, (g1 + g0)/2, (g1 + g0)/2, g1/2. Down, they are g1, g0, g1. g0 = 0.4519, g1 =
-    0.2741.
+    Across, the weights are g1/2, (g1 + g0)/2, (g1 + g0)/2, g1/2. Down, the weights are g1, g0, g1, with g0 =
+    0.4519 and g1 = 0.2741.
     """
     model = StarCameraModel(columns=64, rows=48, field_of_view=0.07, psf="bilinear")
     image = expected_electrons(model, at_pixels(model, [30.5, 20.0]), [3.0], *still()) / model.electrons(

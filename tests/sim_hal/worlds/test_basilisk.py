@@ -1,4 +1,4 @@
-"""Tests of the Basilisk world against `free_body`. They are skipped if Basilisk is not installed."""
+"""Tests of the Basilisk world against `free_body`, which are skipped if Basilisk is not installed."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> 
 
 
 def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None:
-    """The disturbances of a 3U at 500 km have the sizes of the design.
+    """The disturbances of a 3U at 500 km agree with the values of the design.
 
     The gravity gradient is 4.9e-8 N m, a dipole of 1e-3 A m^2 gives 2 to 5e-8 N m, and drag along x 6e-9 N m.
     """

@@ -206,7 +206,7 @@ def test_a_sun_synchronous_orbit_follows_the_sun() -> None:
 def test_the_perigee_turns_at_the_secular_rate(inclination: float) -> None:
     """The perigee rotates at 3/4 J2 (R/p)^2 n (5 cos^2 i - 1).
 
-    This rate is zero at the critical inclination of 63.43 deg.
+    The rate of the perigee is zero at the critical inclination of 63.43 deg.
     """
     elements = KeplerianElements(
         semi_major_axis=26_000e3,
@@ -311,7 +311,7 @@ def test_the_sun_stands_where_it_was_published(
 def test_at_equinox_and_solstice_the_sun_is_a_quarter_further(julian_date: float, longitude: float) -> None:
     """At equinoxes and solstices, the Sun's longitude is a multiple of 90 deg.
 
-    These are longitudes of date. Longitudes of J2000 are smaller by the precession, 50.29" a year.
+    The longitudes are those of date. Longitudes of J2000 are smaller by the precession, 50.29" a year.
     """
     when = julian_date + 69.0 / DAY
     x, y, z = sun_position(when)

@@ -4,8 +4,8 @@
 hook that makes calls fail cannot be removed. The program prints one JSON object per start.
 
 Python raises an audit event before it opens a file or a socket. If `all` is given, each call fails with each
-error, and calls without an audit event fail too. These calls are replaced by test doubles in the modules that
-use them.
+error, and calls without an audit event fail too. Calls without an audit event are replaced by test doubles in
+the modules that use the calls.
 """
 
 from __future__ import annotations

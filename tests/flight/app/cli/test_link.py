@@ -117,8 +117,8 @@ def test_authentic_frames_with_any_counter_end_no_process(
 ) -> None:
     """No counter of an authentic frame ends the link.
 
-    A stored frame that ends the link would end it at each restart. The highest counters are sent first,
-    because the link reports only four refusals a second.
+    A frame that is stored and ends the link would end the link again after each restart. The highest counters
+    are sent first, because the link reports only four refusals a second.
     """
     assert command(lines, "udp", "ping") == 0  # this command uses counter 0
     vault = Vault(Path(lines["place"]) / "keys" / "ground")

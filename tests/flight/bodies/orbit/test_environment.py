@@ -127,12 +127,12 @@ def dragged(drag: str) -> TwoLineElements:
 
 
 def ahead(degrees: float) -> TwoLineElements:
-    """Return the elements of a satellite on the same orbit as FIRST and SECOND, ahead of it by an angle."""
+    """Return the elements of a satellite on the orbit of FIRST and SECOND, but ahead by an angle."""
     return TwoLineElements(FIRST, summed(f"{SECOND[:43]}{(64.3547 + degrees) % 360.0:8.4f}{SECOND[51:]}"))
 
 
 class Flight:
-    """The GPS receiver of a satellite that follows its true elements. It is read every ten seconds.
+    """The GPS receiver of a satellite that follows its true elements. The receiver is read every ten seconds.
 
     The readings start `days` days after the epoch of the elements.
     """

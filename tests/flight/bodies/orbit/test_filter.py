@@ -300,8 +300,8 @@ def _taught(stored: dict[int, tuple[float, float]]) -> SlowStates:
     return SlowStates(values, covariance)
 
 
-# Stored estimates of the inertia errors, relative to the trace. They differ from the truth by 10 or 15 % of a
-# principal moment.
+# Stored estimates of the inertia errors, relative to the trace. The estimates differ from the truth by 10 or
+# 15 % of a principal moment.
 WRONG_INERTIA = {INERTIA_ERROR.start: (0.052, 1e-4), INERTIA_ERROR.start + 1: (-0.034, 1e-4)}
 KNOWN_COILS = {index: (0.0, 5e-3) for index in range(COILS.start, COILS.stop)}
 
@@ -336,7 +336,7 @@ def test_the_motion_replaces_wrong_learned_values_after_a_minute_and_healthy_one
 
 
 def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:
-    """A failing vision worker may send attitudes with NaN. They must not stop the control task."""
+    """A failing vision worker may send attitudes with NaN. Such attitudes must not stop the control task."""
     flown = acquired()
     for _ in range(2 * REFUSALS_TO_RESTART):
         flown.fly(2.0)
@@ -592,7 +592,7 @@ def test_the_magnetometer_gives_the_rate_while_nothing_else_does() -> None:
 def test_another_magnetometer_begins_without_the_learned_bias(renewed: bool) -> None:
     """The filter discards the bias of a replaced magnetometer.
 
-    With the old bias it would refuse the new readings.
+    With the old bias, the filter would refuse the readings of the new magnetometer.
     """
     flown = Flown(pulses=True)
     flown.rate, flown.magnet = TUMBLE, np.array([6e-7, 0.0, -6e-7])

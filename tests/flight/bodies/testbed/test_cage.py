@@ -100,7 +100,7 @@ def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less
 ) -> None:
     """Two coils give the torque that was commanded of coil x, in any field direction and with less current.
 
-    This torque is available even if the field is along body x, where coil x alone gives no torque.
+    Two coils give a torque even if the field is along body x, where coil x alone gives no torque.
     """
     plant, dipole = plant_of(config), config.plant.coil_turns * config.plant.coil_area
     for angle in (-0.6, 0.0, 0.4):

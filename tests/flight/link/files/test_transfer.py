@@ -192,7 +192,7 @@ def test_what_is_wrong_with_a_file_ends_its_transfer(
 def test_bytes_beyond_the_end_that_came_before_the_metadata_are_left_out_of_the_file(tmp_path: Path) -> None:
     """File data beyond the stated size is a file size error, whichever of the two arrives first.
 
-    This is the rule of CCSDS 727.0-B-5, 4.6.1.2.
+    CCSDS 727.0-B-5, 4.6.1.2, states this rule.
     """
     pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
     end = pair.ends[SATELLITE]

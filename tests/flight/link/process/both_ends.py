@@ -169,7 +169,8 @@ class BothEnds:
     def turn(self, seconds: float = 0.5, answer: Callable[[bytes], bool] | None = None) -> None:
         """Advance the clock.
 
-        The flight executes received commands; if `answer` is given, it decides on execution.
+        The flight executes received commands; if `answer` is given, this function decides whether a command
+        is executed.
         """
         until = self.clock.now_ns() + round(seconds * 1e9)
         while self.clock.now_ns() < until:

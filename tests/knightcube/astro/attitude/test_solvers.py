@@ -257,8 +257,8 @@ def test_a_field_seen_backwards_has_no_attitude(name: str) -> None:
         with pytest.raises(AttitudeError):
             SOLVERS[name](-axes, axes, np.full(3, 1e-5))
     else:
-        # Some solvers fit a part of the data exactly. Their loss shows that the other data contradict the
-        # attitude.
+        # Some solvers fit a part of the data exactly. The loss of these solvers shows that the other data
+        # contradict the attitude.
         try:
             fix = SOLVERS[name](-axes, axes, np.full(3, 1e-5))
         except AttitudeError:

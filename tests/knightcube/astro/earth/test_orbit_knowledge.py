@@ -131,9 +131,9 @@ def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
 
 
 def test_a_decayed_orbit_is_reported() -> None:
-    """The decay of satellite 28872 of the verification set is reported.
+    """The decay of an orbit is reported. By SGP4, satellite 28872 decays within 50 minutes of its epoch.
 
-    By SGP4, it decays within 50 minutes.
+    The satellite is part of the verification set.
     """
     first = "1 28872U 05037B   05333.02012661  .25992681  00000-0  24476-3 0  1534"
     second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"

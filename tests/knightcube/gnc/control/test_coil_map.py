@@ -237,9 +237,9 @@ def test_two_coils_make_the_same_torque_unless_the_failed_axis_is_normal_to_the_
 
 @pytest.mark.parametrize(("sine", "kept"), [(0.14, False), (0.17, True)])
 def test_a_torque_that_would_take_all_the_current_is_discarded(sine: float, kept: bool) -> None:
-    """Without coil y, a torque along y is small if the field has this sine of its angle from the x-z plane.
+    """Without coil y, a torque that would take nearly all the current is discarded.
 
-    A torque that would take nearly all the current is discarded.
+    The sine is that of the angle between the field and the x-z plane.
     """
     field = 3e-5 * np.array([np.sqrt(1.0 - sine**2), sine, 0.0])
     weak = np.array([0.0, 0.0, 1e-8])
@@ -267,7 +267,7 @@ def test_a_torque_or_a_field_that_is_not_finite_is_refused(wrong: float) -> None
 def test_redundant_coils_make_a_torque_with_the_least_heat() -> None:
     """Two parallel coils share their dipole in inverse proportion to their resistances.
 
-    This minimises the heat of the coils.
+    This distribution minimises the heat of the coils.
     """
     dipoles = np.column_stack([0.6 * np.eye(3), [0.0, 0.0, 0.6]])
     ohms = np.array([20.0, 20.0, 20.0, 60.0])

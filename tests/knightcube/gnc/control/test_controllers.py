@@ -74,7 +74,7 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
 def test_the_thesis_tracker_overshoots_there() -> None:
     """The thesis's tracker overshoots a step of 0.7 rad, because it needs a planned path.
 
-    For a step, it begins to brake so late that the coil's torque cannot stop the body in time.
+    For a step, the tracker begins to brake so late that the coil's torque cannot stop the body in time.
     """
     rows = fly(LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
     assert rows[:, 1].max() > 0.7 * 1.3
@@ -103,7 +103,7 @@ def test_a_name_means_its_controller(name: str) -> None:
 def test_only_the_lq_tracker_feeds_the_estimated_disturbance_forward() -> None:
     """Only the LQ tracker compensates the estimated disturbance, by J / (n A B) = 3.6 A per rad/s^2.
 
-    This is the current per acceleration at theta = 0.
+    The factor is the current per acceleration at theta = 0.
     """
     rest = PathSample(0.0, 0.0, 0.0)
     for name in KINDS:

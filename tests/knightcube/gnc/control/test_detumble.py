@@ -33,7 +33,10 @@ OWN_FIELD = 1e-3
 
 
 class FreeBody:
-    """A simulated rigid body in a rotating field. Its magnetometer also measures the field of the coils."""
+    """A simulated rigid body in a rotating field.
+
+    The magnetometer of the body also measures the field of the coils.
+    """
 
     def __init__(
         self, rate: FloatArray, field: float, turn: FloatArray, inertia: FloatArray, seed: int
@@ -108,7 +111,7 @@ def test_an_uneven_body_loses_energy_monotonically_and_ends_below_the_limit() ->
 
 
 def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> None:
-    """A gain above the optimum couples the spin to the rotating field, and damps it less.
+    """A gain above the optimum couples the spin to the rotating field, and damps the spin less.
 
     The component along the field decays fastest at k = 2 Omega J (Avanzini and Giulietti 2012).
     """
@@ -198,7 +201,7 @@ def test_a_window_without_time_to_measure_is_refused() -> None:
 
 @pytest.mark.parametrize("length_ms", [20, 40, 100, 99, 300])
 def test_an_exposure_waits_until_no_step_of_the_coils_falls_within(length_ms: int) -> None:
-    """An exposure is delayed until the coils do not switch during it.
+    """An exposure is delayed so that the coils do not switch during the exposure.
 
     The coils are off for 100 of every 250 ms, and a command may arrive 50 ms late.
     """

@@ -333,7 +333,8 @@ def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
 def least_time(momentum: FloatArray, field: FloatArray) -> float:
     """Return a lower bound (s) of the time in which dipoles at the limit can remove the momentum.
 
-    For any direction p, they reduce p . h by at most the integral of the largest torque along p.
+    For any direction p, dipoles at the limit reduce p . h by at most the integral of the largest torque along
+    p.
     """
     directions = np.random.default_rng(1).standard_normal((3000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

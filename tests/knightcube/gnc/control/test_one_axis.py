@@ -190,7 +190,7 @@ def cycles(controller: ExcitationController, count: int, angle: float, rate: flo
 def test_a_manoeuvre_begins_after_a_second_at_rest(angle: float, rate: float, moves: bool) -> None:
     controller = ExcitationController(PLANT, PERIOD, SETTINGS)
     cycles(controller, 41, angle, rate)
-    # A pulse demands half of the current limit. Otherwise the current is that of the tracker.
+    # A pulse demands half of the current limit. Without a pulse, the current is that of the tracker.
     pulses = {round(abs(one.demanded), 9) for one in cycles(controller, 20, angle, rate)}
     assert (pulses == {0.074}) is moves
 

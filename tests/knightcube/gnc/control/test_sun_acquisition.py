@@ -85,7 +85,7 @@ def test_a_single_field_or_one_that_jumps_starts_no_coil() -> None:
         law.sample(now_ns, field, np.zeros(3))
         if law.dipole(now_ns).any():
             acted.append(int(window))
-    # After the first pause there is only one field. The fields of pauses 2 and 3 contradict their
+    # After the first pause only one field is known. The fields of pauses 2 and 3 contradict their
     # predecessors.
     assert set(acted) == {1, 4}
 

@@ -6,10 +6,10 @@ uses the estimate moves the testbed through steps of q2. The free body rotates a
 attitude, with a random walk of the torque and a rotating field. The coils' gain has an error of 10 % (1
 sigma).
 
-The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias. It loses 2 % of its
-packets, and sends nothing in two intervals of 0.5 to 1 s. Every 5 s the star camera gives the mean rate over
-1 s with a full covariance if the stars are streaks, and on the free body also an attitude. The camera's
-results are delayed by 0.2 to 0.6 s.
+The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias. The VN-100 loses 2 %
+of its packets, and sends nothing in two intervals of 0.5 to 1 s. Every 5 s the star camera gives the mean
+rate over 1 s with a full covariance if the stars are streaks, and on the free body also an attitude. The
+camera's results are delayed by 0.2 to 0.6 s.
 
 NEES divided by its degrees of freedom is 1 for a correct covariance; the 95 % band is that of chi-square over
 independent runs. NIS divided by its degrees of freedom has a similar band, over all accepted measurements.

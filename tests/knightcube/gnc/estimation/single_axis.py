@@ -1,12 +1,12 @@
 """A linear Kalman filter of the rotation about the thread, a reference for the three-axis filter.
 
-Its states are angle, rate and disturbance. The angle theta = 2 asin q2 is used instead of q2, because its
-kinematics are linear (Sease 5.9 is not): theta' = omega and omega' = u + d. The acceleration u is that of the
-plant model for the known current. The disturbance d, such as the thread's torque, is a random walk. Each
-measurement is applied at its own time. After a late measurement, the later measurements are applied again. A
-rate from a streaked image is the mean rate over its exposure. Until the exposure ends, the angle at its start
-is an additional state (stochastic cloning, Roumeliotis and Burdick 2002), so an acceleration within the
-exposure does not contradict the mean.
+The states of the filter are angle, rate and disturbance. The angle theta = 2 asin q2 is used instead of q2,
+because its kinematics are linear (Sease 5.9 is not): theta' = omega and omega' = u + d. The acceleration u is
+that of the plant model for the known current. The disturbance d, such as the thread's torque, is a random
+walk. Each measurement is applied at its own time. After a late measurement, the later measurements are
+applied again. A rate from a streaked image is the mean rate over its exposure. Until the exposure ends, the
+angle at its start is an additional state (stochastic cloning, Roumeliotis and Burdick 2002), so an
+acceleration within the exposure does not contradict the mean.
 """
 
 from __future__ import annotations
@@ -157,7 +157,8 @@ class SingleAxisFilter:
     def _index_before(self, begin_ns: int) -> int:
         """Return the number of checkpoints before the time from which measurements are applied again.
 
-        This time is `begin_ns`, or the start of an averaging interval that contains `begin_ns`.
+        Measurements are applied again from `begin_ns`, or from the start of an averaging interval that
+        contains `begin_ns`.
         """
         while True:
             index = bisect.bisect_right(self._history, begin_ns, key=lambda c: c.measurement.time_ns)
@@ -249,7 +250,10 @@ class SingleAxisFilter:
             self.restarts += 1
 
     def _forget(self, now_ns: int) -> None:
-        """Delete checkpoints and commands that are too old. This is done only occasionally, to save time."""
+        """Delete checkpoints and commands that are too old.
+
+        Old entries are deleted only occasionally, to save time.
+        """
         horizon_ns = now_ns - self._settings.history_ns
         if len(self._history) > 2 and self._history[0].measurement.time_ns < horizon_ns - 1_000_000_000:
             keep = bisect.bisect_left(self._history, horizon_ns, key=lambda c: c.measurement.time_ns)

@@ -268,7 +268,8 @@ def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> N
 def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
     """A filter that restarts after a contradiction discards a gyro bias that is not plausible.
 
-    False directions have caused this bias. With it, each restart would give a wrong estimate.
+    False directions have caused the bias. If the filter kept the bias, each restart would give a wrong
+    estimate.
     """
     craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
     known = settings.error_state(INERTIA).prior[SLOW, SLOW]

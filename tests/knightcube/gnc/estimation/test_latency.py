@@ -61,7 +61,7 @@ def test_the_age_is_found_and_made_up_for(late: int) -> None:
 
 
 def test_the_error_of_the_age_is_as_large_as_the_filter_says() -> None:
-    """The squared normalised errors of the age in ten flights have a sum in the 99.9 % band of chi-square."""
+    """The sum of the squared normalised errors of the age in ten flights agrees with chi-square (99.9 %)."""
     squares = []
     for seed in range(20, 30):
         _, last = follow_late(fly(seed, 300, True, SWING), 1, ESTIMATING)
@@ -83,10 +83,7 @@ def test_a_rate_alone_does_not_show_the_age() -> None:
 
 
 def test_no_age_is_taken_that_is_none() -> None:
-    """The estimated age stays between zero and the longest latency.
-
-    Before the start of the filter, it is zero.
-    """
+    """The estimated age is between zero and the longest latency, and zero before the start of the filter."""
     filter_ = AttitudeFilter(SUSPENDED, ESTIMATING)
     assert filter_.latency == 0.0
     flight = fly(13, 400, True)

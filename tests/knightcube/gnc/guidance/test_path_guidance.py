@@ -101,8 +101,8 @@ def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) 
 def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
     """A path is refused if its current exceeds the limit between the nodes.
 
-    A ripple of Chebyshev degree 40 is too fine for 24 nodes. Its current is almost zero at most of the nodes,
-    and several amperes between the nodes.
+    A ripple of Chebyshev degree 40 is too fine for 24 nodes. The current of the ripple is almost zero at most
+    of the nodes, and several amperes between the nodes.
     """
     count = 41
     columns = np.zeros((count, 3))

@@ -70,7 +70,7 @@ def test_a_slew_of_least_time_is_found_although_the_first_path_cannot_be_flown()
 def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
     """If no initial guess leads to a path of the requested duration, a longer slew is planned and shortened.
 
-    This is case 21 of `bench orbit_slews`.
+    The slew is case 21 of `bench orbit_slews`.
     """
     *_, (_, task) = slews(22, 1, False)
     plan = plan_task(task)
@@ -98,7 +98,7 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
 def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> None:
     """A slew is led around the cones, although every path without limits passes through a cone.
 
-    This is case 0 of `bench orbit_slews --cones --seed 43`.
+    The slew is case 0 of `bench orbit_slews --cones --seed 43`.
     """
     (_, task), *_ = slews(1, 43, True)
     plan = plan_task(task)
@@ -111,7 +111,7 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
     """Slews are planned although all initial guesses by rotations about the field pass through cones.
 
-    This holds for the first two of the three slews.
+    In the first two of the three slews, all such guesses pass through cones.
     """
     *_, (_, task) = slews(case + 1, seed, True)
     plan = plan_task(task)
@@ -125,7 +125,7 @@ def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int,
 def test_a_path_beyond_the_limit_when_flown_takes_longer() -> None:
     """A path whose dipoles with feedback exceed their limit is planned again with a longer duration.
 
-    In case 27 of `bench orbit_slews --seed 44` they exceed the limit by 1.4 %.
+    In case 27 of `bench orbit_slews --seed 44` the dipoles exceed their limit by 1.4 %.
     """
     *_, (_, task) = slews(28, 44, False)
     plan = plan_task(task)

@@ -344,7 +344,8 @@ def test_the_shortest_times_are_the_published_ones() -> None:
 def test_from_a_tenth_above_the_shortest_horizon_on_paths_are_optimal_and_within_the_limits() -> None:
     """Paths of at least 1.1 times the shortest duration are optimal and within the limits.
 
-    This is a part of the benchmark `plan`, with a thread, a disturbance and non-zero rates at both ends.
+    The problems are a part of the benchmark `plan`, with a thread, a disturbance and non-zero rates at both
+    ends.
     """
     costs = []
     for problem, shortest in feasible_problems(40, seed=11):

@@ -50,8 +50,8 @@ class SkyFrame:
     def attitude_bound(self, most: int = 60) -> FloatArray:
         """Return the Cramer-Rao bound of the attitude covariance (3, 3) at mid-exposure, rad^2.
 
-        The bound uses the `most` brightest stars with independent positions. It assumes a known shape of the
-        point spread function, and a constant rate whose errors are not correlated with the attitude at
+        The bound uses the `most` brightest stars with independent positions. The bound assumes a known shape
+        of the point spread function, and a constant rate whose errors are not correlated with the attitude at
         mid-exposure.
         """
         camera = self.camera

@@ -69,8 +69,8 @@ def test_exact_positions_give_the_exact_attitude_and_scale(free_scale: bool) -> 
 def test_elongated_errors_agree_with_the_covariance_and_beat_round_ones(free_scale: bool) -> None:
     """The errors of 200 fields with elongated position errors agree with the covariance.
 
-    They are smaller than in fields of 12 stars whose position errors are isotropic and have the same mean
-    variance.
+    The attitude errors are smaller than in fields of 12 stars whose position errors are isotropic and have
+    the same mean variance.
     """
     rng = np.random.default_rng(2)
     mismatch, mine, rounds, scales = 0.0, 0.0, 0.0, 0.0
@@ -103,8 +103,8 @@ def test_excess_scatter_of_the_stars_increases_the_covariance() -> None:
     ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
     assert sound.excess == 1.0
     assert wider.excess == pytest.approx(25.0, rel=0.5)
-    # In the covariance, which is that of the attitude, the degrees of freedom are 24 - 3. In `excess`, which
-    # also accounts for the scale, they are 24 - 4.
+    # In the covariance, which is that of the attitude, the residuals have 24 - 3 degrees of freedom. In
+    # `excess`, which also accounts for the scale, the residuals have 24 - 4 degrees of freedom.
     assert ratio == pytest.approx(wider.excess * (24 - 4) / (24 - 3) / 25.0, rel=1e-3)
 
 

@@ -47,7 +47,8 @@ def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> 
 def test_only_a_reach_below_the_useful_one_is_left_out() -> None:
     """Ranges of triangles that are too small to be useful are omitted, and all other ranges are unchanged.
 
-    Half of the stars are random. The other half are close together, in regions with many or few bright stars.
+    Half of the stars are random. The other half of the stars is concentrated in regions with many or few
+    bright stars.
     """
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(2000, 2)
     both = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(2000)])

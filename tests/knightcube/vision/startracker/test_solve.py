@@ -227,7 +227,8 @@ def test_noise_alone_shows_no_star() -> None:
 def test_points_that_are_not_stars_are_refused_with_the_reason() -> None:
     """Points that are not stars are refused with a reason.
 
-    The points of a real frame are moved at random. They keep their flux, but match no part of the sky.
+    The points of a real frame are moved at random. The moved points keep their flux, but match no part of the
+    sky.
     """
     rng = np.random.default_rng(17)
     pixels = rng.normal(100.0, 10.0, (1024, 1024))

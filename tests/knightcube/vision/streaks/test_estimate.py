@@ -440,7 +440,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
 def test_the_rate_reaches_the_bound_without_faint_stars() -> None:
     """Without faint stars, the rms rate error over 12 frames is below 1.31 times the bound.
 
-    This is the 99 % limit for 36 degrees of freedom.
+    The limit is the 99 % quantile for 36 degrees of freedom.
     """
     ratios = []
     for seed in range(12):

@@ -112,7 +112,10 @@ def test_the_brightest_stars_are_fitted_while_there_is_room(monkeypatch: pytest.
 
 
 def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trusted stars are fitted regardless of the limit of pixels. A limit of one pixel leaves only them."""
+    """Trusted stars are fitted regardless of the limit of pixels.
+
+    With a limit of one pixel, only the trusted stars are fitted.
+    """
     camera, scene = _taken(60.0, 300.0)
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", 1.0)
     done = joint_fit.joint_fit(camera, scene)

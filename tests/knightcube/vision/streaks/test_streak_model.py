@@ -64,7 +64,7 @@ def test_the_light_is_that_of_brute_force(
 ) -> None:
     """The light of a streak differs from a sum over instants by less than a thousandth of its peak.
 
-    This is far below the noise of an unsaturated pixel.
+    The difference is far below the noise of an unsaturated pixel.
     """
     motion = CameraMotion.steady(np.array(turn))
     truth = _brute(motion, np.array(star), sigma)
@@ -99,7 +99,7 @@ def test_the_light_of_a_changing_rate_is_that_of_brute_force(growth: float, leng
 def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[float]) -> None:
     """The derivatives agree with a sum over instants to 2 %.
 
-    This accuracy is sufficient, because derivatives do not change the solution of the fit.
+    An accuracy of 2 % is sufficient, because derivatives do not change the solution of the fit.
     """
     motion, place = CameraMotion.steady(np.array(turn)), np.array(star)
     covered, _, changes = _modelled(motion, place, 1.0)
