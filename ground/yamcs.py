@@ -344,13 +344,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m ground.yamcs", description=__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the configuration and the archive")
     parser.add_argument("--gateway", default=ADDRESS, metavar="HOST:PORT", help=f"default {ADDRESS}")
-    parser.add_argument(
-        "--keys",
-        type=Path,
-        default=KEYS,
-        metavar="FOLDER",
-        help=f"folder of the gateway's keys, for its token (default {KEYS})",
-    )
+    text = f"folder of the gateway's keys, for its token (default {KEYS})"
+    parser.add_argument("--keys", type=Path, default=KEYS, metavar="FOLDER", help=text)
     parser.add_argument("--http", type=int, default=HTTP_PORT, metavar="PORT", help=f"default {HTTP_PORT}")
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
     text = "`link.command_frame_bytes` of the satellite (default %(default)s)"

@@ -62,12 +62,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--only", action="append", choices=tuple(STEPS), help="repeat only this step (repeatable)"
     )
     parser.add_argument("--again", action="store_true", help="do all steps again")
-    parser.add_argument(
-        "--wired",
-        type=config_path,
-        metavar="CONFIG2",
-        help="emulate devices with the wiring of this configuration, which may differ from CONFIG",
-    )
+    text = "emulate devices with the wiring of this configuration, which may differ from CONFIG"
+    parser.add_argument("--wired", type=config_path, metavar="CONFIG2", help=text)
     parser.add_argument("--yes", action="store_true", help="do not wait for answers of the operator")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run, out=Path("bringup"))

@@ -39,12 +39,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: knightcube calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
     parser.add_argument("--fov", type=positive, metavar="DEG", help="rough field of view across the columns")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="YAML",
-        help="file to which the camera is written, for --camera of other commands",
-    )
+    text = "file to which the camera is written, for --camera of other commands"
+    parser.add_argument("--out", type=Path, metavar="YAML", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run)
 

@@ -26,31 +26,22 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         f"example: {PROGRAM} campaign orbit_3u --vary craft.inertia=10% --vary detumble.act=0.5..2 --runs 50"
     )
-    parser.add_argument("config", type=config_path, metavar="CONFIG", help="file or installed name")
-    parser.add_argument(
-        "--vary",
-        action="append",
-        default=[],
-        required=True,
-        metavar="KEY=SPREAD",
-        help="random value, may be repeated: 10%% (uniform, relative), +-0.5 (uniform), 'normal 10%%' or "
+    add = parser.add_argument
+    add("config", type=config_path, metavar="CONFIG", help="file or installed name")
+    text = (
+        "random value, may be repeated: 10%% (uniform, relative), +-0.5 (uniform), 'normal 10%%' or "
         "'normal 0.5' (standard deviation), 1..5 (uniform), 'log 1..100' (uniform in the logarithm), 'a|b|c' "
-        "(one of these). Each number of a list is drawn on its own",
+        "(one of these). Each number of a list is drawn on its own"
     )
-    parser.add_argument(
-        "--runs", type=count, default=100, metavar="N", help="number of flights (default 100)"
-    )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all draws (default 1)")
-    parser.add_argument("--duration", type=positive, metavar="S", help="duration of each flight")
-    parser.add_argument(
-        "--only", default="", metavar="TEXT", help="run only flights with this text in their name"
-    )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
-    parser.add_argument("--workers", type=count, metavar="N", help="processes (default: the cores)")
-    parser.add_argument(
-        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of this machine"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add("--vary", action="append", default=[], required=True, metavar="KEY=SPREAD", help=text)
+    add("--runs", type=count, default=100, metavar="N", help="number of flights (default 100)")
+    add("--seed", type=int, default=1, metavar="N", help="seed of all draws (default 1)")
+    add("--duration", type=positive, metavar="S", help="duration of each flight")
+    add("--only", default="", metavar="TEXT", help="run only flights with this text in their name")
+    add("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
+    add("--workers", type=count, metavar="N", help="processes (default: the cores)")
+    add("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of this machine")
+    add("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run)
 
 

@@ -68,20 +68,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     source.add_argument(
         "--config", type=config_path, metavar="CONFIG", help="configuration with a simulated orbit"
     )
-    source.add_argument(
-        "--fixes",
-        type=Path,
-        metavar="FILE",
-        help="CSV file of GPS fixes with the columns utc (ISO 8601), x, y, z (m, ITRS) and, if known, vx, "
-        "vy, vz (m/s relative to the ground, ITRS), or the folder of a run, whose logged fixes are fitted",
+    text = (
+        "CSV file of GPS fixes with the columns utc (ISO 8601), x, y, z (m, ITRS) and, if known, vx, "
+        "vy, vz (m/s relative to the ground, ITRS), or the folder of a run, whose logged fixes are fitted"
     )
-    source.add_argument(
-        "--read",
-        type=Path,
-        metavar="FILE",
-        help="file of two-line elements, or of OMM in JSON, XML, KVN or CSV, as CelesTrak and Space-Track "
-        "publish them; the elements are checked",
+    source.add_argument("--fixes", type=Path, metavar="FILE", help=text)
+    text = (
+        "file of two-line elements, or of OMM in JSON, XML, KVN or CSV, as CelesTrak and Space-Track "
+        "publish them; the elements are checked"
     )
+    source.add_argument("--read", type=Path, metavar="FILE", help=text)
     parser.add_argument(
         "--satellite", type=int, metavar="NUMBER", help="with --read: satellite number, if there are several"
     )

@@ -65,12 +65,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: knightcube horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
     add_picture(parser)
     add_field(parser, required=True)
-    parser.add_argument(
-        "--fov-error",
-        type=positive,
-        metavar="DEG",
-        help="standard deviation of --fov; pictures of other fields of view are tried too (default 0)",
-    )
+    text = "standard deviation of --fov; pictures of other fields of view are tried too (default 0)"
+    parser.add_argument("--fov-error", type=positive, metavar="DEG", help=text)
     height = parser.add_mutually_exclusive_group()
     height.add_argument(
         "--altitude", type=positive, metavar="KM", help="altitude above the mean Earth radius"
@@ -84,19 +80,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=(low, high),
         help=f"limits of an unknown altitude, km (default {low:g} {high:g})",
     )
-    parser.add_argument(
-        "--mask",
-        type=Path,
-        metavar="IMAGE",
-        help="image (PNG, PGM or FITS) of the picture's size; its pixels above 0 show the spacecraft itself",
-    )
-    parser.add_argument(
-        "--log-response",
-        type=positive,
-        nargs=2,
-        metavar=("PEDESTAL", "COUNTS"),
-        help="response of a logarithmic detector: dark counts, and counts per decade of light",
-    )
+    text = "image (PNG, PGM or FITS) of the picture's size; its pixels above 0 show the spacecraft itself"
+    parser.add_argument("--mask", type=Path, metavar="IMAGE", help=text)
+    text = "response of a logarithmic detector: dark counts, and counts per decade of light"
+    parser.add_argument("--log-response", type=positive, nargs=2, metavar=("PEDESTAL", "COUNTS"), help=text)
     _add_paper_options(parser)
     add_output(parser, run)
 
@@ -222,32 +209,17 @@ METHODS = ("circle", "graphic", "vector")
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the methods of Meller et al."""
     paper = parser.add_argument_group("methods of Meller et al.")
-    paper.add_argument(
-        "--method",
-        choices=("default", *METHODS),
-        default="default",
-        help="circle: a circle through the edges of one picture; graphic: the circles of two level cameras "
-        "(--second, --turned); vector: the nadir of an earlier picture (--second), rotated with the horizon",
+    text = (
+        "circle: a circle through the edges of one picture; graphic: the circles of two level cameras "
+        "(--second, --turned); vector: the nadir of an earlier picture (--second), rotated with the horizon"
     )
-    paper.add_argument(
-        "--second",
-        type=Path,
-        metavar="IMAGE",
-        help="graphic: image of the second camera; vector: earlier image",
-    )
-    paper.add_argument(
-        "--turned",
-        type=finite,
-        metavar="DEG",
-        help="graphic: angle of the second camera to the right of the first",
-    )
-    paper.add_argument(
-        "--nadir",
-        type=finite,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="vector: nadir of the earlier picture in camera axes (default from its circle)",
-    )
+    paper.add_argument("--method", choices=("default", *METHODS), default="default", help=text)
+    text = "graphic: image of the second camera; vector: earlier image"
+    paper.add_argument("--second", type=Path, metavar="IMAGE", help=text)
+    text = "graphic: angle of the second camera to the right of the first"
+    paper.add_argument("--turned", type=finite, metavar="DEG", help=text)
+    text = "vector: nadir of the earlier picture in camera axes (default from its circle)"
+    paper.add_argument("--nadir", type=finite, nargs=3, metavar=("X", "Y", "Z"), help=text)
     paper.add_argument(
         "--lines", type=int, metavar="N", help=f"number of scanned lines, 3 to 512 (default {LINES})"
     )

@@ -92,25 +92,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "dipole, which are compared with the configuration and written as a file that extends it."
     )
     parser.epilog = "example: knightcube identify config/testbed.yaml --out plant.yaml --picture fit.png"
-    parser.add_argument(
-        "source",
-        type=config_path,
-        metavar="CONFIG",
-        help="YAML file, installed name such as testbed, or the folder of a run",
-    )
-    parser.add_argument("--out", type=Path, metavar="YAML", help="write the constants to this file")
-    parser.add_argument(
-        "--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)"
-    )
-    parser.add_argument(
-        "--duration", type=positive, metavar="S", help=f"duration of the flight, s (default {DURATION:g})"
-    )
-    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation")
-    parser.add_argument(
-        "--realtime", action="store_true", help="run simulated devices on the machine's clock"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw measured and predicted motion")
+    add = parser.add_argument
+    text = "YAML file, installed name such as testbed, or the folder of a run"
+    add("source", type=config_path, metavar="CONFIG", help=text)
+    add("--out", type=Path, metavar="YAML", help="write the constants to this file")
+    add("--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)")
+    add("--duration", type=positive, metavar="S", help=f"duration of the flight, s (default {DURATION:g})")
+    add("--seed", type=seed_number, metavar="N", help="seed of the simulation")
+    add("--realtime", action="store_true", help="run simulated devices on the machine's clock")
+    add("--json", action="store_true", help="print one JSON object")
+    add("--picture", type=Path, metavar="PNG", help="draw measured and predicted motion")
     parser.set_defaults(command=run)
 
 

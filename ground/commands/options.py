@@ -21,24 +21,16 @@ _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that name a picture file."""
     parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, BMP, FITS, or see --raw")
-    parser.add_argument(
-        "--raw",
-        type=raw_shape,
-        metavar="CxRxB",
-        help="IMAGE is raw pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16",
-    )
+    text = "IMAGE is raw pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16"
+    parser.add_argument("--raw", type=raw_shape, metavar="CxRxB", help=text)
 
 
 def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
     """Add the arguments that describe the camera; if `required`, the user must give exactly one."""
     group = parser.add_mutually_exclusive_group(required=True) if required else parser
     group.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
-    group.add_argument(
-        "--camera",
-        type=config_path,
-        metavar="YAML",
-        help="configuration (file or packaged name) or calibration of the camera",
-    )
+    text = "configuration (file or packaged name) or calibration of the camera"
+    group.add_argument("--camera", type=config_path, metavar="YAML", help=text)
 
 
 def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:

@@ -43,11 +43,8 @@ def configure_passes(parser: argparse.ArgumentParser) -> None:
     )
     _add_orbit(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--schedule",
-        action="store_true",
-        help="print only the commands for each pass, to be sent by `command --link ADDRESS --keys FOLDER`",
-    )
+    text = "print only the commands for each pass, to be sent by `command --link ADDRESS --keys FOLDER`"
+    parser.add_argument("--schedule", action="store_true", help=text)
     text = "with --schedule: time to point before the rise (default %(default)g s)"
     parser.add_argument("--lead", type=finite, default=_LEAD_S, metavar="S", help=text)
     parser.set_defaults(command=run_passes)
@@ -70,12 +67,8 @@ def configure_day(parser: argparse.ArgumentParser) -> None:
 
 def _add_orbit(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that select satellite, time span and stations."""
-    parser.add_argument(
-        "config",
-        type=config_path,
-        metavar="CONFIG",
-        help="configuration of the satellite with `elements`, or a file of two-line elements or OMM",
-    )
+    text = "configuration of the satellite with `elements`, or a file of two-line elements or OMM"
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help=text)
     add_stations(parser)
 
 

@@ -51,20 +51,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "example: knightcube plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png; in orbit: "
         "knightcube plan --orbit orbit --from nadir --to sun --at 2026-03-01T12:00:00 --within 600"
     )
-    parser.add_argument(
-        "--from",
-        dest="start",
-        required=True,
-        metavar="Q2",
-        help="q2 at the start, or a target such as nadir with --orbit",
-    )
-    parser.add_argument(
-        "--to",
-        dest="end",
-        required=True,
-        metavar="Q2",
-        help="q2 at the end, or a target such as sun with --orbit",
-    )
+    text = "q2 at the start, or a target such as nadir with --orbit"
+    parser.add_argument("--from", dest="start", required=True, metavar="Q2", help=text)
+    text = "q2 at the end, or a target such as sun with --orbit"
+    parser.add_argument("--to", dest="end", required=True, metavar="Q2", help=text)
     parser.add_argument("--from-rate", type=finite, metavar="W", help="rad/s at the start (default 0)")
     parser.add_argument("--to-rate", type=finite, metavar="W", help="rad/s at the end (default 0)")
     _add_options(parser)
@@ -75,24 +65,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def _add_options(parser: argparse.ArgumentParser) -> None:
     """Add the optional arguments of `knightcube plan`."""
     parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
-    parser.add_argument(
-        "--time-price",
-        type=positive,
-        metavar="W",
-        help="cost of time, W: choose the horizon of least energy plus this cost times the horizon",
-    )
-    parser.add_argument(
-        "--cost",
-        choices=[cost.value for cost in PathCost],
-        help="energy to minimise: R I^2 of the mean current (heat), or V |I| from the supply",
-    )
+    text = "cost of time, W: choose the horizon of least energy plus this cost times the horizon"
+    parser.add_argument("--time-price", type=positive, metavar="W", help=text)
+    text = "energy to minimise: R I^2 of the mean current (heat), or V |I| from the supply"
+    parser.add_argument("--cost", choices=[cost.value for cost in PathCost], help=text)
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
-    parser.add_argument(
-        "--config",
-        type=config_path,
-        metavar="CONFIG",
-        help=f"configuration of the plant, a file or an installed name (default {_DEFAULT_CONFIG})",
-    )
+    text = f"configuration of the plant, a file or an installed name (default {_DEFAULT_CONFIG})"
+    parser.add_argument("--config", type=config_path, metavar="CONFIG", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the path, its rate and its current")
 
@@ -199,38 +178,25 @@ def _check(options: argparse.Namespace) -> None:
 def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of slews in orbit."""
     group = parser.add_argument_group("with --orbit")
-    group.add_argument(
-        "--orbit",
-        type=config_path,
-        metavar="CONFIG",
-        help="plan a slew of this satellite, a file or an installed name; --from and --to are then targets: "
-        "nadir, velocity, sun, 'inertial QX QY QZ QW', 'ground LAT LON', each with 'roll DEG' or a free roll",
+    text = (
+        "plan a slew of this satellite, a file or an installed name; --from and --to are then targets: "
+        "nadir, velocity, sun, 'inertial QX QY QZ QW', 'ground LAT LON', each with 'roll DEG' or a free roll"
     )
+    group.add_argument("--orbit", type=config_path, metavar="CONFIG", help=text)
     group.add_argument("--at", type=utc, metavar="UTC", help="start of the slew, such as 2026-03-01T12:00:00")
     group.add_argument("--within", type=positive, metavar="S", help="duration of the slew, s")
-    group.add_argument(
-        "--longest",
-        type=positive,
-        metavar="S",
-        help=f"longest stretched slew, s (default {STRETCH:g} times --within)",
-    )
-    group.add_argument(
-        "--window",
-        type=finite,
-        metavar="S",
-        help="start at the best time within this time after --at, s (default 0)",
-    )
+    text = f"longest stretched slew, s (default {STRETCH:g} times --within)"
+    group.add_argument("--longest", type=positive, metavar="S", help=text)
+    text = "start at the best time within this time after --at, s (default 0)"
+    group.add_argument("--window", type=finite, metavar="S", help=text)
     group.add_argument(
         "--least-time", action="store_true", help="plan the slew of least duration instead of least energy"
     )
     for name in BODIES:
-        group.add_argument(
-            f"--{name}-cone",
-            type=positive,
-            metavar="DEG",
-            help=f"keep the star camera this far from the {name.capitalize()}"
-            + ("'s limb" if name == "earth" else ""),
+        text = f"keep the star camera this far from the {name.capitalize()}" + (
+            "'s limb" if name == "earth" else ""
         )
+        group.add_argument(f"--{name}-cone", type=positive, metavar="DEG", help=text)
 
 
 def _run_orbit(options: argparse.Namespace) -> int:

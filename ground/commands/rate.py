@@ -49,19 +49,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gain", type=positive, metavar="E", help="electrons per count (default 1)")
     parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="count at which pixels clip")
     parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, standard deviation (1)")
-    parser.add_argument(
-        "--line-time",
-        type=finite,
-        metavar="S",
-        help="time between rows, 0 for a global shutter (default: unknown, about 0)",
-    )
+    text = "time between rows, 0 for a global shutter (default: unknown, about 0)"
+    parser.add_argument("--line-time", type=finite, metavar="S", help=text)
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
-    parser.add_argument(
-        "--method",
-        choices=(LIKELIHOOD, *DETECTOR_NAMES),
-        default=LIKELIHOOD,
-        help="estimator (default likelihood); the others are the corner detectors of the thesis",
-    )
+    text = "estimator (default likelihood); the others are the corner detectors of the thesis"
+    parser.add_argument("--method", choices=(LIKELIHOOD, *DETECTOR_NAMES), default=LIKELIHOOD, help=text)
     add_output(parser, run)
 
 

@@ -89,26 +89,16 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--format", choices=FORMATS, default="csv", help="default: csv")
     places = ", ".join(f"RUN/{place}" for place in FORMATS.values())
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="PLACE",
-        help=f"folder of the files, or the SQLite file (default {places})",
-    )
+    text = f"folder of the files, or the SQLite file (default {places})"
+    parser.add_argument("--out", type=Path, metavar="PLACE", help=text)
     message = parser.add_mutually_exclusive_group()
-    message.add_argument(
-        "--tdm",
-        type=Path,
-        metavar="FILE",
-        help="write only the tracks of objects, as a CCSDS Tracking Data Message, and beside it the orbit of "
-        "the camera (suffix .oem), as an Orbit Ephemeris Message",
+    text = (
+        "write only the tracks of objects, as a CCSDS Tracking Data Message, and beside it the orbit of "
+        "the camera (suffix .oem), as an Orbit Ephemeris Message"
     )
-    message.add_argument(
-        "--aem",
-        type=Path,
-        metavar="FILE",
-        help="write only the estimated attitudes of a satellite, as a CCSDS Attitude Ephemeris Message",
-    )
+    message.add_argument("--tdm", type=Path, metavar="FILE", help=text)
+    text = "write only the estimated attitudes of a satellite, as a CCSDS Attitude Ephemeris Message"
+    message.add_argument("--aem", type=Path, metavar="FILE", help=text)
     parser.add_argument("--xml", action="store_true", help="write the message as XML (CCSDS 505.0-B)")
     parser.add_argument("--json", action="store_true", help="print the files as one JSON object")
     parser.set_defaults(command=run_export)

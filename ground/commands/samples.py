@@ -79,13 +79,8 @@ def configure_index(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = "example: knightcube index --camera flight.yaml --faintest 6.5 --out mission.index"
     add_field(parser, required=True)
-    parser.add_argument(
-        "--faintest",
-        type=float,
-        default=DEFAULT.faintest,
-        metavar="V",
-        help="magnitude of the faintest star that the camera detects (default %(default)s)",
-    )
+    text = "magnitude of the faintest star that the camera detects (default %(default)s)"
+    parser.add_argument("--faintest", type=float, default=DEFAULT.faintest, metavar="V", help=text)
     parser.add_argument(
         "--epoch", type=float, default=DEFAULT.epoch, metavar="YEAR", help="Julian year (default %(default)s)"
     )

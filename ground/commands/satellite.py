@@ -492,12 +492,8 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
     )
     add_link_options(parser, parser.add_mutually_exclusive_group(required=True))
     _add_spi(parser)
-    parser.add_argument(
-        "--folder",
-        type=Path,
-        metavar="DIR",
-        help="folder of received files and open transfers (default: KEYS-files beside the folder KEYS)",
-    )
+    text = "folder of received files and open transfers (default: KEYS-files beside the folder KEYS)"
+    parser.add_argument("--folder", type=Path, metavar="DIR", help=text)
     text = "maximum rate of frames to the satellite, bytes/s (default %(default)g)"
     parser.add_argument("--rate", type=float, default=_RATE, metavar="B", help=text)
     text = "time without a packet after which the command fails (default %(default)g s)"

@@ -60,54 +60,35 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: knightcube solve night.jpg --fov 11.4 --overlay solved.png"
     add_picture(parser)
     add_field(parser)
-    parser.add_argument(
-        "--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of the field)"
-    )
-    parser.add_argument(
-        "--exposure",
-        type=positive,
-        metavar="S",
-        help="exposure time, needed for the angular rate from streaks",
-    )
-    parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
-    parser.add_argument(
-        "--date",
-        type=utc,
-        metavar="UTC",
-        help="time of the picture, such as 2026-11-21, for proper motion, aberration and planets",
-    )
-    parser.add_argument(
-        "--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here"
-    )
-    parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
+    add = parser.add_argument
+    add("--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of the field)")
+    text = "exposure time, needed for the angular rate from streaks"
+    add("--exposure", type=positive, metavar="S", help=text)
+    add("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    text = "time of the picture, such as 2026-11-21, for proper motion, aberration and planets"
+    add("--date", type=utc, metavar="UTC", help=text)
+    add("--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here")
+    add("--index", type=Path, metavar="FILE", help="another sky index")
     _add_methods(parser)
     add_output(parser, run)
 
 
 def _add_methods(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--method",
-        choices=tuple(METHODS),
-        default=DEFAULT_METHOD,
-        help="identification; all methods except the default need a field of view known to within 1.8 %%: "
-        "see --fov-error",
+    text = (
+        "identification; all methods except the default need a field of view known to within 1.8 %%: "
+        "see --fov-error"
     )
-    parser.add_argument(
-        "--attitude",
-        choices=(IMAGE, *SOLVERS),
-        default=IMAGE,
-        help="image: fit of the star positions in the image, each with its own covariance (default); the "
-        "other methods solve Wahba's problem for the directions of the stars",
+    parser.add_argument("--method", choices=tuple(METHODS), default=DEFAULT_METHOD, help=text)
+    text = (
+        "image: fit of the star positions in the image, each with its own covariance (default); the "
+        "other methods solve Wahba's problem for the directions of the stars"
     )
-    parser.add_argument(
-        "--centroid",
-        choices=CENTROIDS,
-        default=CENTROIDS[0],
-        help=(
-            "centroid method for points: psf fits the point spread (default), window is the centre "
-            "of mass, the other methods weigh the pixels differently"
-        ),
+    parser.add_argument("--attitude", choices=(IMAGE, *SOLVERS), default=IMAGE, help=text)
+    text = (
+        "centroid method for points: psf fits the point spread (default), window is the centre "
+        "of mass, the other methods weigh the pixels differently"
     )
+    parser.add_argument("--centroid", choices=CENTROIDS, default=CENTROIDS[0], help=text)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -112,12 +112,8 @@ def configure_watch(parser: argparse.ArgumentParser) -> None:
         "knightcube watch --link 192.0.2.7:5010 --keys keys/ground --once"
     )
     way = parser.add_mutually_exclusive_group(required=True)
-    way.add_argument(
-        "flight",
-        metavar="RUN|SOCKET",
-        nargs="?",
-        help="folder of a run or of an archive, a socket, or HOST:PORT",
-    )
+    text = "folder of a run or of an archive, a socket, or HOST:PORT"
+    way.add_argument("flight", metavar="RUN|SOCKET", nargs="?", help=text)
     add_link_options(parser, way)
     text = "mission time between printed lines (default %(default)g s)"
     parser.add_argument("--every", type=positive, default=10.0, metavar="S", help=text)
@@ -286,28 +282,15 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         "knightcube console --fly config/step_demo.yaml runs/live; "
         "knightcube console --link 192.0.2.7:5010 --keys keys/ground --config orbit.yaml"
     )
-    parser.add_argument(
-        "run",
-        metavar="RUN",
-        type=Path,
-        nargs="?",
-        help="folder of a run, or of an archive for its newest run",
-    )
+    text = "folder of a run, or of an archive for its newest run"
+    parser.add_argument("run", metavar="RUN", type=Path, nargs="?", help=text)
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--to", metavar="SOCKET", help="send commands to the flight's UNIX socket or HOST:PORT")
-    way.add_argument(
-        "--fly",
-        metavar="CONFIG",
-        type=Path,
-        help="simulate this configuration in real time, with the log in RUN",
-    )
+    text = "simulate this configuration in real time, with the log in RUN"
+    way.add_argument("--fly", metavar="CONFIG", type=Path, help=text)
     add_link_options(parser, way)
-    parser.add_argument(
-        "--frames",
-        metavar="FOLDER",
-        type=Path,
-        help="kept frames of the camera (default those of RUN; with --link as received by `files`)",
-    )
+    text = "kept frames of the camera (default those of RUN; with --link as received by `files`)"
+    parser.add_argument("--frames", metavar="FOLDER", type=Path, help=text)
     parser.add_argument(
         "--station",
         action="append",

@@ -103,30 +103,15 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
 
 def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExclusiveGroup) -> None:
     """Add the option `--link` to the group of flight addresses, and the link's settings to the parser."""
-    way.add_argument(
-        "--link",
-        metavar="ADDRESS",
-        help=f"link of the flight: {ADDRESSES}",
-    )
+    text = f"link of the flight: {ADDRESSES}"
+    way.add_argument("--link", metavar="ADDRESS", help=text)
     parser.add_argument("--keys", type=Path, metavar="FOLDER", help="keys of the ground, needed with --link")
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="CONFIG",
-        help="configuration of the flight, whose section `link` describes frames and their coding",
-    )
-    parser.add_argument(
-        "--spacecraft",
-        type=int,
-        metavar="N",
-        help=f"spacecraft identifier of the link (default that of --config, or {DEFAULTS.spacecraft})",
-    )
-    parser.add_argument(
-        "--frame-bytes",
-        type=int,
-        metavar="N",
-        help=f"length of the link's telemetry frames (default that of --config, or {DEFAULTS.frame_bytes})",
-    )
+    text = "configuration of the flight, whose section `link` describes frames and their coding"
+    parser.add_argument("--config", type=Path, metavar="CONFIG", help=text)
+    text = f"spacecraft identifier of the link (default that of --config, or {DEFAULTS.spacecraft})"
+    parser.add_argument("--spacecraft", type=int, metavar="N", help=text)
+    text = f"length of the link's telemetry frames (default that of --config, or {DEFAULTS.frame_bytes})"
+    parser.add_argument("--frame-bytes", type=int, metavar="N", help=text)
 
 
 def ground_files_folder(keys: Path) -> Path:
