@@ -89,8 +89,7 @@ def _write_rows(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]
 
 
 _TYPES = {"f": "REAL", "i": "INTEGER", "u": "INTEGER"}
-_MAX_INTEGER = (1 << 63) - 1
-"""Largest integer that SQLite supports."""
+_MAX_INTEGER = (1 << 63) - 1  # largest integer that SQLite supports
 
 
 def write_database(run: Run, file: Path) -> list[Path]:

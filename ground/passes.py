@@ -29,10 +29,8 @@ from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 
 _SEARCH_S = 3600.0
 """Time (s) by which the search extends beyond the span, so that passes at its ends are found completely."""
-_STEP_S = 10.0
-"""Interval (s) between computed positions; begin and end of an eclipse are interpolated."""
-_SPEED = 7.6e3
-"""Typical speed (m/s) in a low orbit, which converts an along-track error to a timing error."""
+_STEP_S = 10.0  # interval (s) between computed positions; begin and end of an eclipse are interpolated
+_SPEED = 7.6e3  # typical speed (m/s) in a low orbit, which converts an along-track error to a timing error
 LEAD_S = 120.0
 """Default time (s) for the slew, from the command to point to the station until the rise."""
 _RISE, _CULMINATION, _SET = range(3)

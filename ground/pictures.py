@@ -89,10 +89,8 @@ Picture = npt.NDArray[np.uint8]
 _EXPECTED: Colour = (0, 158, 115)
 _NAME: Colour = (240, 228, 66)
 _MAX_NAMES = 25
-_BRIGHTEST = 8
-"""Number of brightest stars that are labelled even without a proper name."""
-_ARROW = 0.06
-"""Length of the compass's north arrow as a fraction of the picture size."""
+_BRIGHTEST = 8  # number of brightest stars that are labelled even without a proper name
+_ARROW = 0.06  # length of the compass's north arrow as a fraction of the picture size
 
 
 def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> Picture:
@@ -184,8 +182,7 @@ def _draw_compass(
 
 
 _EDGE_RADIUS = 5.0
-_DOT = 0.0
-"""Radius (px) that draws a single pixel instead of a ring."""
+_DOT = 0.0  # radius (px) that draws a single pixel instead of a ring
 
 
 def draw_horizon(

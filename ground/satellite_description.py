@@ -25,16 +25,13 @@ Line = str | tuple[str, str]
 
 TILT_DEG = 22.0
 """Angle of the star camera from the normal of the orbit towards the zenith, deg."""
-_YEAR_RATE = 2.0 * math.pi / (365.2422 * 86_400.0)
-"""Mean rate of the Sun's right ascension, rad/s."""
-_EQUATOR_FIELD = 2.98e-5
-"""Field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]."""
+_YEAR_RATE = 2.0 * math.pi / (365.2422 * 86_400.0)  # mean rate of the Sun's right ascension, rad/s
+_EQUATOR_FIELD = 2.98e-5  # field of the Earth's dipole at the equator at one Earth radius, T [IGRF-13]
 _OFFSET, _DRAG_COEFFICIENT, _SUN_PRESSURE = 0.02, 2.2, 4.56e-6
 """Centre of mass offset (m) [CubeSat Design Specification], drag coefficient, solar pressure (Pa)."""
 _CURRENT_ERROR, _CURRENT_SIGMA = 3.5e-3 / 0.148, 2.0e-3 / 0.148
 """Bound of the simulated current error, and assumed current noise, as fractions of the limit [`orbit`]."""
-_STRAY_FIELD = 7.4e-5
-"""Field (T) of a coil at the magnetometer at the current limit [as in `orbit`]."""
+_STRAY_FIELD = 7.4e-5  # field (T) of a coil at the magnetometer at the current limit [as in `orbit`]
 
 
 @dataclass(frozen=True, slots=True)

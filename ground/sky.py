@@ -23,10 +23,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun
 from knightcube.vision.startracker.sky_map import SkyMap
 
-_ORDER = 5
-"""Order of the distortion polynomials; it is odd because a radial distortion has no even terms."""
-_GRID = 25
-"""Number of points per axis at which the distortion is fitted."""
+_ORDER = 5  # order of the distortion polynomials; it is odd because a radial distortion has no even terms
+_GRID = 25  # number of points per axis at which the distortion is fitted
 _CARD, _BLOCK = 80, 2880
 
 Card = tuple[str, str | int | float | bool]
@@ -177,8 +175,7 @@ def directions_of_bodies(julian_date: float) -> dict[str, FloatArray]:
     return {name: away / np.linalg.norm(away) for name, away in found.items()}
 
 
-_SAME_PX = 0.1
-"""Distance (px) between optical axis and image centre above which both points are reported."""
+_SAME_PX = 0.1  # distance (px) between optical axis and image centre above which both points are reported
 
 
 def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody], reversed_rows: bool = False) -> dict[str, Any]:

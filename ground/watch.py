@@ -27,10 +27,8 @@ from knightcube.errors import FlightError, UsageError
 
 STREAMS = ("imu", "field", "coils", "power", "camera")
 _KEPT_EVENTS = 200
-_MAX_TIME = 1e15
-"""Mission time (s) above which a packet is assumed to be damaged."""
-_TIMEOUT_S = 2.0
-"""Longest time (s) to wait for the answer to a ping."""
+_MAX_TIME = 1e15  # mission time (s) above which a packet is assumed to be damaged
+_TIMEOUT_S = 2.0  # longest time (s) to wait for the answer to a ping
 
 
 class PacketSource(Protocol):

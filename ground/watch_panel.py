@@ -15,8 +15,7 @@ from flight.link.telemetry.packets import to_text
 from ground.watch import STREAMS, FlightState, attitude_text, named, printable
 
 LISTED_EVENTS = 12
-_BAR = 20
-"""Width (characters) of the bar that shows a coil current."""
+_BAR = 20  # width (characters) of the bar that shows a coil current
 _MODE_COLOURS = {
     "safe": "bold white on red",
     "boot": "bold black on yellow",

@@ -47,8 +47,7 @@ EPOCH = "2000-01-01T00:00:00"
 _BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
 UNUSED = "_spare"
 """Suffix of the name of a parameter for the unused bits of a bit field."""
-_DEGREES = "deg"
-"""Unit of an angle argument, which is encoded in rad."""
+_DEGREES = "deg"  # unit of an angle argument, which is encoded in rad
 _NAN = struct.pack(">d", math.nan).hex()
 """Encoding (NaN, hexadecimal) of an unused number of the command `point`."""
 _PRIMARY = (
@@ -68,8 +67,7 @@ _VERIFIERS = (
     ("Failed", "PT1H", (Stage.REFUSED, Stage.FAILED)),
 )
 """Stages of a command, with XTCE name, Yamcs's timeout after the release, and name in this software."""
-_SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"
-"""Yamcs's name for the sequence count of a sent command."""
+_SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"  # Yamcs's name for the sequence count of a sent command
 
 
 def document(

@@ -31,8 +31,7 @@ _VERIFY_MS = 10_000
 """Longest time (ms) to wait until a condition is satisfied; the packet `health` arrives every second."""
 _SCHEMA = "https://yamcs.org/schema"
 _REQUEST_S = 300.0
-_PAGE = 500
-"""Maximum number of timeline items in one answer."""
+_PAGE = 500  # maximum number of timeline items in one answer
 
 
 def _command(name: str, **arguments: object) -> dict[str, Any]:

@@ -27,10 +27,8 @@ _POLL_NS = 25_000_000
 _FRAME_PATIENCE_NS = 12 * SECOND_NS
 _ATTEMPTS = 3
 """Number of attempts to open a device, so that the measurement can begin despite a loose contact."""
-_LOST_FRAMES = 2
-"""Number of additional triggers if a trigger yields no frame."""
-_LATE_FRAME_S = 2.0
-"""Longest time (s) from the end of an exposure to the arrival of the frame."""
+_LOST_FRAMES = 2  # number of additional triggers if a trigger yields no frame
+_LATE_FRAME_S = 2.0  # longest time (s) from the end of an exposure to the arrival of the frame
 STILL_S = 0.5
 """Time (s) in which a body that stands still is measured."""
 

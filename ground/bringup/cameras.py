@@ -18,12 +18,10 @@ from knightcube.vision.startracker.detect import detect
 
 _FRAMES = 3
 _LENS_FRAMES = 6
-_FEW_SOURCES = 5
-"""Smallest number of point sources for which a frame is assumed to show stars or lamps."""
+_FEW_SOURCES = 5  # smallest number of point sources for which a frame is assumed to show stars or lamps
 _SHARP = (0.6, 2.5)
 """Range (px) of the PSF width (standard deviation) in which star positions are measured accurately."""
-_HOT = 1e-3
-"""Largest fraction of hot pixels of a healthy sensor."""
+_HOT = 1e-3  # largest fraction of hot pixels of a healthy sensor
 
 
 def step_dark(session: Session) -> Outcome:

@@ -43,8 +43,7 @@ SCALE = 0.1
 STRONGEST_BIAS = 1.5e-5
 """Largest constant field (T) of the body itself that is permitted even if the field of the site is weak."""
 _AXES = "xyz"
-_NEAR = 0.15
-"""Relative difference up to which a measured value agrees with its expected value."""
+_NEAR = 0.15  # relative difference up to which a measured value agrees with its expected value
 UNRECOGNISED = "different from the configuration, cause unknown"
 
 

@@ -18,8 +18,7 @@ from knightcube.vision.camera.images import grey_stretch, read_image
 
 _SIZE = (13.0, 10.0)
 _SAMPLES = 400
-_CUT_OUT = 128
-"""Side (px) of the section of the focus frame that is shown around its brightest pixel."""
+_CUT_OUT = 128  # side (px) of the section of the focus frame that is shown around its brightest pixel
 
 
 def draw(file: Path, outcomes: Mapping[str, Outcome], frames: Mapping[str, Path]) -> None:

@@ -13,11 +13,9 @@ from hal.interfaces.devices import GpsReading, GpsReceiver, PowerMonitor, PowerR
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 
-_SETTLE_S = 1.6
-"""Time (s) after a change of the current until a monitor's mean contains only the new current."""
+_SETTLE_S = 1.6  # time (s) after a change of the current until a monitor's mean contains only the new current
 _MONITOR_S = 1.0
-_NEAR = 0.15
-"""Largest relative difference between the changes of the current that two monitors measure."""
+_NEAR = 0.15  # largest relative difference between the changes of the current that two monitors measure
 
 
 # Power system.
@@ -120,16 +118,13 @@ def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -
 
 # GPS receiver.
 
-_FIX_PATIENCE_S = 120.0
-"""Longest time (s) that a receiver under an open sky needs for its first fix."""
+_FIX_PATIENCE_S = 120.0  # longest time (s) that a receiver under an open sky needs for its first fix
 _SILENCE_S = 6.0
 _FIXES = 12
-_PERIOD_S = 1.0
-"""Interval (s) of the fixes that the drivers request."""
+_PERIOD_S = 1.0  # interval (s) of the fixes that the drivers request
 _LATE_S = 0.7
 """Largest age (s) of a fix at its arrival: receivers need up to 0.2 s, and slow serial lines add to this."""
-_CLOCK_S = 5.0
-"""Difference (s) between GPS time and computer time that is not explained by a late fix."""
+_CLOCK_S = 5.0  # difference (s) between GPS time and computer time that is not explained by a late fix
 
 
 def step_gps(session: Session) -> Outcome:
@@ -229,8 +224,7 @@ def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
 
 # Solar strings.
 
-_STRINGS_S = 2.5
-"""Time (s) in which each string is measured at least twice."""
+_STRINGS_S = 2.5  # time (s) in which each string is measured at least twice
 
 
 def step_strings(session: Session) -> Outcome:

@@ -43,8 +43,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_matrix
 _REST_S = 12.0
 _SETTLE_S = 0.3
 _DRIVE_S = 1.2
-_EARTH_FIELD = 7.5e-5
-"""Largest magnetic field (T) of a laboratory without a Helmholtz coil."""
+_EARTH_FIELD = 7.5e-5  # largest magnetic field (T) of a laboratory without a Helmholtz coil
 _DENSITIES = math.radians(0.0035), 1.4e-8, 0.14e-3 * 9.80665
 """Noise densities of a VN-100 per sqrt(Hz) [data sheet]: gyro (rad/s), field (T), acceleration (m/s^2)."""
 

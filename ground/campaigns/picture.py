@@ -12,10 +12,8 @@ from ground.campaigns.runner import Result
 from ground.campaigns.varied import figures_of, numbers_drawn
 from ground.report import drawing
 
-_LABEL = 22
-"""Maximum number of characters in a line of an axis label."""
-_MOST = 6
-"""Maximum number of rows and of columns of panels in the plot."""
+_LABEL = 22  # maximum number of characters in a line of an axis label
+_MOST = 6  # maximum number of rows and of columns of panels in the plot
 
 
 def draw_campaign(results: Sequence[Result], file: Path) -> bool:

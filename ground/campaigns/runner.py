@@ -30,18 +30,13 @@ from typing import IO, Any
 from ground.campaigns import CampaignError, cluster
 from knightcube.errors import UsageError
 
-_PLAIN_S = 10.0
-"""Time (s) between two lines of progress if the output is not a terminal."""
-_WIDTH = 30
-"""Width of the progress bar in characters."""
-_ATTEMPTS = 3
-"""Number of worker processes whose death during the same case ends the campaign."""
-_STOP_S = 5.0
-"""Time (s) in which interrupted worker processes must end before they are killed."""
+_PLAIN_S = 10.0  # time (s) between two lines of progress if the output is not a terminal
+_WIDTH = 30  # width of the progress bar in characters
+_ATTEMPTS = 3  # number of worker processes whose death during the same case ends the campaign
+_STOP_S = 5.0  # time (s) in which interrupted worker processes must end before they are killed
 _SCRATCH = "knightcube-campaign-"
 """Prefix of the name of the folder that contains the temporary files of the workers."""
-_TEMPORARY = "temporary"
-"""Name of the link in the campaign's folder to the folder of temporary files."""
+_TEMPORARY = "temporary"  # name of the link in the campaign's folder to the folder of temporary files
 
 
 class Progress:
@@ -98,8 +93,7 @@ def _duration(seconds: float) -> str:
 
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
-_RESULTS = "results.jsonl"
-"""Name of the file of the results in the folder of a campaign."""
+_RESULTS = "results.jsonl"  # name of the file of the results in the folder of a campaign
 
 Result = dict[str, Any]
 Parameters = dict[str, Any]

@@ -36,8 +36,7 @@ _FORMS = (
     "KEY=10% (uniform, relative), KEY=+-0.5 (uniform), KEY=normal 10% or KEY=normal 0.5 (standard "
     "deviation), KEY=1..5 (uniform), KEY=log 1..100 (uniform in the logarithm) or KEY=a|b|c (one of these)"
 )
-_MOST_LISTED = 20
-"""Maximum number of failed flights in the printed table (all are in the file summary.json)."""
+_MOST_LISTED = 20  # maximum number of failed flights in the printed table (all are in the file summary.json)
 
 Draw = Callable[[np.random.Generator, float], Any]
 

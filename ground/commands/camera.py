@@ -29,8 +29,7 @@ from knightcube.vision.camera.images import write_picture
 
 _POLL_NS = 5_000_000
 _PATIENCE_NS = 10_000_000_000
-_MAX_ROTATION = 0.5
-"""Largest rotation (rad) in one exposure; longer streaks would leave any field of view."""
+_MAX_ROTATION = 0.5  # largest rotation (rad) in one exposure; longer streaks would leave any field of view
 _MAX_EXPOSURES = 8
 """Maximum time to wait for a frame, in exposure times (a free-running camera finishes other frames first)."""
 

@@ -33,10 +33,8 @@ from sim_hal.worlds.orbit import elements, julian_date, propagate
 
 _SPAN, _STEP = 86_400.0, 600.0
 """Duration and sampling interval (s) of the positions to which the elements of an orbit are fitted."""
-_LISTED = 5
-"""Maximum number of satellites that a message lists."""
-_ECCENTRICITY = OrbitSection().eccentricity
-"""Default eccentricity of an orbit."""
+_LISTED = 5  # maximum number of satellites that a message lists
+_ECCENTRICITY = OrbitSection().eccentricity  # default eccentricity of an orbit
 _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
 """Required columns of a CSV file of fixes, and its optional velocity columns."""
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")

@@ -49,14 +49,11 @@ if TYPE_CHECKING:
     from ground.console.description import Body
     from ground.passes import OrbitPrediction, Station
 
-_ASK_S = 0.2
-"""Interval (s) between two requests for the state of Yamcs."""
-_START_S = 60.0
-"""Longest time (s) to wait for the link, and for the flight."""
+_ASK_S = 0.2  # interval (s) between two requests for the state of Yamcs
+_START_S = 60.0  # longest time (s) to wait for the link, and for the flight
 _RUNS, _FLIGHT = "runs", "the flight"
 """Folder of the runs of a simulated flight, and the name of its process in messages."""
-_END_S = 30.0
-"""Longest time (s) to wait for the end of Yamcs."""
+_END_S = 30.0  # longest time (s) to wait for the end of Yamcs
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 _LONGEST_DAYS = 30.0
 """Longest span (days) of a prediction, because older elements do not give times of useful accuracy."""
-_UNCERTAIN_S = 10.0
-"""Standard deviation of the predicted times (s) above which a warning is printed."""
+_UNCERTAIN_S = 10.0  # standard deviation of the predicted times (s) above which a warning is printed
 _LEAD_S = 120.0
 """Default time (s) before the satellite's rise at which it is commanded to slew to the station."""
 

@@ -31,11 +31,9 @@ from knightcube.gnc.guidance.slew_plan import STRETCH, OrderedSlew, SlewStatus
 from knightcube.gnc.guidance.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, StepPlan
 
 BODIES: tuple[Literal["sun", "earth", "moon"], ...] = ("sun", "earth", "moon")
-_OFF_UNIT = 0.1
-"""Largest deviation from 1 of the norm of a given quaternion, which the command normalises."""
+_OFF_UNIT = 0.1  # largest deviation from 1 of the norm of a given quaternion, which the command normalises
 _DEFAULT_CONFIG = "step_demo"
-_TESTBED_ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")
-"""Options that only testbed slews have."""
+_TESTBED_ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")  # options that only testbed slews have
 _ORBIT_ONLY = ("at", "within", "longest", "window", "least_time", *(f"{name}_cone" for name in BODIES))
 """Options that only slews in orbit have."""
 

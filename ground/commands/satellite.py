@@ -101,14 +101,10 @@ _OF_TRANSFERS: dict[str, type[CancelFile | SuspendFile | ResumeFile]] = {
     "suspend": SuspendFile,
     "resume": ResumeFile,
 }
-_RATE = 20_000.0
-"""Default rate of frames to the satellite (bytes/s)."""
-_SILENCE_S = 60.0
-"""Default time (s) without a packet after which a file command fails."""
-_TURN_S = 0.01
-"""Time (s) for which received packets are awaited before the due protocol data units are sent."""
-_SHOW_S = 1.0
-"""Time (s) between two lines of progress."""
+_RATE = 20_000.0  # default rate of frames to the satellite (bytes/s)
+_SILENCE_S = 60.0  # default time (s) without a packet after which a file command fails
+_TURN_S = 0.01  # time (s) for which received packets are awaited before the due protocol data units are sent
+_SHOW_S = 1.0  # time (s) between two lines of progress
 _LINGER_S = 0.5
 """Time (s) after a transfer in which the satellite may request a repetition of the last answer."""
 

@@ -37,13 +37,10 @@ is a stack of units of 113.5 mm along x. A 27U is as long as a 12U and 126.3 mm 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _DENSITIES = (20.0, 20_000.0)
 """Range of the mean density, kg/m^3: from an empty box of thin sheet to solid tungsten."""
-_LOWEST_PERIGEE = 150.0
-"""Lowest permitted perigee, km above the equatorial radius."""
-_ALTITUDES = (200.0, 2000.0)
-"""Range of the semi-major axis minus the Earth's radius, km."""
+_LOWEST_PERIGEE = 150.0  # lowest permitted perigee, km above the equatorial radius
+_ALTITUDES = (200.0, 2000.0)  # range of the semi-major axis minus the Earth's radius, km
 _LARGEST_ECCENTRICITY = 0.1
-_HIGHEST_VOLTAGE = 36.0
-"""Largest voltage across a coil, V."""
+_HIGHEST_VOLTAGE = 36.0  # largest voltage across a coil, V
 _COIL_RANGES = {
     "dipole": (1e-3, 100.0, "A m^2"),
     "turns": (1.0, 1e5, ""),

@@ -43,10 +43,8 @@ if TYPE_CHECKING:
     from ground.console.server import Console
 
 PORT = 8040
-_READ_S = 0.5
-"""Time (s) between two reads of a growing log."""
-_PING_S = 2.0
-"""Time (s) between two pings of a watched flight."""
+_READ_S = 0.5  # time (s) between two reads of a growing log
+_PING_S = 2.0  # time (s) between two pings of a watched flight
 
 
 def configure_keys(parser: argparse.ArgumentParser) -> None:

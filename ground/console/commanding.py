@@ -55,20 +55,16 @@ Object = dict[str, Any]
 Send = Callable[[bytes], Object]
 """Function that sends a command packet and returns the answer with `obeyed` and `text`. Raises
 FlightError."""
-_TIMEOUT_S = 3.0
-"""Longest time (s) to wait for an answer from a socket."""
-_LISTEN_S = 0.02
-"""Longest time (s) for which one read of a link waits."""
+_TIMEOUT_S = 3.0  # longest time (s) to wait for an answer from a socket
+_LISTEN_S = 0.02  # longest time (s) for which one read of a link waits
 _PING_AFTER_S = 2.0
 """Time (s) without telemetry after which a ping is sent, because the link forgets silent UDP senders."""
-_ANSWER_S = 5.0
-"""Longest time (s) to wait for the report on a command over the link."""
+_ANSWER_S = 5.0  # longest time (s) to wait for the report on a command over the link
 _KEPT_REPORTS = 64
 _SPI = 1
 _START_S, _END_S = 60.0, 15.0
 """Longest times (s) to wait for the start and the end of a flight that the console started."""
-_FRAMES = 60
-"""Number of camera frames that a flight started by the console keeps for the page."""
+_FRAMES = 60  # number of camera frames that a flight started by the console keeps for the page
 _CAMERA = re.compile(r"(?m)^(camera:[^\n]*)$(?!(?:\n[ #][^\n]*)*?\n  keep_frames:)(?=\n  )")
 """Pattern of the first line of a section `camera` without the key `keep_frames`."""
 

@@ -20,15 +20,12 @@ from knightcube.errors import FlightError, UsageError
 
 Object = dict[str, Any]
 _T = TypeVar("_T")
-_RATE = 40_000.0
-"""Maximum rate of frames to the satellite (bytes/s)."""
-_SILENCE_S = 30.0
-"""Time (s) without telemetry after which a transfer fails. The received data is kept."""
+_RATE = 40_000.0  # maximum rate of frames to the satellite (bytes/s)
+_SILENCE_S = 30.0  # Time (s) without telemetry after which a transfer fails. The received data is kept.
 _POLL_S = 0.05
 _LINGER_S = 0.5
 """Time (s) after a transfer during which the satellite may request a repetition of the last answer."""
-_MOST_FILES = 2000
-"""Largest number of files in the list of a run's folder."""
+_MOST_FILES = 2000  # largest number of files in the list of a run's folder
 
 
 class Files(Protocol):

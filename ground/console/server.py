@@ -40,8 +40,7 @@ from knightcube.errors import FlightError, UsageError
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
 NO_ACCESS = "open the newest address that `knightcube console` printed: the page needs the token in it"
-_READ_S = 0.03
-"""Time (s) between two reads of new packets."""
+_READ_S = 0.03  # time (s) between two reads of new packets
 _MAX_POINTS = 4000
 _MOST_EXPORTED = 1_000_000
 _MAX_DIGITS = 18
@@ -52,8 +51,7 @@ _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
 """Packet types that the link process sends, even if the flight process is silent."""
 _BODY_OF: dict[str, Body] = {CONTROL.name: "testbed", NAVIGATION.name: "orbit", SPIN.name: "orbit"}
 """Kind of body (testbed or orbit) by the name of a packet type that only this kind of body sends."""
-_MOST_UPLOAD = 1 << 24
-"""Largest size (bytes) of a file that the page uploads to the satellite."""
+_MOST_UPLOAD = 1 << 24  # largest size (bytes) of a file that the page uploads to the satellite
 _MOST_STATIONS = 20
 _MOST_DAYS = 7.0
 _T = TypeVar("_T")

@@ -25,8 +25,7 @@ from knightcube.vision.camera.images import facts_of
 Object = dict[str, Any]
 _TRACK_STEP, _TRACK_HALF = 60.0, 5700.0
 """Step (s) of the ground track, and the duration (s) that the track covers before and after the present."""
-_MAX_SIDE = 640
-"""Maximum width and height (px) of a picture on the page."""
+_MAX_SIDE = 640  # maximum width and height (px) of a picture on the page
 _DARK, _BRIGHT = 50.0, 99.9
 """Percentiles of the pixel values that are shown as black (first) and as white (second)."""
 

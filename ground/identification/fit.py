@@ -71,26 +71,20 @@ _BIAS, _DELAY = NAMES.index("bias"), NAMES.index("delay")
 
 _PRIOR_SIGMA = np.array([math.inf, math.inf, math.inf, 1.0, 0.1, 0.02])
 """Standard deviations of the zero-mean priors of the constants, in the order of `NAMES`."""
-_NOISE_PRIOR = math.log(3.0)
-"""Prior standard deviation of the logarithms of the noise levels."""
+_NOISE_PRIOR = math.log(3.0)  # prior standard deviation of the logarithms of the noise levels
 _MAX_DELAY = 0.1
-_CONVERGED = 0.01
-"""Step size (standard deviations) below which the fit has converged."""
+_CONVERGED = 0.01  # step size (standard deviations) below which the fit has converged
 _MAX_ROUNDS = 25
 _NOISE_STEP = 0.02
 _NOISE_CONVERGED = 0.01
 _GATES = (30.0, 8.0)
 """Outlier gates in standard deviations of the innovations, first with assumed, then with estimated noise."""
-_MAX_RESTARTS = 0.02
-"""Largest fraction of samples at which the filter may restart."""
-_LAGS = 20
-"""Number of lags of the whiteness test."""
-_SEGMENTS = 40
-"""Number of segments of the record for the sandwich estimate."""
+_MAX_RESTARTS = 0.02  # largest fraction of samples at which the filter may restart
+_LAGS = 20  # number of lags of the whiteness test
+_SEGMENTS = 40  # number of segments of the record for the sandwich estimate
 _MIN_PROBABILITY = 1e-3
 """Probability below which the whiteness test rejects the hypothesis that the innovations are white."""
-_MAX_GAIN_ERROR = 0.25
-"""Largest accepted relative standard deviation of the gain."""
+_MAX_GAIN_ERROR = 0.25  # largest accepted relative standard deviation of the gain
 
 
 @dataclass(frozen=True, slots=True)

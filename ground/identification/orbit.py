@@ -36,8 +36,7 @@ from knightcube.vision.lens_knowledge import axes_turn
 Object = dict[str, Any]
 LEARNED = 0.5
 """Maximum ratio of estimated to configured standard deviation (rms) at which a quantity counts as learned."""
-_UNIFORM = math.sqrt(3.0)
-"""Largest error of a uniform distribution with a standard deviation of one."""
+_UNIFORM = math.sqrt(3.0)  # largest error of a uniform distribution with a standard deviation of one
 _FRACTIONS = np.geomspace(1.0, 1e-3, 13).tolist()
 """Fractions of the configured inertia accuracies that are tried, in decreasing order."""
 _ELEMENTS = ("xx", "yy", "zz", "yz", "zx", "xy")

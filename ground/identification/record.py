@@ -25,12 +25,9 @@ _AT_LIMIT = 0.97
 """Fraction of a coil's current limit above which the actual current may differ from the commanded current."""
 _RESOLUTION = 1.0e-4
 """Difference (A) above which two currents count as different; one PWM count is about 4e-5 A."""
-_SETTLED_FIELD = 0.5
-"""Time (s) from switching off the coils until the field is measured."""
-_MAX_GAP = 60.0
-"""Longest allowed time (s) between two samples."""
-_CLIPPED_VARIANCE = 100.0
-"""Factor by which the variance of a current is increased at the coil's limit."""
+_SETTLED_FIELD = 0.5  # time (s) from switching off the coils until the field is measured
+_MAX_GAP = 60.0  # longest allowed time (s) between two samples
+_CLIPPED_VARIANCE = 100.0  # factor by which the variance of a current is increased at the coil's limit
 _MAX_VALUES = {
     "imu": {"quaternion": 1.001, "rate": 50.0, "field": 0.1},
     "control": {"current_command": 10.0, "current_written": 10.0},

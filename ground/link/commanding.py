@@ -48,14 +48,11 @@ from ground.telemetry import text_of
 from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
-_BLOCK = 64
-"""Number of frame counters reserved at once, because each reservation takes two disk writes."""
+_BLOCK = 64  # number of frame counters reserved at once, because each reservation takes two disk writes
 _SILENCE_S = 5.0
 """Time (s) without telemetry after which the ground sends a ping while it awaits the reports on a command."""
-_REPEAT_NS = 5_000_000_000
-"""Time (ns) after which an unanswered command is sent again."""
-_BURST_S = 0.05
-"""Longest time (s) over which unused transmission capacity accumulates."""
+_REPEAT_NS = 5_000_000_000  # time (ns) after which an unanswered command is sent again
+_BURST_S = 0.05  # longest time (s) over which unused transmission capacity accumulates
 _VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TRANSFER = LAYOUTS[TRANSFER.name]
 

@@ -39,19 +39,16 @@ ADDRESS = "127.0.0.1:5013"
 _VERIFIED = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
-_MAX_UNSENT = 1 << 22
-"""Number of unsent bytes above which a connection is closed."""
+_MAX_UNSENT = 1 << 22  # number of unsent bytes above which a connection is closed
 _SPI, _BLOCK = 1, 64
 """Key (SPI) of the gateway's commands, and number of frame counters that are reserved at once."""
 _READ_BYTES = 1 << 16
 _PING_PERIOD_S = 20.0
 """Time (s) between the gateway's own pings, because the link forgets a UDP sender after a minute."""
-_TOKEN_S = 5.0
-"""Time (s) after which a connection without the token is closed."""
+_TOKEN_S = 5.0  # time (s) after which a connection without the token is closed
 _MOST_WITHOUT_TOKEN = 256
 """Maximum number of connections that have not sent the token; a further connection closes the oldest."""
-_REPORT_S = 1.0
-"""Minimum time (s) between two reports about connections without the token."""
+_REPORT_S = 1.0  # minimum time (s) between two reports about connections without the token
 _TOKEN_CHARACTERS = b"0123456789abcdef"
 _TOKEN_BYTES = 32
 _CHECKED_BYTES = HEADER_BYTES + 1

@@ -55,13 +55,11 @@ DEFAULTS = Link(keys="-")
 ADDRESSES = "HOST:PORT (UDP), tcp:HOST:PORT, /dev/FILE@BAUD, kiss:HOST:PORT or kiss:/dev/FILE@BAUD"
 """Permitted notations of the address at which the ground sends frames to the satellite."""
 
-_STORE_EVERY = 256
-"""Number of telemetry frames between two writes of the anti-replay counters."""
+_STORE_EVERY = 256  # number of telemetry frames between two writes of the anti-replay counters
 _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
-_TURN_S = 1.0
-"""Longest time (s) to wait while another program sends a frame with the same keys."""
+_TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
 FRAME_OVERHEAD_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
 """Number of bytes that a telecommand frame adds to its packet."""
 _LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))

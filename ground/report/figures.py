@@ -32,8 +32,7 @@ PATH_WINDOW_S = 20.0
 """Length (s) of the time axis, from the command of a step, in the figure of the planned paths."""
 _MIN_FIELD_ROTATION = np.radians(20.0)
 """Smallest rotation (rad) of the field in a run for which the figure of the coil cage is drawn."""
-_FIELD_STRIDE = 40
-"""Number of magnetometer readings (one second) of which only the first is drawn."""
+_FIELD_STRIDE = 40  # number of magnetometer readings (one second) of which only the first is drawn
 
 
 def save(figure: Figure, file: Path) -> None:

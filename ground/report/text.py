@@ -14,8 +14,7 @@ Object = dict[str, Any]
 
 ARCSECONDS = 648_000.0 / math.pi
 DEGREES = 180.0 / math.pi
-_MAX_LISTED = 20
-"""Maximum number of lines in the table of failed frames."""
+_MAX_LISTED = 20  # maximum number of lines in the table of failed frames
 
 
 def format_report(summary: Object) -> str:
