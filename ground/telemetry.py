@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import math
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import (
@@ -153,3 +161,160 @@ def _read_log(folder: Path, stem: str) -> ScanResult:
         return scan(b"".join(path.read_bytes() for path in find_segments(folder, stem)))
     except OSError as error:
         raise UsageError(f"{folder}: the {stem} log cannot be read: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class PacketColumn:
+    """Values of a column, as a list of texts or an array (n,) of numbers in native byte order."""
+
+    name: str
+    unit: str
+    meaning: str
+    values: list[str] | npt.NDArray[Any]
+
+
+def tables(run: Run) -> Iterator[tuple[str, list[PacketColumn]]]:
+    """Yield the name and the columns of each packet type in the run."""
+    for name, layout in LAYOUTS.items():
+        if len(run[name]):
+            yield name, list(_columns(layout, run[name]))
+
+
+def _columns(layout: Layout, packets: PacketArray) -> Iterator[PacketColumn]:
+    yield PacketColumn("time_s", "s", "mission time", np.asarray(packets["time_ns"] / 1e9))
+    for field in layout.packet.fields:
+        values = packets[field.name]
+        if field.kind.startswith("S"):
+            yield PacketColumn(field.name, field.unit, field.meaning, [to_text(value) for value in values])
+            continue
+        native = values.astype(values.dtype.newbyteorder("="))
+        spread = {field.name: native}
+        if field.count > 1:
+            spread = {f"{field.name}_{i + 1}": native[:, i] for i in range(field.count)}
+        for column, own in spread.items():
+            yield PacketColumn(column, field.unit, field.meaning, own)
+
+
+def write_csv(run: Run, folder: Path) -> list[Path]:
+    """Write `<packet>.csv` for each packet type, and return the files. Raises OSError.
+
+    The first row contains the names of the columns, and all other rows contain values. The file `fields.csv`
+    has one row for each column of each packet type, with its unit and meaning. NaN is written as `NaN`,
+    because polars reads a column with `nan` as text.
+    """
+    paths, described = [], []
+    for name, columns in tables(run):
+        paths.append(folder / f"{name}.csv")
+        described += [(name, column.name, column.unit, column.meaning) for column in columns]
+        rows = zip(*(_printed(column.values) for column in columns), strict=True)
+        _write_rows(paths[-1], [column.name for column in columns], rows)
+    paths.append(folder / "fields.csv")
+    _write_rows(paths[-1], ["packet", "name", "unit", "meaning"], described)
+    return paths
+
+
+def _printed(values: list[str] | npt.NDArray[Any]) -> list[Any]:
+    """Return the values of a column for a CSV file."""
+    if isinstance(values, list):
+        return values
+    return ["NaN" if math.isnan(value) else value for value in values.tolist()]
+
+
+def _write_rows(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(head)
+        writer.writerows(rows)
+
+
+_TYPES = {"f": "REAL", "i": "INTEGER", "u": "INTEGER"}
+_MAX_INTEGER = (1 << 63) - 1  # largest integer that SQLite supports
+
+
+def write_database(run: Run, file: Path) -> list[Path]:
+    """Write an SQLite database with one table per packet type, which replaces an existing file.
+
+    Raises OSError.
+
+    The table `fields` contains the unit and the meaning of each column. NaN becomes NULL, and a column with
+    integers of more than 63 bits becomes text, because SQLite supports neither.
+    """
+    made = file.with_name(f"{file.name}.part")
+    made.unlink(missing_ok=True)
+    try:
+        with closing(sqlite3.connect(made)) as database, database:
+            database.execute("CREATE TABLE fields (packet TEXT, name TEXT, unit TEXT, meaning TEXT)")
+            for name, columns in tables(run):
+                _write_table(database, name, columns)
+        os.replace(made, file)
+    except sqlite3.Error as error:
+        raise OSError(None, str(error), str(file)) from error
+    finally:
+        made.unlink(missing_ok=True)
+    return [file]
+
+
+def _write_table(database: sqlite3.Connection, name: str, columns: Sequence[PacketColumn]) -> None:
+    described = [(name, column.name, column.unit, column.meaning) for column in columns]
+    database.executemany("INSERT INTO fields VALUES (?, ?, ?, ?)", described)
+    shape = ", ".join(f'"{column.name}" {_type(column)}' for column in columns)
+    database.execute(f'CREATE TABLE "{name}" ({shape})')
+    marks = ", ".join("?" * len(columns))
+    rows = zip(*(_plain(column) for column in columns), strict=True)
+    database.executemany(f'INSERT INTO "{name}" VALUES ({marks})', rows)
+
+
+def _type(column: PacketColumn) -> str:
+    values = column.values
+    return "TEXT" if isinstance(values, list) or _is_wide(values) else _TYPES[values.dtype.kind]
+
+
+def _plain(column: PacketColumn) -> list[object]:
+    values = column.values
+    if isinstance(values, list):
+        return list(values)
+    return [str(value) for value in values.tolist()] if _is_wide(values) else list(values.tolist())
+
+
+def _is_wide(values: npt.NDArray[Any]) -> bool:
+    """Return whether a value is too large for an SQLite integer."""
+    return bool(values.dtype.kind == "u" and np.any(values > _MAX_INTEGER))
+
+
+def write_parquet(run: Run, folder: Path) -> list[Path]:
+    """Write `<packet>.parquet` for each packet type, with unit and meaning as metadata, and return the files.
+
+    Raises OSError, and UsageError without pyarrow.
+    """
+    try:
+        import pyarrow  # noqa: PLC0415 - an extra
+        from pyarrow import parquet  # noqa: PLC0415
+    except ImportError as error:
+        raise UsageError("Parquet needs pyarrow: pip install 'knightcube-flight[parquet]'") from error
+    paths = []
+    for name, columns in tables(run):
+        arrays = [pyarrow.array(column.values) for column in columns]
+        fields = [
+            pyarrow.field(column.name, array.type, metadata={"unit": column.unit, "meaning": column.meaning})
+            for column, array in zip(columns, arrays, strict=True)
+        ]
+        paths.append(folder / f"{name}.parquet")
+        parquet.write_table(pyarrow.table(arrays, schema=pyarrow.schema(fields)), paths[-1])
+    return paths
+
+
+FORMATS = {"csv": "csv", "parquet": "parquet", "sqlite": "run.sqlite"}
+"""Default output of each format in the folder of a run: a folder, or for SQLite a file."""
+
+
+def export(run: Run, place: Path, form: str = "csv") -> list[Path]:
+    """Write all packets in one of `FORMATS` into the folder or file `place`, and return the files.
+
+    Raises UsageError if `place` cannot be written or a library is missing.
+    """
+    write = {"csv": write_csv, "parquet": write_parquet, "sqlite": write_database}[form]
+    try:
+        (place.parent if form == "sqlite" else place).mkdir(parents=True, exist_ok=True)
+        return write(run, place)
+    except OSError as error:
+        raise UsageError(f"{place}: {form} cannot be written: {error.strerror or error}") from error

@@ -1,4 +1,4 @@
-"""State of a flight from its log or its command socket, written as lines of text."""
+"""State of a flight from its log or its command socket, as lines of text or as a panel in the terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from flight.app.run import utc_ns
 from flight.link import events
 from flight.link.commands import CommandPacker, Ping
 from flight.link.telemetry.definitions import COMMAND, EVENT, FACTS, MODES, SEVERITIES, STEERING
+from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.fields import States
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
@@ -25,7 +26,11 @@ from ground.telemetry import decode, scan
 from knightcube.astro.quaternion import angle_between
 from knightcube.errors import FlightError, UsageError
 
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
 STREAMS = ("imu", "field", "coils", "power", "camera")
+LISTED_EVENTS = 12
 _KEPT_EVENTS = 200
 _MAX_TIME = 1e15  # mission time (s) above which a packet is assumed to be damaged
 _TIMEOUT_S = 2.0  # longest time (s) to wait for the answer to a ping
@@ -287,3 +292,86 @@ def attitude_text(state: FlightState) -> str:
     if rate is not None and np.all(np.isfinite(rate)):
         parts.append(f"{1e3 * float(np.linalg.norm(rate)):.2f} mrad/s")
     return "  ".join(parts)
+
+
+_BAR = 20  # width (characters) of the bar that shows a coil current
+_MODE_COLOURS = {
+    "safe": "bold white on red",
+    "boot": "bold black on yellow",
+    "detumble": "bold black on yellow",
+}
+_STREAM_COLOURS = {"good": "green", "no-reading-yet": "dim"}
+"""Colours of the stream states that are not alarms."""
+_SEVERITY_COLOURS = ("dim", "yellow", "bold red")
+_Line = list[tuple[str, str]]
+"""Line of the panel as texts with their styles."""
+
+
+def panel(state: FlightState, silence: float) -> RenderableType:
+    """Return the panel of a flight whose log has not grown for `silence` s. Needs the package rich."""
+    from rich.console import Group  # noqa: PLC0415 - an extra
+    from rich.panel import Panel  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(style="bold cyan", no_wrap=True)
+    facts.add_column()
+    for name, line in _panel_lines(state):
+        facts.add_row(name, Text.assemble(*line))
+    duration = state.value("run", "duration")
+    planned = f" of {duration:.0f}" if duration is not None and math.isfinite(duration) else ""
+    mode = state.mode or "mode not known"
+    colour = _MODE_COLOURS.get(state.mode, "bold black on green")
+    title = Text(" ").join([Text(f" {mode} ", colour), Text(f"{state.time:.1f} s{planned}", "bold")])
+    silent = f"no packet for {silence:.0f} s" if silence > 3.0 else ""
+    end = Text(f"ended: {state.ended}" if state.ended else silent, "bold")
+    listed = Table(box=None, pad_edge=False, show_header=False)
+    for column in range(4):
+        listed.add_column(no_wrap=column < 3)
+    for event in list(state.events)[-LISTED_EVENTS:]:
+        colour = _SEVERITY_COLOURS[min(event.severity, len(_SEVERITY_COLOURS) - 1)]
+        severity = named(SEVERITIES, event.severity)
+        cells = (f"{event.time:9.3f} s", severity, event.name, event.text)
+        listed.add_row(*(Text(cell, colour) for cell in cells))
+    body = Group(facts, Text(), listed)
+    return Panel(body, title=title, title_align="left", subtitle=end, subtitle_align="left")
+
+
+def _panel_lines(state: FlightState) -> Iterator[tuple[str, _Line]]:
+    """Yield the name and the line of each quantity that is known."""
+    if (name := state.value("run", "config_name")) is not None:
+        kind = "simulated" if state.value("run", "simulated") else "real devices"
+        yield "flight", [(f"{printable(to_text(name))}, {kind}", "")]
+    yield "attitude", [(attitude_text(state) or "no estimate", "")]
+    written, limit = state.value("control", "current_written"), state.value("run", "current_limit")
+    for axis, current in zip("xyz", () if written is None else written, strict=False):
+        share = abs(current) / limit if limit and math.isfinite(current) else 0.0
+        filled = min(_BAR, round(_BAR * share)) if math.isfinite(share) else 0
+        bar = ("█" * filled, "red" if filled == _BAR else "blue")
+        yield f"coil {axis}", [(f"{1e3 * current:+8.1f} mA ", ""), bar, ("░" * (_BAR - filled), "")]
+    if (steering := state.value("control", "state")) is not None:
+        yield "steering", [(named(STEERING, steering), "")]
+    if (house := state.newest.get("housekeeping")) is not None:
+        volts, amperes, watts = (house[f"coil_{name}"] for name in ("voltage", "current", "power"))
+        text = f"{_figure(volts, 2)} V  {_figure(1e3 * amperes, 1)} mA  {_figure(1e3 * watts, 1)} mW"
+        yield "coil bus", [(text, "")]
+        frames, rates = int(house["frames"]), int(house["streak_rates"])
+        yield "camera", [(f"{frames} frames, {rates} rates used by the estimator", "")]
+    if (health := state.newest.get("health")) is not None:
+        streams = {name: named(STREAM_STATES, health[name]) for name in STREAMS}
+        yield (
+            "streams",
+            [
+                (f"{name} {stream}  ", _STREAM_COLOURS.get(stream, "bold red"))
+                for name, stream in streams.items()
+                if stream != "not-fitted"
+            ],
+        )
+        processor = _figure(100.0 * health["cpu_share"], 0)
+        yield "loop", [(f"slips {int(health['slips'])}  processor {processor} %  faults {state.faults}", "")]
+
+
+def _figure(value: float, digits: int) -> str:
+    """Return a number as text, or "-" if it is unknown."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"

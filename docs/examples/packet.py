@@ -11,8 +11,7 @@ from pathlib import Path
 from flight.link.telemetry.definitions import THERMAL
 from flight.link.telemetry.log import FlightLog, Recorder
 from ground.documentation import markdown
-from ground.export import export
-from ground.telemetry import read_run
+from ground.telemetry import export, read_run
 from sim_hal.clock import SimClock
 
 

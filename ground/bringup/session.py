@@ -15,9 +15,8 @@ import msgspec
 import numpy as np
 
 from flight.schema.sections import Config
-from ground.bringup.bench import STILL_S, Outcome, Session, StepSkipped
+from ground.bringup.bench import STILL_S, Outcome, Session, StepSkipped, find
 from ground.bringup.cameras import step_dark, step_focus, step_lens, step_light, step_wide
-from ground.bringup.devices import find
 from ground.bringup.diagnosis import (
     FEWEST,
     QUARTER,

@@ -320,7 +320,7 @@ _TEXTS: dict[str, Callable[[Mapping[str, Any]], str]] = {
 
 
 def _draw(folder: Path, outcomes: Mapping[str, Outcome]) -> None:
-    from ground.bringup.picture import draw  # noqa: PLC0415 - loads matplotlib
+    from ground.report.figures import draw_bench  # noqa: PLC0415 - loads matplotlib
 
     frames = {title: folder / f"{title}.png" for title in ("dark", "light", "focus")}
-    draw(folder / PICTURE, outcomes, {title: path for title, path in frames.items() if path.exists()})
+    draw_bench(folder / PICTURE, outcomes, {title: path for title, path in frames.items() if path.exists()})

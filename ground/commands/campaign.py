@@ -48,9 +48,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the campaign, and print its summary."""
     from ground.campaigns import CampaignError  # noqa: PLC0415
-    from ground.campaigns.picture import draw_campaign  # noqa: PLC0415
     from ground.campaigns.runner import fly, results_in  # noqa: PLC0415 - no other command needs devices
-    from ground.campaigns.varied import variation_of, varied_campaign  # noqa: PLC0415
+    from ground.campaigns.varied import (  # noqa: PLC0415
+        draw_campaign,
+        variation_of,
+        varied_campaign,
+    )
 
     campaign = varied_campaign(
         options.config, [variation_of(text) for text in options.vary], options.duration

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from ground.commands.options import (
     check_size,
     finite,
     positive,
+    print_result,
     read_picture,
 )
 from ground.pictures import draw_circle, draw_horizon
@@ -110,10 +110,7 @@ def run(options: argparse.Namespace) -> int:
         # The relative uncertainty of the focal length is df / f = d(fov) / sin(fov).
         sigma = math.radians(options.fov_error) / math.sin(math.radians(options.fov))
         solution = nadir_of_uncertain_field(pixels, camera, sigma, knowledge, settings, hidden)
-    if options.json:
-        sys.stdout.write(json.dumps(_facts(solution, altitude is None), allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_text(solution, altitude is None))
+    print_result(options, _facts(solution, altitude is None), _text(solution, altitude is None))
     if options.overlay is not None:
         write_picture(options.overlay, draw_horizon(grey_stretch(pixels), solution, camera))
         if not options.json:
@@ -277,10 +274,8 @@ def _run_paper(options: argparse.Namespace, pixels: Image, camera: CameraModel) 
         found = _found(options, pixels, camera)
     except (NoHorizonError, GraphicMethodError) as error:
         reason = str(error)
-    if options.json:
-        sys.stdout.write(json.dumps(_paper_facts(options.method, found, reason), allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_paper_text(options.method, found, reason))
+    facts = _paper_facts(options.method, found, reason)
+    print_result(options, facts, _paper_text(options.method, found, reason))
     if options.overlay is not None:
         picture = grey_stretch(pixels)
         drawn = picture if found is None else draw_circle(picture, found.seen, camera)

@@ -8,7 +8,6 @@ flight, so for a satellite the command only reads the folder of a run.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -23,22 +22,25 @@ from flight.schema import reader as configuration
 from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig
 from flight.schema.testbed import TestbedConfig
-from ground.commands.options import positive, write_new
-from ground.identification.fit import NAMES, UNITS, PlantFit, fit
-from ground.identification.orbit import LearnedDescription, LearnedQuantity, fragment, learned_description
-from ground.identification.record import Record, read_record
-from ground.identification.scale import (
+from ground.commands.options import positive, print_result, write_new
+from ground.identification.fit import (
     DURATION,
     MAGNETOMETER_ERROR,
+    NAMES,
+    UNITS,
     AbsolutePlant,
+    PlantFit,
     absolute,
     config_text,
     configured_constants,
     excitation_config,
+    fit,
     noise_of,
     plant_text,
     prior_of,
 )
+from ground.identification.orbit import LearnedDescription, LearnedQuantity, fragment, learned_description
+from ground.identification.record import Record, read_record
 from ground.telemetry import read_run
 from knightcube.errors import UsageError
 
@@ -124,11 +126,7 @@ def run(options: argparse.Namespace) -> int:
     made = _identify(folder)
     if options.out is not None:
         write_new(options.out, made.fragment)
-    if options.json:
-        sys.stdout.write(json.dumps(_facts(made), allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_text(made))
-        sys.stdout.write(f"\nwritten: {options.out}\n" if options.out is not None else "\n" + made.fragment)
+    print_result(options, _facts(made), _text(made) + _written(options, made.fragment))
     if options.picture is not None:
         from ground.report import draw_fit  # noqa: PLC0415
 
@@ -147,18 +145,15 @@ def _show_learned(options: argparse.Namespace, folder: Path, config: OrbitConfig
     text = fragment(found, folder, os.path.relpath(folder / "config.yaml", place))
     if options.out is not None:
         write_new(options.out, text)
-    if options.json:
-        facts = {
-            "folder": str(folder),
-            "time_s": found.time,
-            "quantities": {name: _quantity_facts(one) for name, one in found.quantities.items()},
-            "fragment": text,
-        }
-        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
-        return 0
-    sys.stdout.write(_table(found, folder))
-    sys.stdout.write(f"\nwritten: {options.out}\n" if options.out is not None else "\n" + text)
+    quantities = {name: _quantity_facts(one) for name, one in found.quantities.items()}
+    facts = {"folder": str(folder), "time_s": found.time, "quantities": quantities, "fragment": text}
+    print_result(options, facts, _table(found, folder) + _written(options, text))
     return 0
+
+
+def _written(options: argparse.Namespace, fragment: str) -> str:
+    """Return the name of the written file, or the text for the configuration if no file was written."""
+    return f"\nwritten: {options.out}\n" if options.out is not None else "\n" + fragment
 
 
 def _quantity_facts(one: LearnedQuantity) -> dict[str, Any]:

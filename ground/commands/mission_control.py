@@ -21,8 +21,8 @@ from flight.link.telemetry.log import SUFFIX, find_runs, find_segments
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES, walk
 from flight.schema.document import config_path
 from flight.schema.reader import load
+from ground.commands.elements import add_stations, predicted
 from ground.commands.options import count, positive
-from ground.commands.passes import add_stations, predicted
 from ground.link.commanding import terminal_of
 from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.link.terminal import DEFAULTS
@@ -35,18 +35,19 @@ from ground.yamcs import (
     RECORDED,
     USER,
     USERS,
+    Session,
+    add_passes,
     command_line,
     compile_link,
     missing,
     password_in,
     write,
 )
-from ground.yamcs_operations import Session, add_passes
 from knightcube.errors import FlightError, UsageError
 
 if TYPE_CHECKING:
     from flight.schema.sections import Link
-    from ground.console.description import Body
+    from ground.documentation import Body
     from ground.passes import OrbitPrediction, Station
 
 _ASK_S = 0.2  # interval (s) between two requests for the state of Yamcs

@@ -24,20 +24,18 @@ from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
 from ground.commands.elements import elements_of
 from ground.commands.options import write_new
-from ground.commands.satellite_questions import (
+from ground.satellite_description import (
     COIL_EXAMPLE,
     QUESTIONS,
     Apsides,
+    Derived,
     Question,
+    Satellite,
     Values,
     check_values,
-    read_value,
-)
-from ground.satellite_description import (
-    Derived,
-    Satellite,
     configuration_text,
     derived,
+    read_value,
     sun_synchronous_inclination,
 )
 from knightcube.astro.earth.figure import EARTH_RADIUS

@@ -1,13 +1,16 @@
-"""Command-line arguments that several commands share."""
+"""Command-line arguments and output that several commands share."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import re
+import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from flight.schema.document import config_path
 from knightcube.astro.arrays import Image
@@ -40,6 +43,11 @@ def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespac
     parser.set_defaults(command=run)
 
 
+def print_result(options: argparse.Namespace, facts: Any, text: str) -> None:
+    """Print a result as one JSON object if the option `--json` is given, otherwise as text."""
+    sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n" if options.json else text)
+
+
 def read_picture(options: argparse.Namespace) -> Image:
     """Return the pixels (rows, columns) of the picture that the arguments name. Raises UsageError."""
     pixels = read_raw(options.image, *options.raw) if options.raw else read_image(options.image)
@@ -55,10 +63,7 @@ def check_size(path: Path, pixels: Image) -> None:
 
 
 def raw_shape(text: str) -> tuple[int, int, int]:
-    """Return the columns, rows and bits of a raw picture.
-
-    Raises ArgumentTypeError unless the text has the form 1280x960x16.
-    """
+    """Return columns, rows and bits from a text such as 1280x960x16. Raises ArgumentTypeError."""
     found = _RAW.fullmatch(text)
     if found is None or "0" in found.groups():
         raise argparse.ArgumentTypeError(f"{text!r}: give columns x rows x bits, such as 1280x960x16")
@@ -67,10 +72,7 @@ def raw_shape(text: str) -> tuple[int, int, int]:
 
 
 def positive(text: str) -> float:
-    """Return the positive number in an argument.
-
-    Raises ArgumentTypeError unless the number is finite and positive.
-    """
+    """Return the positive finite number in an argument. Raises ArgumentTypeError for other texts."""
     value = finite(text)
     if value <= 0.0:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
@@ -85,10 +87,7 @@ def count(text: str) -> int:
 
 
 def finite(text: str) -> float:
-    """Return the finite number in an argument.
-
-    Raises ArgumentTypeError unless the number is finite.
-    """
+    """Return the finite number in an argument. Raises ArgumentTypeError for other texts."""
     try:
         value = float(text)
     except ValueError as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -17,7 +16,7 @@ from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
-from ground.commands.options import finite, positive, utc
+from ground.commands.options import finite, positive, print_result, utc
 from knightcube import plan_slew, plan_step
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
@@ -103,10 +102,7 @@ def _run_testbed(options: argparse.Namespace) -> int:
         minimise=options.cost or config.guidance.cost,
     )
     solved_s = time.perf_counter() - begun
-    if options.json:
-        sys.stdout.write(json.dumps(_facts(made, plant, solved_s), allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_text(made, plant, solved_s))
+    print_result(options, _facts(made, plant, solved_s), _text(made, plant, solved_s))
     if options.picture is not None:
         from ground.report import draw_path  # noqa: PLC0415
 
@@ -209,20 +205,14 @@ def _run_orbit(options: argparse.Namespace) -> int:
     made = _planned(options, config, config.elements, at)
     solved_s = time.process_time() - begun
     facts = _orbit_facts(made, at, solved_s)
-    sys.stdout.write(
-        json.dumps(facts | _nodes(made), allow_nan=False) + "\n" if options.json else _orbit_text(facts)
-    )
+    print_result(options, facts | _nodes(made), _orbit_text(facts))
     if options.picture is not None:
-        _draw(made, options)
+        from ground.report import draw_slew  # noqa: PLC0415
+
+        draw_slew(made, made.order, options.picture)
+        if not options.json:
+            sys.stdout.write(f"picture:       {options.picture}\n")
     return 0
-
-
-def _draw(made: OrderedSlew, options: argparse.Namespace) -> None:
-    from ground.report import draw_slew  # noqa: PLC0415
-
-    draw_slew(made, made.order, options.picture)
-    if not options.json:
-        sys.stdout.write(f"picture:       {options.picture}\n")
 
 
 def _planned(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 from dataclasses import replace
@@ -13,7 +12,15 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, camera_model, likelihood_settings
-from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
+from ground.commands.options import (
+    add_field,
+    add_output,
+    add_picture,
+    finite,
+    positive,
+    print_result,
+    read_picture,
+)
 from ground.pictures import draw_marks
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
@@ -68,16 +75,9 @@ def run(options: argparse.Namespace) -> int:
     likelihood = _likelihood(options, camera)
     found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
     objects = _objects(pixels, pinhole, found, likelihood)
-    if options.json:
-        facts = {
-            **_facts(found, objects, options.method),
-            "shutter_described": not likelihood.shutter_unstated,
-        }
-        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_text(found, objects))
-        if isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated:
-            sys.stdout.write(_SHUTTER)
+    facts = _facts(found, objects, options.method) | {"shutter_described": not likelihood.shutter_unstated}
+    unstated = isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated
+    print_result(options, facts, _text(found, objects) + (_SHUTTER if unstated else ""))
     if options.overlay is not None:
         ends = [item.endpoints for item in objects]
         write_picture(options.overlay, draw_marks(grey_stretch(pixels), found.endpoints, found.used, ends))

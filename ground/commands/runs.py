@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -11,10 +10,10 @@ import numpy as np
 
 from flight.link.telemetry.log import find_runs
 from ground import report as reporting
-from ground.export import FORMATS, export
+from ground.commands.options import print_result
 from ground.messages import ObjectOrbit, orbits_of, write_attitudes, write_orbit_messages, write_tracking_data
 from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
-from ground.telemetry import read_run
+from ground.telemetry import FORMATS, export, read_run
 from knightcube.errors import UsageError
 
 
@@ -42,18 +41,12 @@ def run_report(options: argparse.Namespace) -> int:
         return _compare(options)
     if find_runs(options.run):
         archive = summarise_archive(options.run)
-        text = json.dumps(archive, allow_nan=False) + "\n" if options.json else format_archive(archive)
-        sys.stdout.write(text)
+        print_result(options, archive, format_archive(archive))
         return 0
     run = read_run(options.run)
     summary = reporting.summarise(run)
-    if options.json:
-        sys.stdout.write(json.dumps(summary, allow_nan=False) + "\n")
-        if options.figures is None:
-            return 0
-    else:
-        sys.stdout.write(reporting.format_report(summary))
-    if options.no_figures:
+    print_result(options, summary, reporting.format_report(summary))
+    if options.no_figures or (options.json and options.figures is None):
         return 0
     try:
         paths = reporting.draw(run, options.figures or options.run / "figures")
@@ -70,8 +63,7 @@ def _compare(options: argparse.Namespace) -> int:
     """Print the results of two runs side by side, and draw both runs if a folder is given."""
     runs = [read_run(folder) for folder in (options.run, options.other)]
     compared = compare(*(reporting.summarise(run) for run in runs))
-    text = json.dumps(compared, allow_nan=False) + "\n" if options.json else format_comparison(compared)
-    sys.stdout.write(text)
+    print_result(options, compared, format_comparison(compared))
     if options.figures is not None and not options.no_figures:
         path = reporting.draw_both(runs[0], runs[1], options.figures)
         if not options.json:
@@ -115,10 +107,7 @@ def run_export(options: argparse.Namespace) -> int:
     else:
         place = options.out or options.run / FORMATS[options.format]
         paths = export(read_run(options.run), place, options.format)
-    if options.json:
-        sys.stdout.write(json.dumps({"files": [str(path) for path in paths]}) + "\n")
-    else:
-        sys.stdout.write("".join(f"{path}\n" for path in paths))
+    print_result(options, {"files": [str(path) for path in paths]}, "".join(f"{path}\n" for path in paths))
     return 0
 
 
@@ -146,11 +135,8 @@ def run_orbit(options: argparse.Namespace) -> int:
     """Determine, print and write the initial orbits."""
     found = orbits_of(read_run(options.run))
     paths = [] if options.opm is None else write_orbit_messages(found, options.opm, options.xml)
-    if options.json:
-        facts = {"objects": [_orbit_facts(item) for item in found], "files": [str(path) for path in paths]}
-        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
-    else:
-        sys.stdout.write("".join(map(_orbit_text, found)) + "".join(f"{path}\n" for path in paths))
+    facts = {"objects": [_orbit_facts(item) for item in found], "files": [str(path) for path in paths]}
+    print_result(options, facts, "".join([*map(_orbit_text, found), *(f"{path}\n" for path in paths)]))
     return 0 if all(item.orbit is not None for item in found) else 1
 
 

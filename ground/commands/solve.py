@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -21,6 +20,7 @@ from ground.commands.options import (
     add_picture,
     finite,
     positive,
+    print_result,
     read_picture,
     utc,
     write_new,
@@ -104,12 +104,9 @@ def run(options: argparse.Namespace) -> int:
     if sky_map is not None and options.date is not None:
         bodies = bodies_in(sky_map, julian_date(options.date))
     reversed_rows = options.raw is None and rows_reversed(options.image)
-    if options.json:
-        values = {"attitude_method": options.attitude, "centroid_method": options.centroid}
-        values |= facts(solution, seconds) | sky_facts(sky_map, bodies, reversed_rows)
-        sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
-    else:
-        sys.stdout.write(_text(solution, seconds) + sky_text(sky_map, bodies))
+    values = {"attitude_method": options.attitude, "centroid_method": options.centroid}
+    values |= facts(solution, seconds) | sky_facts(sky_map, bodies, reversed_rows)
+    print_result(options, values, _text(solution, seconds) + sky_text(sky_map, bodies))
     if options.wcs is not None and sky_map is not None:
         write_new(options.wcs, header_text(sky_map, reversed_rows))
     if options.overlay is not None:

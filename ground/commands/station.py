@@ -34,6 +34,7 @@ from ground.watch import (
     attitude_text,
     event_line,
     named,
+    panel,
     state_line,
 )
 from knightcube.errors import FlightError, UsageError
@@ -203,8 +204,6 @@ def _panel(
     """Return a context with a function that updates the panel, or None without rich."""
     try:
         from rich.live import Live  # noqa: PLC0415 - an extra
-
-        from ground.watch_panel import panel  # noqa: PLC0415
     except ModuleNotFoundError:
         sys.stderr.write("knightcube: a panel needs rich: pip install 'knightcube-flight[watch]'\n")
         return None
@@ -338,8 +337,7 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
 
     The exit stack `stack` closes the resources of the console.
     """
-    from ground.console.commanding import CommandForms, LinkFeed, by_socket, flying  # noqa: PLC0415
-    from ground.console.files import LinkFiles, RunFiles  # noqa: PLC0415
+    from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles, by_socket, flying  # noqa: PLC0415  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415
     from ground.console.surroundings import UNKNOWN, FlightSurroundings, FrameFolder  # noqa: PLC0415

@@ -29,12 +29,10 @@ from flight.link.commands import Point, words_of
 from flight.link.process.directives import KINDS
 from flight.link.telemetry.definitions import CONTROL, LINK, NAVIGATION, SPIN, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
-from ground.console.commanding import CommandForms
-from ground.console.description import Body, add_components, endings
-from ground.console.files import Files
+from ground.console.commanding import CommandForms, Files
 from ground.console.history import MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
-from ground.documentation import database
+from ground.documentation import Body, add_components, database, endings
 from knightcube.errors import FlightError, UsageError
 
 PAGE = Path(__file__).parent / "page"

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.schema.reader import load
-from ground.console.description import Body
+from ground.documentation import Body
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements

@@ -67,8 +67,7 @@ def draw_day(
 ) -> None:
     """Draw passes and eclipses of a span as a PNG, with the targets (start in s, name). Raises UsageError."""
     with drawing(file):
-        from ground.report.figures import save  # noqa: PLC0415
-        from ground.report.orbit_figures import day_figure  # noqa: PLC0415
+        from ground.report.figures import day_figure, save  # noqa: PLC0415
 
         save(day_figure(prediction, stations, targets), file)
 
@@ -76,8 +75,7 @@ def draw_day(
 def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:
     """Draw one planned slew in orbit as a PNG. Raises UsageError."""
     with drawing(file):
-        from ground.report.figures import save  # noqa: PLC0415
-        from ground.report.orbit_figures import slew_figure  # noqa: PLC0415
+        from ground.report.figures import save, slew_figure  # noqa: PLC0415
 
         save(slew_figure(made, order), file)
 

@@ -21,7 +21,7 @@ from flight.schema import reader
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.identification.orbit import learned_lens
-from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements
+from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements, star_camera
 from ground.report.signals import (
     PowerHistory,
     ThreadMotion,
@@ -36,7 +36,6 @@ from ground.report.signals import (
     streaks,
     true_attitude,
 )
-from ground.report.star_camera import star_camera
 from ground.report.steps import against_thesis, judged_steps, step_row
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray

@@ -16,8 +16,7 @@ import pytest
 from flight.link.telemetry.definitions import EVENT, HOUSEKEEPING, RUN
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
-from ground.export import export
-from ground.telemetry import Run, read_run
+from ground.telemetry import Run, export, read_run
 from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run

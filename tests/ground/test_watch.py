@@ -24,7 +24,7 @@ from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Packer, PacketArray
 from ground.commands import station
 from ground.telemetry import read_run, scan
-from ground.watch import FlightState, LogTail, PlainLines, state_line
+from ground.watch import LISTED_EVENTS, FlightState, LogTail, PlainLines, panel, state_line
 from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
@@ -147,8 +147,6 @@ def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same(
     assert "?[2Jgone??" in text
     assert all(letter.isprintable() or letter == "\n" for letter in text)
     console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
-    from ground.watch_panel import panel  # noqa: PLC0415 - needs rich
-
     console.print(panel(view, 0.0))
     assert "\x1b" not in console.export_text()
 
@@ -160,8 +158,6 @@ def _wild(kind: str, count: int) -> object:
 
 def test_the_panel_shows_mode_attitude_currents_streams_and_the_newest_events(growing: Path) -> None:
     console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
-    from ground.watch_panel import LISTED_EVENTS, panel  # noqa: PLC0415 - needs rich
-
     view = FlightState()
     view.update(scan((growing / "flight-0001.ccsds").read_bytes()).packets)
     packer = Packer()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ground.messages import write_tracking_data
+from ground.report.figures import objects_figure
 from ground.report.orbit import objects
-from ground.report.orbit_figures import objects_figure
 from ground.report.panels import RunSignals
 from ground.report.summary import summarise
 from ground.report.text import format_report

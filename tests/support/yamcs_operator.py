@@ -12,8 +12,7 @@ from yamcs.client.activities import StackActivity
 from yamcs.protobuf.activities import activities_pb2
 
 from ground.xtce import SPACE
-from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, UP_BUCKET, USER
-from ground.yamcs_operations import PASS, STACKS
+from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, PASS, STACKS, UP_BUCKET, USER
 
 _LONGEST_S = 120.0
 _ENDED = {"SUCCESSFUL", "FAILED", "CANCELLED"}

@@ -15,9 +15,8 @@ import yaml
 
 from flight.app.cli import main
 from ground.campaigns import varied
-from ground.campaigns.picture import draw_campaign
 from ground.campaigns.runner import Result, fly
-from ground.campaigns.varied import variation_of, varied_campaign
+from ground.campaigns.varied import draw_campaign, variation_of, varied_campaign
 from knightcube.errors import UsageError
 
 DEMO = Path(__file__).parents[3] / "config" / "step_demo.yaml"

@@ -18,9 +18,10 @@ import pytest
 
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.reader import load
-from ground.commands.satellite_questions import QUESTIONS, read_coils
 from ground.satellite_description import (
+    QUESTIONS,
     largest_dipole,
+    read_coils,
     sun_synchronous_inclination,
 )
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements

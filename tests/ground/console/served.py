@@ -10,8 +10,7 @@ from typing import Any
 from aiohttp import CookieJar
 from aiohttp.test_utils import TestClient, TestServer
 
-from ground.console.commanding import CommandForms
-from ground.console.files import RunFiles
+from ground.console.commanding import CommandForms, RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console, application
 from ground.console.surroundings import FlightSurroundings

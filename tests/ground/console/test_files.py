@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from ground.console.commanding import LinkFeed
-from ground.console.files import LinkFiles, RunFiles
+from ground.console.commanding import LinkFeed, LinkFiles, RunFiles
 from knightcube.errors import FlightError, UsageError
 from tests.flight.link.process.filed_ends import FiledEnds
 

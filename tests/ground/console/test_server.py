@@ -20,8 +20,7 @@ from flight.link.commands import COMMANDS, POINT, Command, crc_of
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
-from ground.console.commanding import CommandForms
-from ground.console.files import RunFiles
+from ground.console.commanding import CommandForms, RunFiles
 from ground.console.history import History
 from ground.console.server import Access, Console
 from ground.console.surroundings import UNKNOWN, FlightSurroundings

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from ground.identification.fit import fit
-from ground.identification.scale import absolute, noise_of, prior_of
+from ground.identification.fit import absolute, fit, noise_of, prior_of
 from tests.ground.identification.worlds import believed, drawn, fly_bare, fly_stack, motion_error, scale_error
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground.identification.fit import PlantFit, fit
+from ground.identification.fit import PlantFit, fit, noise_of
 from ground.identification.record import Record
-from ground.identification.scale import noise_of
 from tests.ground.identification.worlds import World, believed, drawn, fly_bare
 from tests.support.shared_results import made_once
 

@@ -19,9 +19,9 @@ from ground.identification.fit import (
     first_guess,
     fit,
     innovations,
+    noise_of,
 )
 from ground.identification.record import IdentificationError, Record, Timeline
-from ground.identification.scale import noise_of
 from knightcube.astro.arrays import FloatArray
 from tests.ground.identification.conftest import Identified
 from tests.ground.identification.excitations import USUAL

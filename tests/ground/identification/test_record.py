@@ -11,9 +11,8 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import chi2
 
-from ground.identification.fit import fit
+from ground.identification.fit import excitation_config, fit, noise_of
 from ground.identification.record import IdentificationError, Record, read_record
-from ground.identification.scale import excitation_config, noise_of
 from ground.telemetry import Run, ScanResult
 from knightcube.errors import UsageError
 from tests.ground.identification.worlds import World, believed, fly_stack, motion_error

@@ -14,10 +14,10 @@ from scipy.stats import chi2
 
 from flight.schema.reader import parse
 from flight.schema.testbed import as_testbed
-from ground.identification.fit import MotionConstants, PlantFit
-from ground.identification.record import HorizontalField
-from ground.identification.scale import (
+from ground.identification.fit import (
     AbsolutePlant,
+    MotionConstants,
+    PlantFit,
     PlantPrior,
     PriorValue,
     absolute,
@@ -27,6 +27,7 @@ from ground.identification.scale import (
     plant_text,
     prior_of,
 )
+from ground.identification.record import HorizontalField
 from tests.ground.identification.conftest import Identified
 from tests.ground.identification.worlds import believed, drawn, scale_error
 from tests.support import flights

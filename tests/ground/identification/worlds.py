@@ -11,16 +11,16 @@ import numpy as np
 from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.testbed import Identification, TestbedConfig
-from ground.identification.fit import MotionConstants
-from ground.identification.record import HorizontalField, Record, read_record
-from ground.identification.scale import (
+from ground.identification.fit import (
     DIPOLE_ERROR,
     FIELD_ERROR,
     INERTIA_ERROR,
     MAGNETOMETER_ERROR,
     AbsolutePlant,
+    MotionConstants,
     excitation_config,
 )
+from ground.identification.record import HorizontalField, Record, read_record
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.one_axis import ExcitationController, ExcitationSettings
 from knightcube.gnc.guidance.plant import PathSample

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from flight.bodies.testbed.control import plant_of
 from flight.link import events
 from flight.link.modes import Mode
-from ground.report import figures, orbit_figures, panels
+from ground.report import figures, panels
 from ground.report.panels import RunSignals
 from ground.telemetry import Run
 from knightcube.astro.quaternion import from_rotation_vector
@@ -356,15 +356,15 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "comparison": _comparison,
     "path": _path,
     "fit": lambda: figures.fit_figure(*identified()),
-    "spin": lambda: _orbit(orbit_figures.spin_figure),
-    "spin without the truth": lambda: _orbit(orbit_figures.spin_figure, False),
-    "knowledge": lambda: _orbit(orbit_figures.knowledge_figure),
-    "pointing": lambda: _orbit(orbit_figures.pointing_figure),
-    "pointing without the truth": lambda: _orbit(orbit_figures.pointing_figure, False),
-    "track": lambda: _orbit(orbit_figures.track_figure),
-    "objects": lambda: _orbit(orbit_figures.objects_figure),
-    "slew": lambda: orbit_figures.slew_figure(*planned_slew()),
-    "slew far from its limits": lambda: orbit_figures.slew_figure(*planned_slew(5.0)),
+    "spin": lambda: _orbit(figures.spin_figure),
+    "spin without the truth": lambda: _orbit(figures.spin_figure, False),
+    "knowledge": lambda: _orbit(figures.knowledge_figure),
+    "pointing": lambda: _orbit(figures.pointing_figure),
+    "pointing without the truth": lambda: _orbit(figures.pointing_figure, False),
+    "track": lambda: _orbit(figures.track_figure),
+    "objects": lambda: _orbit(figures.objects_figure),
+    "slew": lambda: figures.slew_figure(*planned_slew()),
+    "slew far from its limits": lambda: figures.slew_figure(*planned_slew(5.0)),
 }
 """Plots by name."""
 

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
 
-from ground.report import figures, orbit_figures
+from ground.report import figures
 from ground.report.panels import RunSignals
 from tests.ground.report.drawn_examples import PICTURES, recorded, rounded
 from tests.ground.report.drawn_figure import described, unlike
@@ -97,10 +97,10 @@ def test_a_run_without_packets_has_no_picture() -> None:
         figures._rate,
         figures._overview,
         figures.cage_figure,
-        orbit_figures.spin_figure,
-        orbit_figures.knowledge_figure,
-        orbit_figures.pointing_figure,
-        orbit_figures.track_figure,
-        orbit_figures.objects_figure,
+        figures.spin_figure,
+        figures.knowledge_figure,
+        figures.pointing_figure,
+        figures.track_figure,
+        figures.objects_figure,
     )
     assert [picture(signals) for picture in pictures] == [None] * len(pictures)

@@ -137,7 +137,7 @@ def test_a_downloaded_log_without_truth_is_reported_to_its_end(folder: Path, tmp
     run = read_run(tmp_path)
     assert summarise(run)["run"]["duration_s"] == DURATION_S - PERIOD_S
     pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
-    from ground.report.orbit_figures import pointing_figure  # noqa: PLC0415 - needs matplotlib
+    from ground.report.figures import pointing_figure  # noqa: PLC0415 - needs matplotlib
     from ground.report.panels import RunSignals  # noqa: PLC0415 - needs matplotlib
 
     assert not any("thesis" in text for text in power_labels(RunSignals(read_run(folder))))

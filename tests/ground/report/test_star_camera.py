@@ -14,7 +14,7 @@ from flight.link.telemetry.packets import Layout, PacketArray
 from flight.schema import reader
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.identification.orbit import learned_lens
-from ground.report.star_camera import star_camera
+from ground.report.orbit import star_camera
 from ground.report.text import _lens
 from ground.telemetry import Run
 from knightcube.astro.earth.figure import EARTH_RADIUS

@@ -37,10 +37,10 @@ from ground.report.orbit import (
     attitude_errors,
     camera_errors,
     detumbling_periods,
+    star_camera,
     stars_age,
 )
 from ground.report.signals import seconds
-from ground.report.star_camera import star_camera
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.settings import Simulation

@@ -21,8 +21,19 @@ from ground.commands.mission_control import Replay
 from ground.passes import OrbitPrediction, station_of
 from ground.telemetry import read_run
 from ground.xtce import SPACE, TELECOMMANDS, spread
-from ground.yamcs import INSTANCE, RECORDED, USER, files, main, password_in, write
-from ground.yamcs_operations import Session, add_passes, procedures_of, stacks_and_displays
+from ground.yamcs import (
+    INSTANCE,
+    RECORDED,
+    USER,
+    Session,
+    add_passes,
+    files,
+    main,
+    password_in,
+    procedures_of,
+    stacks_and_displays,
+    write,
+)
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.studies.interop.yamcs import PLANS, fly
 from tests.support.linked_board import free_ports, write_linked_config
