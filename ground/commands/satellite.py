@@ -10,6 +10,7 @@ import select
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -38,7 +39,6 @@ from flight.link.commands import (
     words_of,
 )
 from flight.link.files.store import Store
-from flight.link.files.transfer import Progress
 from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
@@ -73,6 +73,7 @@ from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
 from flight.link.telemetry.packets import TelemetryError
 from flight.schema.document import read_document, read_text, to_yaml
+from ground.commands.options import print_result
 from ground.documentation import meaning_of
 from ground.link.commanding import (
     FileSession,
@@ -80,7 +81,6 @@ from ground.link.commanding import (
     change_key,
     exchange,
     explained,
-    failed,
     ground_files_folder,
     obeyed,
     sha256_of,
@@ -239,36 +239,28 @@ def run_command(options: argparse.Namespace) -> int:
     except (TelemetryError, ValueError) as error:
         raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
     done, text = bool(row["obeyed"]), text_of(row["text"])
-    if options.json:
-        facts = {"obeyed": done, "mode": mode.label, "text": text, "count": int(row["count"])}
-        sys.stdout.write(json.dumps(facts) + "\n")
-    else:
-        sys.stdout.write(f"{'obeyed' if done else 'refused'}: {text}; mode {mode.label}\n")
+    facts = {"obeyed": done, "mode": mode.label, "text": text, "count": int(row["count"])}
+    print_result(options, facts, f"{'obeyed' if done else 'refused'}: {text}; mode {mode.label}\n")
     return 0 if done else 1
 
 
 def _command_by_link(options: argparse.Namespace) -> int:
     """Send the command in protected frames and print each stage of its verification."""
-    terminal = terminal_of(options)
 
     def show(report: Report) -> None:
         if not options.json:
             sys.stdout.write(f"{report.stage.name.lower()}: {explained(report)}\n")
             sys.stdout.flush()
 
-    try:
+    with closing(terminal_of(options)) as terminal:
         if options.what == "new-key":
             vault = Vault(options.keys)
             reports = change_key(terminal, vault, options.changed, options.spi, options.timeout, show)
         else:
             reports = send(terminal, packet_of(options), options.spi, options.timeout, show)
-    finally:
-        terminal.close()
+    stages = [{"stage": report.stage.name.lower(), "text": explained(report)} for report in reports]
     done = obeyed(reports)
-    if options.json:
-        stages = [{"stage": report.stage.name.lower(), "text": explained(report)} for report in reports]
-        facts = {"obeyed": done, "counter": reports[-1].counter, "stages": stages}
-        sys.stdout.write(json.dumps(facts) + "\n")
+    print_result(options, {"obeyed": done, "counter": reports[-1].counter, "stages": stages}, "")
     return 0 if done else 1
 
 
@@ -404,8 +396,7 @@ def _ask_by_link(
     refused: str | None = None
     reported = False
     kinds = {TELEMETRY_LAYOUTS[kind.name].identifier: kind for kind in (PARAMETERS, VERIFICATION)}
-    terminal = terminal_of(options)
-    try:
+    with closing(terminal_of(options)) as terminal:
         counter = terminal.send(packet, options.spi)
         for _, data in terminal.packets(options.timeout):
             kind = kinds.get(int.from_bytes(data[:2], "big"))
@@ -420,8 +411,6 @@ def _ask_by_link(
                     reported = True
             if refused or (refused is not None and (table is not None or not wants_table)):
                 break
-    finally:
-        terminal.close()
     if refused is None:
         raise FlightError(f"{options.link}: no answer within {options.timeout:g} s")
     return table, refused
@@ -429,14 +418,8 @@ def _ask_by_link(
 
 def _show(table: ParameterTable, before: ParameterTable, refused: str, as_json: bool) -> None:
     if as_json:
-        facts: Object = {
-            "crc": f"{table.crc:08x}",
-            "table": table.origin,
-            "loads": table.loads,
-            "kept": table.kept,
-            "refused": refused,
-            "values": table.values,
-        }
+        facts: Object = {"crc": f"{table.crc:08x}", "table": table.origin, "loads": table.loads}
+        facts |= {"kept": table.kept, "refused": refused, "values": table.values}
         sys.stdout.write(json.dumps(facts) + "\n")
         return
     for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
@@ -536,8 +519,7 @@ def run_files(options: argparse.Namespace) -> int:
             raise UsageError(f"--{name} {getattr(options, name)}: must be a positive number")
     if options.what in _LOCAL and not options.path.is_file():
         raise UsageError(f"{options.path}: no such file on the ground: {_LOCAL[options.what]}")
-    terminal = terminal_of(options)
-    try:
+    with closing(terminal_of(options)) as terminal:
         store = Store(options.folder or ground_files_folder(options.keys))
         with store.owned(), EndingSignals() as signals:
             session = FileSession(terminal, store, options.spi, options.rate, time.monotonic_ns())
@@ -546,15 +528,8 @@ def run_files(options: argparse.Namespace) -> int:
                 facts = work.obey(options)
             finally:
                 session.close(time.monotonic_ns())
-    finally:
-        terminal.close()
-    if options.json:
-        sys.stdout.write(json.dumps(facts) + "\n")
-    else:
-        for one in facts.get("files", ()):
-            sys.stdout.write(f"{one['bytes']:>12} {shown(one['name'])}\n")
-        if "text" in facts:
-            sys.stdout.write(f"{facts['text']}\n")
+    files = "".join(f"{one['bytes']:>12} {shown(one['name'])}\n" for one in facts.get("files", ()))
+    print_result(options, facts, files + (f"{facts['text']}\n" if "text" in facts else ""))
     return 0
 
 
@@ -604,17 +579,9 @@ class _FileWork:
     def _get(self, directive: Directive, name: str) -> Path:
         """Return the path of a file that was received completely."""
         self._session.ask(directive, time.monotonic_ns())
-        completed = False
-        while not completed:
+        self._turn(name)
+        while not self._session.received_file(name):
             self._turn(name)
-            for report in self._session.reports():
-                if problem := failed([report]):
-                    raise FlightError(problem)
-                # The satellite reports a transfer as completed after the ground has received the file.
-                completed |= report.stage is Stage.COMPLETED
-            for progress in self._new_endings(name):
-                self._check(progress)
-                completed = True
         until = time.monotonic() + _LINGER_S
         while time.monotonic() < until and self._session.entity.transfers():
             self._turn("")
@@ -622,34 +589,19 @@ class _FileWork:
 
     def _put(self, path: Path, name: str) -> Object:
         begun = self._session.put(path.absolute(), name, time.monotonic_ns())
-        ended: list[Progress] = []
-        while not ended:
+        self._turn(name)
+        while not self._session.ended(name, begun.number):
             self._turn(name)
-            ended = [one for one in self._new_endings(name) if one.number == begun.number]
-        self._check(ended[0])
         text = f"on board: received/{name}, {begun.size} bytes"
         digest = sha256_of(path).hex()
         return {"name": f"received/{name}", "bytes": begun.size, "sha256": digest, "text": text}
 
     def _command(self, directive: Directive) -> Object:
         self._session.ask(directive, time.monotonic_ns())
-        while True:
+        self._turn("")
+        while not self._session.completed():
             self._turn("")
-            reports = self._session.reports()
-            if problem := failed(reports):
-                raise FlightError(problem)
-            if any(report.stage is Stage.COMPLETED for report in reports):
-                return {"text": f"completed: {directive}"}
-
-    def _check(self, progress: Progress) -> None:
-        if progress.condition != 0:
-            raise FlightError(f"{progress.name}: {self._session.reason_of(progress)}")
-
-    def _new_endings(self, name: str) -> list[Progress]:
-        ended = self._session.entity.ended
-        found = [one for one in ended if one.name == name]
-        ended.clear()
-        return found
+        return {"text": f"completed: {directive}"}
 
     def _turn(self, name: str) -> None:
         """Transfer for a moment.

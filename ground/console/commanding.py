@@ -48,7 +48,7 @@ from flight.schema.reader import parse
 from flight.schema.sections import Commands
 from ground.console.history import values
 from ground.documentation import Body, commands_for, foreign_modes, layouts_for
-from ground.link.commanding import FileSession, exchange, explained, failed, no_answer, obeyed, sha256_of
+from ground.link.commanding import FileSession, exchange, explained, no_answer, obeyed, sha256_of
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry import decode, scan
 from knightcube.errors import FlightError, UsageError
@@ -401,7 +401,7 @@ class LinkFiles:
             def send(session: FileSession) -> None:
                 with self._feed.lock:
                     begun = session.put(path, full, time.monotonic_ns())
-                self._wait(lambda: self._ended(session, begun.number))
+                self._wait(lambda: session.ended(full, begun.number))
 
             self._with_session(send)
             return {"name": f"received/{full}", "bytes": len(data), "sha256": sha256_of(path).hex()}
@@ -410,7 +410,7 @@ class LinkFiles:
         def receive(session: FileSession) -> Path:
             with self._feed.lock:
                 session.ask(directive, time.monotonic_ns())
-            self._wait(lambda: self._received(session, name))
+            self._wait(lambda: session.received_file(name))
             until = time.monotonic() + _LINGER_S
             while session.entity.transfers() and time.monotonic() < until:
                 time.sleep(_POLL_S)
@@ -432,26 +432,3 @@ class LinkFiles:
             if self._feed.silence > _SILENCE_S:
                 raise FlightError(f"no telemetry for {_SILENCE_S:g} s; the received data is kept")
             time.sleep(_POLL_S)
-
-    @staticmethod
-    def _received(session: FileSession, name: str) -> bool:
-        """Return whether a file has been received completely. Raises FlightError with the reason if not."""
-        reports = session.reports()
-        if problem := failed(reports):
-            raise FlightError(problem)
-        completed = any(report.stage is Stage.COMPLETED for report in reports)
-        for ending in [one for one in session.entity.ended if one.name == name]:
-            session.entity.ended.remove(ending)
-            if ending.condition != 0:
-                raise FlightError(f"{name}: {session.reason_of(ending)}")
-            completed = True
-        return completed
-
-    @staticmethod
-    def _ended(session: FileSession, number: int) -> bool:
-        """Return whether a file was sent completely. Raises FlightError with the reason if not."""
-        for ending in [one for one in session.entity.ended if one.number == number]:
-            if ending.condition != 0:
-                raise FlightError(f"{ending.name}: {session.reason_of(ending)}")
-            return True
-        return False

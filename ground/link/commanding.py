@@ -342,6 +342,33 @@ class FileSession:
         """Return why a transfer ended. If the satellite refused it, the text is that of the satellite."""
         return self._texts.get((progress.source, progress.number), "") or progress.said
 
+    def ended(self, name: str, number: int | None = None) -> bool:
+        """Return whether a transfer of a file has ended, and forget all ended transfers.
+
+        Only the transfer `number` counts if it is given. Raises FlightError with the reason if it has failed.
+        """
+        found = [one for one in self.entity.ended if one.name == name and number in {None, one.number}]
+        self.entity.ended.clear()
+        for one in found:
+            if one.condition != 0:
+                raise FlightError(f"{one.name}: {self.reason_of(one)}")
+        return bool(found)
+
+    def completed(self) -> bool:
+        """Return whether the satellite reports a command as completed. Raises FlightError if it failed."""
+        reports = self.reports()
+        if problem := failed(reports):
+            raise FlightError(problem)
+        return any(report.stage is Stage.COMPLETED for report in reports)
+
+    def received_file(self, name: str) -> bool:
+        """Return whether a file has been received completely. Raises FlightError with the reason if not.
+
+        The satellite reports a transfer as completed after the ground has received the file.
+        """
+        completed = self.completed()
+        return self.ended(name) or completed
+
     def close(self, now_ns: int) -> None:
         """Store the received data."""
         self.entity.close(now_ns)

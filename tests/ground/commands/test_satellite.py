@@ -43,6 +43,7 @@ from flight.link.telemetry.definitions import (
 from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import satellite
+from ground.link.commanding import FileSession
 from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.guidance.pointing_target import Goal
 from tests.ground.commands.in_process import command
@@ -378,14 +379,15 @@ def test_the_table_arrives_before_or_after_its_verification(link: Link) -> None:
 class Session:
     """A file session with given reports and results for each cycle."""
 
+    ended, completed, received_file = FileSession.ended, FileSession.completed, FileSession.received_file
+
     def __init__(self, folder: Path, *turns: tuple[list[Report], list[Any]]) -> None:
         self.received = folder
         self.received_ns = 10**30
         self.turns = list(turns)
         self.asked: list[Any] = []
         self._reports: list[Report] = []
-        self.ended: list[Any] = []
-        self.entity = SimpleNamespace(ended=self.ended, transfers=list)
+        self.entity = SimpleNamespace(ended=[], transfers=list)
 
     def ask(self, directive: Any, _: int) -> None:
         self.asked.append(directive)
@@ -396,7 +398,7 @@ class Session:
     def transmit(self, _: int) -> None:
         reports, ended = self.turns.pop(0)
         self._reports += reports
-        self.ended += ended
+        self.entity.ended += ended
 
     def take(self, *_: Any) -> None:
         """Do nothing, because no telemetry arrives."""
