@@ -7,10 +7,9 @@ import hashlib
 import json
 import os
 import select
-import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -29,6 +28,7 @@ from flight.schema.sections import Config
 from ground.bringup.bench import Outcome, Session, StepSkipped
 from ground.bringup.diagnosis import Finding
 from ground.bringup.session import STEPS, steps_of
+from ground.commands.options import interruptible, print_result
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import write_picture
 
@@ -79,52 +79,39 @@ def run(options: argparse.Namespace) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     kept = {} if options.again else _kept(options.out / REPORT, key)
-    say = _silent if options.json else sys.stdout.write
     wanted = options.only or [name for name in steps_of(config) if name not in kept]
-    # Ctrl-C raises KeyboardInterrupt, so that the coils are set to zero before the end.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with _opened(options, text, config, emulated, say) as session:
-            session.known |= kept
-            for name in wanted:
-                try:
-                    outcome = STEPS[name](session)
-                except StepSkipped as reason:
-                    found = [] if reason.finding is None else [reason.finding]
-                    outcome = Outcome(found, {"skipped": str(reason)})
-                session.known[name] = outcome
-                _keep(options, key, session.known, name)
-                say(_step_text(name, outcome))
-    finally:
-        signal.signal(signal.SIGINT, before)
+    # Ctrl-C sets the coils to zero before the end.
+    with interruptible(), _opened(options, text, config, emulated) as session:
+        session.known |= kept
+        for name in wanted:
+            try:
+                outcome = STEPS[name](session)
+            except StepSkipped as reason:
+                found = [] if reason.finding is None else [reason.finding]
+                outcome = Outcome(found, {"skipped": str(reason)})
+            session.known[name] = outcome
+            _keep(options, key, session.known, name)
+            if not options.json:
+                sys.stdout.write(_step_text(name, outcome))
+    from ground.report.figures import draw_bench  # noqa: PLC0415 - loads matplotlib
+
     ordered = {name: session.known[name] for name in STEPS if name in session.known}
-    _draw(options.out, ordered)
+    frames = {title: options.out / f"{title}.png" for title in ("dark", "light", "focus")}
+    kept_frames = {title: path for title, path in frames.items() if path.exists()}
+    draw_bench(options.out / PICTURE, ordered, kept_frames)
     findings = [finding for outcome in ordered.values() for finding in outcome.findings]
-    skipped = [name for name, outcome in ordered.items() if "skipped" in outcome.values]
-    if options.json:
-        facts = {"steps": {name: _facts(one) for name, one in ordered.items()}, "faults": len(findings)}
-        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
-    else:
-        missed = f", {len(skipped)} steps skipped" if skipped else ""
-        files = f"{options.out / FRAGMENT}, {options.out / PICTURE}"
-        say(f"{'verdict':8}{len(findings)} faults{missed}; {files}\n")
-    return 1 if findings or _undone(ordered) else 0
-
-
-def _undone(outcomes: Mapping[str, Outcome]) -> bool:
-    """Return whether a step was skipped although its device is configured."""
-    skipped = [str(one.values.get("skipped", "")) for one in outcomes.values()]
-    return any(reason and not reason.startswith("the configuration has no") for reason in skipped)
-
-
-def _silent(_: str) -> int:
-    return 0
+    reasons = [str(one.values["skipped"]) for one in ordered.values() if "skipped" in one.values]
+    facts = {"steps": {name: _facts(one) for name, one in ordered.items()}, "faults": len(findings)}
+    missed = f", {len(reasons)} steps skipped" if reasons else ""
+    files = f"{options.out / FRAGMENT}, {options.out / PICTURE}"
+    print_result(options, facts, f"{'verdict':8}{len(findings)} faults{missed}; {files}\n")
+    # A step whose device is not configured may be skipped.
+    undone = any(not reason.startswith("the configuration has no") for reason in reasons)
+    return 1 if findings or undone else 0
 
 
 @contextmanager
-def _opened(
-    options: argparse.Namespace, text: str, config: Config, emulated: bool, say: Callable[[str], Any]
-) -> Iterator[Session]:
+def _opened(options: argparse.Namespace, text: str, config: Config, emulated: bool) -> Iterator[Session]:
     """Open the real or emulated devices, and close them with the coils at zero. Raises DeviceError."""
 
     def ask(request: str) -> None:
@@ -256,71 +243,45 @@ def _step_text(name: str, outcome: Outcome) -> str:
     return "\n".join([*lines, *(f"{'':8}{finding.line()}" for finding in outcome.findings)]) + "\n"
 
 
-def _measured(name: str, values: Mapping[str, Any]) -> str:
-    """Return the measured values of a step as one line."""
-    if name == "rest" and "noise" not in values:
-        return f"{values['samples']} samples"
-    return _TEXTS[name](values)
-
-
-def _rest_text(values: Mapping[str, Any]) -> str:
-    noise, expected = {key: max(one) for key, one in values["noise"].items()}, values["expected"]
-    return (
-        f"{values['rate_hz']:.2f} samples/s; noise (expected) "
-        f"{noise['gyro']:.2g} ({expected['gyro']:.2g}) rad/s, "
-        f"{1e9 * noise['field']:.0f} ({1e9 * expected['field']:.0f}) nT, "
-        f"{noise['acceleration']:.2g} ({expected['acceleration']:.2g}) m/s^2"
-    )
-
-
-def _axes_text(values: Mapping[str, Any]) -> str:
-    turns = [
-        f"{axis} {np.linalg.norm(turn):.0f}" for axis, turn in zip("xyz", values["turns_deg"], strict=True)
-    ]
-    return f"turns of 90 deg measured by the gyro: {', '.join(turns)} deg"
-
-
-def _coils_text(values: Mapping[str, Any]) -> str:
-    fields = ", ".join(f"{value:+.2f}" for value in values["strength"])
-    drawn = ("-" if None in row else f"{500.0 * sum(row):.0f}" for row in values["current"])
-    return f"fields relative to the expected ones {fields}; supply current {', '.join(drawn)} mA"
-
-
-def _power_text(values: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{key} {one['voltage']:.2f} V, {one['current']:.3f} A, with a coil {1e3 * one['rise']:+.0f} mA"
-        for key, one in values["monitors"].items()
-    )
-
-
-def _strings_text(values: Mapping[str, Any]) -> str:
-    lit = ", ".join(f"{1e3 * row[number]:.0f}" for number, row in enumerate(values["currents"]))
-    return f"currents in the light of a lamp {lit} mA"
-
-
-def _wide_text(values: Mapping[str, Any]) -> str:
-    return "mean levels " + ", ".join(f"{level:.0f}" for level in values["levels"].values()) + " counts"
-
-
-_TEXTS: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "rest": _rest_text,
-    "axes": _axes_text,
-    "coils": _coils_text,
-    "power": _power_text,
-    "gps": lambda values: "{fixes} fixes, {satellites} satellites".format(**values),
-    "strings": _strings_text,
-    "wide": _wide_text,
-    "dark": lambda values: "level {level:.0f} counts, read noise {read_noise:.1f} e-".format(**values),
-    "light": lambda values: "{sources} point sources, level {level:.0f} counts".format(**values),
-    "focus": lambda values: "PSF width {psf_sigma:.2f} px (standard deviation)".format(**values),
-    "lens": lambda values: (
-        "field of view {field_of_view_deg:.3f} deg, {stars} stars, residual {rms_px:.3f} px".format(**values)
-    ),
+_FORMATS = {
+    "gps": "{fixes} fixes, {satellites} satellites",
+    "dark": "level {level:.0f} counts, read noise {read_noise:.1f} e-",
+    "light": "{sources} point sources, level {level:.0f} counts",
+    "focus": "PSF width {psf_sigma:.2f} px (standard deviation)",
+    "lens": "field of view {field_of_view_deg:.3f} deg, {stars} stars, residual {rms_px:.3f} px",
 }
 
 
-def _draw(folder: Path, outcomes: Mapping[str, Outcome]) -> None:
-    from ground.report.figures import draw_bench  # noqa: PLC0415 - loads matplotlib
-
-    frames = {title: folder / f"{title}.png" for title in ("dark", "light", "focus")}
-    draw_bench(folder / PICTURE, outcomes, {title: path for title, path in frames.items() if path.exists()})
+def _measured(name: str, values: Mapping[str, Any]) -> str:
+    """Return the measured values of a step as one line."""
+    match name:
+        case "rest" if "noise" not in values:
+            text = f"{values['samples']} samples"
+        case "rest":
+            noise, expected = {key: max(one) for key, one in values["noise"].items()}, values["expected"]
+            text = (
+                f"{values['rate_hz']:.2f} samples/s; noise (expected) "
+                f"{noise['gyro']:.2g} ({expected['gyro']:.2g}) rad/s, "
+                f"{1e9 * noise['field']:.0f} ({1e9 * expected['field']:.0f}) nT, "
+                f"{noise['acceleration']:.2g} ({expected['acceleration']:.2g}) m/s^2"
+            )
+        case "axes":
+            sizes = [f"{np.linalg.norm(turn):.0f}" for turn in values["turns_deg"]]
+            turns = ", ".join(f"{axis} {size}" for axis, size in zip("xyz", sizes, strict=True))
+            text = f"turns of 90 deg measured by the gyro: {turns} deg"
+        case "coils":
+            fields = ", ".join(f"{value:+.2f}" for value in values["strength"])
+            drawn = ("-" if None in row else f"{500.0 * sum(row):.0f}" for row in values["current"])
+            text = f"fields relative to the expected ones {fields}; supply current {', '.join(drawn)} mA"
+        case "power":
+            form = "{} {voltage:.2f} V, {current:.3f} A, with a coil {milliamperes:+.0f} mA"
+            monitors = values["monitors"].items()
+            text = ", ".join(form.format(key, **one, milliamperes=1e3 * one["rise"]) for key, one in monitors)
+        case "strings":
+            lit = ", ".join(f"{1e3 * row[number]:.0f}" for number, row in enumerate(values["currents"]))
+            text = f"currents in the light of a lamp {lit} mA"
+        case "wide":
+            text = f"mean levels {', '.join(f'{level:.0f}' for level in values['levels'].values())} counts"
+        case _:
+            text = _FORMATS[name].format(**values)
+    return text

@@ -6,11 +6,9 @@ import argparse
 import json
 import os
 import shlex
-import signal
 import sys
 import textwrap
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
 from ground.commands.elements import elements_of
-from ground.commands.options import write_new
+from ground.commands.options import interruptible, write_new
 from ground.satellite_description import (
     COIL_EXAMPLE,
     QUESTIONS,
@@ -91,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
         verb = "is" if len(missing) == 1 else "are"
         raise UsageError(f"{', '.join(missing)} {verb} missing; on a terminal the command asks for values")
     else:
-        with _interruptible():
+        with interruptible():
             answers.ask()
     try:
         facts, text = _written(answers, options.force)
@@ -230,16 +228,6 @@ class Answers:
                 del self.values[one]
             raise UsageError(f"--{name} {' '.join(texts)}: {error}") from error
         self._texts[name] = texts
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Make Ctrl-C raise KeyboardInterrupt instead of ending the process at once."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def satellite_of(values: Values) -> Satellite:

@@ -6,8 +6,10 @@ import argparse
 import json
 import math
 import re
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -46,6 +48,16 @@ def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespac
 def print_result(options: argparse.Namespace, facts: Any, text: str) -> None:
     """Print a result as one JSON object if the option `--json` is given, otherwise as text."""
     sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n" if options.json else text)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Make Ctrl-C raise KeyboardInterrupt instead of ending the process at once."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def read_picture(options: argparse.Namespace) -> Image:

@@ -157,12 +157,10 @@ def _watch(options: argparse.Namespace, tail: PacketSource, wait: float, where: 
         line = state_line(state) + (f"  ended: {state.ended}" if state.ended else "")
         sys.stdout.write((json.dumps(_facts(state)) if options.json else line) + "\n")
         return 0
-    with _ending() as ended:
-        shown = None if options.plain or not sys.stdout.isatty() else _panel(state, tail)
-        with shown or _lines(state, tail, options.every) as refresh:
+    with _ending() as ended, _display(options, state, tail) as refresh:
+        refresh()
+        while not (state.ended or tail.silence > options.patience or ended.wait(_READ_S)):
             refresh()
-            while not (state.ended or tail.silence > options.patience or ended.wait(_READ_S)):
-                refresh()
     if not state.ended and not ended.is_set():
         sys.stderr.write(f"knightcube: no new packet for {tail.silence:.0f} s {where}\n")
         return 1
@@ -187,47 +185,39 @@ def _ending() -> Iterator[threading.Event]:
 
 
 @contextlib.contextmanager
-def _lines(state: FlightState, tail: PacketSource, every: float) -> Iterator[Callable[[], None]]:
-    """Yield a function that prints the new packets as plain lines."""
-    lines = PlainLines(state, every, sys.stdout.write)
+def _display(
+    options: argparse.Namespace, state: FlightState, tail: PacketSource
+) -> Iterator[Callable[[], None]]:
+    """Yield a function that shows the new packets: on a panel in a terminal with rich, otherwise as lines."""
+    live = None
+    if not options.plain and sys.stdout.isatty():
+        try:
+            from rich.live import Live  # noqa: PLC0415 - an extra
+
+            live = Live(auto_refresh=False)
+        except ModuleNotFoundError:
+            sys.stderr.write("knightcube: a panel needs rich: pip install 'knightcube-flight[watch]'\n")
+    lines = PlainLines(state, options.every, sys.stdout.write)
 
     def refresh() -> None:
-        lines.feed(tail.new())
-        sys.stdout.flush()
+        if live is None:
+            lines.feed(tail.new())
+            sys.stdout.flush()
+        else:
+            state.update(tail.new())
+            live.update(panel(state, tail.silence), refresh=True)
 
-    yield refresh
-
-
-def _panel(
-    state: FlightState, tail: PacketSource
-) -> contextlib.AbstractContextManager[Callable[[], None]] | None:
-    """Return a context with a function that updates the panel, or None without rich."""
-    try:
-        from rich.live import Live  # noqa: PLC0415 - an extra
-    except ModuleNotFoundError:
-        sys.stderr.write("knightcube: a panel needs rich: pip install 'knightcube-flight[watch]'\n")
-        return None
-
-    @contextlib.contextmanager
-    def shown() -> Iterator[Callable[[], None]]:
-        with Live(auto_refresh=False) as live:
-
-            def refresh() -> None:
-                state.update(tail.new())
-                live.update(panel(state, tail.silence), refresh=True)
-
-            yield refresh
-
-    return shown()
+    with live or contextlib.nullcontext():
+        yield refresh
 
 
 def _facts(state: FlightState) -> dict[str, Any]:
-    written, streams = state.value("control", "current_written"), None
-    if "health" in state.newest:
-        streams = {name: named(STREAM_STATES, state.value("health", name)) for name in STREAMS}
-    currents = None
+    written, health = state.value("control", "current_written"), state.newest.get("health")
+    currents = streams = None
     if written is not None:
         currents = [float(value) if abs(value) < float("inf") else None for value in written]
+    if health is not None:
+        streams = {name: named(STREAM_STATES, health[name]) for name in STREAMS}
     return {
         "mission_time_s": state.time,
         "mode": state.mode or None,
