@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from flight.app.run import RunRequest
 from flight.app.service import requested_config
 from flight.schema.devices import Camera, camera_model
 from flight.schema.document import ConfigError, config_path
-from ground.commands.options import finite
+from ground.commands.options import finite, print_result
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
@@ -91,8 +90,7 @@ def run(options: argparse.Namespace) -> int:
                     write_truth(path.with_suffix(".json"), _truth(frame, lone, rate))
     numbers = [fact["sequence"] for fact in facts]
     frozen = numbers != sorted(set(numbers))
-    if options.json:
-        sys.stdout.write(json.dumps({"frames": facts, "frozen": frozen}) + "\n")
+    print_result(options, {"frames": facts, "frozen": frozen}, "")
     if frozen:
         sys.stderr.write("knightcube: the camera's frame numbers do not increase: it is frozen\n")
     return 1 if frozen else 0

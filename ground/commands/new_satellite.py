@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 import sys
@@ -21,7 +20,7 @@ from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
 from ground.commands.elements import elements_of
-from ground.commands.options import interruptible, write_new
+from ground.commands.options import interruptible, print_result, write_new
 from ground.satellite_description import (
     COIL_EXAMPLE,
     QUESTIONS,
@@ -97,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
         if missing:
             sys.stderr.write(f"knightcube: the answers as a command:\n  {answers.command()}\n")
         raise
-    sys.stdout.write(json.dumps(facts) + "\n" if options.json else text)
+    print_result(options, facts, text)
     return 0
 
 
@@ -236,12 +235,8 @@ def satellite_of(values: Values) -> Satellite:
     inclination = values["inclination"]
     if inclination is None:
         inclination = sun_synchronous_inclination(altitude, eccentricity)
-    orbit = {
-        "altitude": altitude,
-        "eccentricity": eccentricity,
-        "inclination_deg": inclination,
-        "local_time": values["local-time"],
-    }
+    orbit = {"altitude": altitude, "eccentricity": eccentricity, "inclination_deg": inclination}
+    orbit["local_time"] = values["local-time"]
     coils = tuple(values["coil"])
     try:
         section = msgspec.convert(orbit, OrbitSection)
@@ -287,10 +282,8 @@ def warnings_of(values: Derived) -> list[str]:
     found = []
     ratio = values.coil_torque / values.disturbance
     if ratio < _WEAK:
-        found.append(
-            f"the coils' torque is {ratio:.2g} times the largest disturbance torque, so pointing may "
-            "fail: use stronger coils or a higher orbit"
-        )
+        torque = f"the coils' torque is {ratio:.2g} times the largest disturbance torque"
+        found.append(f"{torque}, so pointing may fail: use stronger coils or a higher orbit")
     if values.momentum_time > values.period:
         hours = values.momentum_time / 3600.0
         found.append(f"detumbling takes more than {hours:.1f} h: use stronger coils, or a smaller --release")
@@ -305,19 +298,13 @@ def _text(satellite: Satellite, values: Derived, path: Path) -> str:
         (EARTH_RADIUS + orbit.altitude) * (1.0 + sign * orbit.eccentricity) - EARTH_RADIUS
         for sign in (-1.0, 1.0)
     )
+    shape = f"{1e-3 * perigee:.0f} to {1e-3 * apogee:.0f} km, {orbit.inclination_deg:.2f} deg"
+    torque = f"{values.dipole:.3g} A m^2; {values.coil_torque:.2g} N m, {ratio:.3g} times the largest"
     lines = [
         ("written", str(path)),
         ("inertia", f"{moments} kg m^2, of a homogeneous cuboid"),
-        (
-            "orbit",
-            f"{1e-3 * perigee:.0f} to {1e-3 * apogee:.0f} km, {orbit.inclination_deg:.2f} deg, "
-            f"{values.period / 60.0:.1f} min",
-        ),
-        (
-            "coils",
-            f"{values.dipole:.3g} A m^2; {values.coil_torque:.2g} N m, {ratio:.3g} times the largest "
-            "aerodynamic and solar radiation torque",
-        ),
+        ("orbit", f"{shape}, {values.period / 60.0:.1f} min"),
+        ("coils", f"{torque} aerodynamic and solar radiation torque"),
         ("detumbling", f"from {satellite.release_deg:g} deg/s within about {values.slow_within:g} s"),
         *(("warning", text) for text in warnings_of(values)),
         ("next", f"{PROGRAM} check {config}"),
