@@ -1,7 +1,9 @@
-"""The open devices of a bench session, and the outcome of a step.
+"""The devices of a bench session: the search for them, the open devices, and the outcome of a step.
 
 The driver sets a coil to zero if its command is not repeated within 0.25 s. The guardian sets all coils to
-zero if this process stops, and `Session.close` does so at the end of every session.
+zero if this process stops, and `Session.close` does so at the end of every session. A missing chip is searched
+for at all addresses of its bus, and a missing serial device on all serial lines of the configuration at all
+baud rates. Chips are identified by registers that no driver changes.
 """
 
 from __future__ import annotations
@@ -123,9 +125,8 @@ class Session:
         if key.startswith("wide_cameras"):
             return "camera", self.config.wide_cameras[int(key[13:-1])]
         if key.startswith("power."):
-            return "power_monitor", None if self.config.power is None else self.config.power.monitors().get(
-                key
-            )
+            power = self.config.power
+            return "power_monitor", None if power is None else power.monitors().get(key)
         return key, getattr(self.config, key)
 
     def _opened(self, key: str, kind: str, section: Any) -> Any:
@@ -173,12 +174,10 @@ class Session:
             finding = Finding("inertial_unit", kind, text, cure)
             raise StepSkipped("the inertial unit measures impossible values", finding)
         if len(readings) < 3:
-            text = (
-                f"{len(readings)} valid samples and {link.packets - before.packets} packets in {seconds:g} s"
-            )
-            finding = Finding(
-                "inertial_unit", "no samples", text, "switch it off and on, and check the cable"
-            )
+            packets = link.packets - before.packets
+            text = f"{len(readings)} valid samples and {packets} packets in {seconds:g} s"
+            cure = "switch it off and on, and check the cable"
+            finding = Finding("inertial_unit", "no samples", text, cure)
             raise StepSkipped("the inertial unit sends too few samples", finding)
         columns = [
             np.array([getattr(reading, name) for reading in readings], dtype=float).reshape(-1, 3)
@@ -233,6 +232,8 @@ class Session:
             self._open["coils"].off()
         self.stack.close()
 
+
+# Search for devices, and for the reason why a device is missing.
 
 _PCA9685 = [0xE2, 0xE4, 0xE8, 0xE0]
 """Registers 2 to 5 (SUBADR1 to ALLCALLADR) of a PCA9685, which our drivers leave at their power-on values."""
@@ -382,9 +383,8 @@ def _serial_finding(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -
     found = None
     if what == wanted and rate != section.baud_rate:
         text = f"it sends at {rate} baud, not at {section.baud_rate}"
-        found = Finding(
-            kind, "wrong baud rate", text, f"set `baud_rate: {rate}`, or change that of the device"
-        )
+        cure = f"set `baud_rate: {rate}`, or change that of the device"
+        found = Finding(kind, "wrong baud rate", text, cure)
     elif what == wanted == "vn100" and pause:
         text = f"its output arrives on {section.device}, but stops for up to {pause:.2f} s"
         cure = "check plugs and solder joints for loose contact, and its supply"

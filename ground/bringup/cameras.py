@@ -63,9 +63,8 @@ def step_dark(session: Session) -> Outcome:
         findings.append(Finding("camera", "lens cap off", text, "put the cap on, and repeat the step"))
     elif electrons > 3.0 * camera.read_noise + 5.0:
         text = f"read noise {electrons:.1f} e-, configured {camera.read_noise:g}"
-        findings.append(
-            Finding("camera", "noisy", text, "check `gain` and `read_noise`, and cool the camera")
-        )
+        cure = "check `gain` and `read_noise`, and cool the camera"
+        findings.append(Finding("camera", "noisy", text, cure))
     elif 0.0 < electrons < 0.3 * camera.read_noise:
         text = f"read noise {electrons:.2g} e-, configured {camera.read_noise:g}"
         cure = "check `gain` (e-/count), `read_noise`, and whether the pixel format loses bits"
@@ -140,8 +139,8 @@ def step_light(session: Session) -> Outcome:
     sources, level = len(detect(pixels).stars()), float(np.median(pixels))
     saturated = float(np.mean(pixels >= _saturation(camera)))
     findings += _frozen("camera", frames) + _wrong_size("camera", camera, pixels)
-    if _format_faults("camera", camera, frames):
-        findings += _format_faults("camera", camera, frames)
+    if wrong := _format_faults("camera", camera, frames):
+        findings += wrong
     elif saturated > 0.2:
         text = f"{100.0 * saturated:.0f} % of the pixels are saturated"
         findings.append(Finding("camera", "too bright", text, "shorten `exposure`, or darken the room"))
@@ -236,10 +235,8 @@ def step_lens(session: Session) -> Outcome:
         text = f"{field_deg:.3f} deg across the columns, configured {camera.field_of_view_deg:g}"
         findings.append(Finding("camera", "wrong field of view", text, "use the fragment's `camera`"))
     if found.mirrored:
-        text = "the frames are mirrored"
-        findings.append(
-            Finding("camera", "mirrored", text, "correct the order of the rows, or remove the mirror")
-        )
+        cure = "correct the order of the rows, or remove the mirror"
+        findings.append(Finding("camera", "mirrored", "the frames are mirrored", cure))
     values = {"stars": calibration.stars, "rms_px": calibration.rms_after, "field_of_view_deg": field_deg}
     changes: dict[str, Any] = {}
     if calibration.stars >= MIN_STARS and "focal_length" not in calibration.undetermined:
@@ -274,10 +271,9 @@ def step_wide(session: Session) -> Outcome:
         pixels = open_frames[key] = frames[-1].pixels
         wrong = _frozen(key, frames) + _wrong_size(key, camera, pixels)
         wrong = wrong or _format_faults(key, camera, frames)
-        if not wrong and float(np.mean(pixels >= _saturation(camera))) > 0.5:
-            text = (
-                f"{100.0 * float(np.mean(pixels >= _saturation(camera))):.0f} % of the pixels are saturated"
-            )
+        saturated = float(np.mean(pixels >= _saturation(camera)))
+        if not wrong and saturated > 0.5:
+            text = f"{100.0 * saturated:.0f} % of the pixels are saturated"
             wrong = [Finding(key, "too bright", text, "shorten `exposure`, or darken the room")]
         if wrong:
             del open_frames[key]
@@ -295,13 +291,11 @@ def step_wide(session: Session) -> Outcome:
         for name, pixels in open_frames.items()
     }
     for key in open_frames:
-        findings += _cover_faults(
-            key, [name for name in open_frames if key in darkened[name]], covered[key][key]
-        )
+        own = [name for name in open_frames if key in darkened[name]]
+        findings += _cover_faults(key, own, covered[key][key])
     levels = {key: float(np.mean(pixels)) for key, pixels in open_frames.items()}
-    return Outcome(
-        findings, {"levels": levels, "darkened": {name: sorted(one) for name, one in darkened.items()}}
-    )
+    listed = {name: sorted(one) for name, one in darkened.items()}
+    return Outcome(findings, {"levels": levels, "darkened": listed})
 
 
 def _darkened(pixels: Image, covered: Mapping[str, Image]) -> set[str]:
@@ -325,7 +319,6 @@ def _cover_faults(key: str, darkened: Sequence[str], covered: Image) -> list[Fin
         return [Finding(key, "noisy", "its covered frame is not dark", "check its cable and `pixel_format`")]
     if key not in darkened:
         text = f"its frame does not change when its lens is covered ({float(np.median(covered)):.0f} counts)"
-        return [
-            Finding(key, "lens cap on", text, "take the cap off, point it at light, check its `exposure`")
-        ]
+        cure = "take the cap off, point it at light, check its `exposure`"
+        return [Finding(key, "lens cap on", text, cure)]
     return []

@@ -132,11 +132,6 @@ def missing_share(change: FloatArray, noise: float) -> float:
     return float(np.mean(along < 0.5 * full)) if full > 8.0 * noise else 0.0
 
 
-def repeated_share(values: FloatArray) -> float:
-    """Return the fraction of samples (k, 3) that equal the preceding sample in all axes."""
-    return float(np.mean((np.diff(values, axis=0) == 0.0).all(axis=1)))
-
-
 def allan_deviation(values: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
     """Return averaging times (m,), s, and the Allan deviations (m, 3) of values (k, 3) every `period` s."""
     sizes = [1 << n for n in range(int(math.log2(max(len(values) // 4, 1))) + 1)]
@@ -177,7 +172,7 @@ def diagnose_rest(
         ("accelerometer", samples.acceleration, expected.acceleration, "m/s^2"),
     )
     for name, values, sigma, unit in quantities:
-        repeated = repeated_share(values)
+        repeated = float(np.mean((np.diff(values, axis=0) == 0.0).all(axis=1)))
         if 0.2 < repeated < 0.98:
             new = measured * (1.0 - repeated)
             text = f"{100.0 * repeated:.0f} % of its values repeat: {new:.3g} are new per second"
@@ -201,14 +196,8 @@ def _noise_findings(part: str, values: FloatArray, sigma: float, unit: str) -> l
     if noise.min() < 1e-3 * sigma:
         axes = ", ".join(axis for axis, value in zip(_AXES, noise, strict=True) if value < 1e-3 * sigma)
         text = f"its values on {axes} do not change: noise {noise.min():.1e} {unit}, expected {sigma:.2g}"
-        return [
-            Finding(
-                part,
-                "stuck",
-                text,
-                "switch the unit off and on; replace it if the values still do not change",
-            )
-        ]
+        cure = "switch the unit off and on; replace it if the values still do not change"
+        return [Finding(part, "stuck", text, cure)]
     return []
 
 
@@ -217,34 +206,19 @@ def _rest_values(samples: Samples, strongest: float) -> list[Finding]:
     found, part = [], "inertial_unit"
     bias = samples.rate.mean(axis=0)
     if np.abs(bias).max() > 0.02:
-        found.append(
-            Finding(
-                f"{part}.gyro",
-                "biased",
-                f"it measures {np.abs(bias).max():.3f} rad/s at rest",
-                "keep the body still and repeat the step; calibrate the gyro if the bias stays",
-            )
-        )
+        text = f"it measures {np.abs(bias).max():.3f} rad/s at rest"
+        cure = "keep the body still and repeat the step; calibrate the gyro if the bias stays"
+        found.append(Finding(f"{part}.gyro", "biased", text, cure))
     force = float(np.linalg.norm(samples.acceleration.mean(axis=0)))
     if np.isfinite(force) and abs(force / GRAVITY - 1.0) > 0.05:
-        found.append(
-            Finding(
-                f"{part}.accelerometer",
-                "wrong scale",
-                f"it measures {force:.2f} m/s^2 at rest instead of {GRAVITY:.2f}",
-                "check the range and the unit of its driver",
-            )
-        )
+        text = f"it measures {force:.2f} m/s^2 at rest instead of {GRAVITY:.2f}"
+        cure = "check the range and the unit of its driver"
+        found.append(Finding(f"{part}.accelerometer", "wrong scale", text, cure))
     field = float(np.linalg.norm(samples.field.mean(axis=0)))
     if np.isfinite(field) and not 1.5e-5 <= field <= strongest:
-        found.append(
-            Finding(
-                f"{part}.magnetometer",
-                "wrong scale",
-                f"it measures {1e6 * field:.3g} uT at rest, expected are 15 to {1e6 * strongest:.0f} uT",
-                "check the unit and the range of its driver, and remove magnets and iron",
-            )
-        )
+        text = f"it measures {1e6 * field:.3g} uT at rest, expected are 15 to {1e6 * strongest:.0f} uT"
+        cure = "check the unit and the range of its driver, and remove magnets and iron"
+        found.append(Finding(f"{part}.magnetometer", "wrong scale", text, cure))
     return found
 
 
@@ -306,11 +280,8 @@ def diagnose_axes(turns: Turns) -> AxesFound:
         part, size = f"inertial_unit.{name}", float(np.linalg.norm(turns.before[0, index]))
         if name in axes and np.abs(turns.after[:, index] - turns.before[:, index]).max() < 0.02 * size:
             axes[name] = None
-            text, cure = (
-                "its values do not change during the rotations",
-                "switch the unit off and on, or replace it",
-            )
-            findings.append(Finding(part, "stuck", text, cure))
+            text = "its values do not change during the rotations"
+            findings.append(Finding(part, "stuck", text, "switch the unit off and on, or replace it"))
         elif own := [one for one in named if one.part == part]:
             findings += own
         elif name in axes and axes[name] is None:
@@ -397,13 +368,11 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
         findings.append(Finding(part, "dead", text, cure))
         return None
     if (sizes < 0.2 * QUARTER).any():
+        cure = "repeat the rotation; replace the gyro if this recurs"
         for axis in np.flatnonzero(sizes < 0.2 * QUARTER):
-            text = (
-                f"a rotation of 90 deg about {_AXES[axis]} is measured as {math.degrees(sizes[axis]):.1f} deg"
-            )
-            findings.append(
-                Finding(part, "dead", text, "repeat the rotation; replace the gyro if this recurs")
-            )
+            degrees = math.degrees(sizes[axis])
+            text = f"a rotation of 90 deg about {_AXES[axis]} is measured as {degrees:.1f} deg"
+            findings.append(Finding(part, "dead", text, cure))
         return None
     ratio = sizes / QUARTER
     if (np.abs(np.log(ratio)) > math.log(1.35)).any():
@@ -631,10 +600,10 @@ def diagnose_coils(
     serves, strength, misfit = _match(response, expected, live)
     sign, found = _common_sign(strength, misfit, live)
     drawn = np.mean(test.current, axis=1) / test.commanded
-    joined, askew = _joined(response, expected, live), ASKEW if _exact(axes) else RECOGNISED
-    state = CoilsFound(
-        response, expected, serves, sign * strength, misfit, live, drawn, 1.0, joined, askew, found
-    )
+    joined = _joined(response, expected, live)
+    exact = np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6)  # each axis is exactly a body axis
+    askew, strength = ASKEW if exact else RECOGNISED, sign * strength
+    state = CoilsFound(response, expected, serves, strength, misfit, live, drawn, 1.0, joined, askew, found)
     shared, shunt = _shared_fault(test, state, size_known)
     state = replace(state, drawn=drawn / shunt, shunt=shunt)
     found += shared
@@ -652,11 +621,6 @@ def _usual_size(response: FloatArray, expected: FloatArray) -> float:
     along = np.abs(response @ unit.T).max(axis=1) > math.cos(RECOGNISED) * size
     usual = along & (size >= 0.2 * size.max())
     return float(np.median(size[usual] if usual.any() else size[size >= 0.2 * size.max()]) or 1.0)
-
-
-def _exact(axes: FloatArray) -> bool:
-    """Return whether each axis of the magnetometer is exactly a body axis."""
-    return bool(np.allclose(np.abs(axes).max(axis=1), 1.0, atol=1e-6))
 
 
 def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict[int, int]:
@@ -781,9 +745,8 @@ def _coil_findings(
         return [_several_coils(part, name, names[state.joined[j]], float(state.drawn[j]))]
     if absent > 0.04:
         text = f"coil {name}: its field is missing in {100.0 * absent:.0f} % of the samples"
-        return [
-            Finding(part, "intermittent", text, "check the coil's plug and solder joints for loose contact")
-        ]
+        cure = "check the coil's plug and solder joints for loose contact"
+        return [Finding(part, "intermittent", text, cure)]
     if state.misfit[j] >= state.askew:
         shown = ", ".join(f"{value:.2f}" for value in state.response[j] / np.linalg.norm(state.response[j]))
         text = f"coil {name}: its field is {math.degrees(state.misfit[j]):.0f} deg off, along ({shown})"
@@ -816,9 +779,8 @@ def _several_coils(part: str, name: str, other: str, drawn: float) -> Finding:
 def _without_field(part: str, name: str, drawn: float) -> Finding:
     """Return the finding about a coil that draws `drawn` times the commanded current but has no field."""
     if math.isnan(drawn):
-        return Finding(
-            part, "no field", f"coil {name}: its field does not change", "check wires and channels"
-        )
+        text = f"coil {name}: its field does not change"
+        return Finding(part, "no field", text, "check wires and channels")
     if drawn < 0.12:
         cure = "check the coil's wires and plug, and the bridge's `channels`"
         return Finding(part, "open", f"coil {name}: no field and no current", cure)

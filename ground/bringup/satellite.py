@@ -43,13 +43,11 @@ def step_power(session: Session) -> Outcome:
     coils.off()
     values: dict[str, dict[str, float]] = {}
     for key, monitor in monitors.items():
-        if rest[key] is None or driven[key] is None:
+        before, after = rest[key], driven[key]
+        if before is None or after is None:
             problem = monitor.error() or "no conversion arrives"
             findings.append(Finding(key, "no reading", problem, "check its supply and wiring"))
             continue
-        before, after = rest[key], driven[key]
-        assert before is not None, "checked above"
-        assert after is not None, "checked above"
         values[key] = {"voltage": before.voltage, "current": before.current}
         values[key]["rise"] = after.current - before.current
         findings += _monitor_faults(key, power, before, after)
@@ -77,17 +75,10 @@ def _readings(
 def _monitor_faults(key: str, power: Power, rest: PowerReading, driven: PowerReading) -> list[Finding]:
     """Return the fault of a monitor that its readings without and with a driven coil show, if any."""
     if rest.current == driven.current and rest.voltage == driven.voltage:
-        text = (
-            f"its readings do not change when a coil is driven ({rest.voltage:.2f} V, {rest.current:.3f} A)"
-        )
-        return [
-            Finding(
-                key,
-                "stuck",
-                text,
-                "switch it off and on, and check its wiring; replace it if the readings still do not change",
-            )
-        ]
+        shown = f"{rest.voltage:.2f} V, {rest.current:.3f} A"
+        text = f"its readings do not change when a coil is driven ({shown})"
+        cure = "switch it off and on, and check its wiring; replace it if the readings still do not change"
+        return [Finding(key, "stuck", text, cure)]
     low, high = 0.9 * power.battery.voltage(0.0), 1.05 * power.battery.voltage(1.0)
     if not low <= rest.voltage <= high:
         text = f"it measures {rest.voltage:.2f} V, but the battery has {low:.2f} to {high:.2f} V"
@@ -196,11 +187,8 @@ def _gps_faults(fixes: Sequence[GpsReading], offset: float) -> list[Finding]:
     utc, positions = np.array([one.utc_ns for one in fixes]), np.array([one.position for one in fixes])
     if len(fixes) > 2 and (np.diff(utc) == 0).mean() > 0.5:
         text = f"its time does not advance in {len(fixes)} fixes"
-        return [
-            Finding(
-                "gps", "stuck", text, "switch it off and on; replace it if the time still does not advance"
-            )
-        ]
+        cure = "switch it off and on; replace it if the time still does not advance"
+        return [Finding("gps", "stuck", text, cure)]
     findings = []
     if abs(offset) > _CLOCK_S:
         text = f"its time differs from that of this computer by {-offset:.0f} s"
@@ -239,9 +227,8 @@ def step_strings(session: Session) -> Outcome:
     findings: list[Finding] = []
     lit = np.zeros((len(peaks), len(peaks)))
     for number, normal in enumerate(normals):
-        session.ask(
-            f"Shine a lamp onto the panel of string {number + 1} only, normal {tuple(normal.tolist())}."
-        )
+        outward = tuple(normal.tolist())
+        session.ask(f"Shine a lamp onto the panel of string {number + 1} only, normal {outward}.")
         lit[number] = _currents(session, strings, normal) - dark
     alike = normals @ normals.T > 0.99 * np.linalg.norm(normals, axis=1) ** 2
     if (lit == 0.0).all():

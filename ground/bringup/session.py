@@ -77,19 +77,12 @@ def step_rest(session: Session) -> Outcome:
     findings = diagnose_rest(samples, span, expected, bad / max(packets + bad, 1), strongest)
     if len(samples.times) < FEWEST:
         return Outcome(findings, {"samples": len(samples.times)})
-    noise = {
-        "gyro": noise_of(samples.rate).tolist(),
-        "field": noise_of(samples.field).tolist(),
-        "acceleration": noise_of(samples.acceleration).tolist(),
-    }
+    measured = {"gyro": samples.rate, "field": samples.field, "acceleration": samples.acceleration}
+    noise = {name: noise_of(sensor).tolist() for name, sensor in measured.items()}
     values = {
         "rate_hz": len(samples.times) / span,
         "noise": noise,
-        "expected": {
-            "gyro": expected.gyro,
-            "field": expected.field,
-            "acceleration": expected.acceleration,
-        },
+        "expected": {name: getattr(expected, name) for name in measured},
         "bias": samples.rate.mean(axis=0).tolist(),
         "field": samples.field.mean(axis=0).tolist(),
         "acceleration": samples.acceleration.mean(axis=0).tolist(),
@@ -245,19 +238,9 @@ def _drive(
         one.part == "inertial_unit.magnetometer" and one.kind in {"stuck", "dead"}
         for one in session.known.get("rest", Outcome()).findings
     )
-    return CoilTest(
-        commanded,
-        fields[:, 0],
-        fields[:, 1],
-        currents,
-        float(np.mean(idle)),
-        noise,
-        absent,
-        fault,
-        any(clipped),
-        (float(np.max(volts[:, 0])), float(np.min(volts[:, 1:]))),
-        sensed,
-    )
+    resting, supply = float(np.mean(idle)), (float(np.max(volts[:, 0])), float(np.min(volts[:, 1:])))
+    plus, minus, clips = fields[:, 0], fields[:, 1], any(clipped)
+    return CoilTest(commanded, plus, minus, currents, resting, noise, absent, fault, clips, supply, sensed)
 
 
 def _voltage(monitor: PowerMonitor | None) -> float:

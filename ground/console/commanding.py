@@ -1,4 +1,4 @@
-"""Commands from the console's forms to a flight, over a socket or a link."""
+"""Commands from the console's forms to a flight over a socket or a link, and files of the satellite."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maximum-likelihood fit of the motion's constants and the noise levels to a record, by Gauss-Newton steps.
+"""Maximum-likelihood fit of the motion's constants and the noise levels to a record, and absolute constants.
 
 The equation of motion, divided by the inertia, is theta'' = g I cos(theta) - kappa theta - delta theta' + d
 (Sease 2013, eq. 5.4, with the thread). Each change of the current I takes effect after the delay tau. The
@@ -19,6 +19,14 @@ The covariance is the inverse of the information if the innovations are white (t
 The inertial unit's attitude filter or air currents can correlate the innovations, which are then not white.
 In that case, each standard deviation is at least the sandwich estimate (Huber 1967) over segments of the
 record.
+
+Motion under a known current determines g = n A B / J, k / J and c / J, but not the inertia J itself. For
+example, a body with twice the inertia in twice the field on a thread of twice the stiffness has the same
+motion. The absolute values follow from prior values of the inertia J, the dipole per ampere n A, and the
+field B. The field B is also measured by the magnetometer. The priors are Gaussian in the logarithms of the
+values. The measured gain g relates inertia, dipole and field by the constraint
+ln n A + ln B - ln J - ln g = 0, which is applied as an error-free measurement, and corrects inertia, dipole
+and field.
 """
 
 from __future__ import annotations
