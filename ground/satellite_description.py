@@ -3,8 +3,8 @@
 The file extends the configuration `orbit` (a 1U CubeSat) and contains only differing values. Values that are
 not described are computed: the inertia is that of a homogeneous cuboid, and limits are scaled between those
 of the configurations `orbit` and `orbit_3u`. The file omits weights and noise levels that the flight
-application computes from craft and coils. The questions of `knightcube new-satellite` stand with the functions
-that read and check the answers.
+application computes from craft and coils. The questions of `knightcube new-satellite` stand with the
+functions that read and check the answers.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The devices of a bench session: the search for them, the open devices, and the outcome of a step.
 
 The driver sets a coil to zero if its command is not repeated within 0.25 s. The guardian sets all coils to
-zero if this process stops, and `Session.close` does so at the end of every session. A missing chip is searched
-for at all addresses of its bus, and a missing serial device on all serial lines of the configuration at all
-baud rates. Chips are identified by registers that no driver changes.
+zero if this process stops, and `Session.close` does so at the end of every session. A missing chip is
+searched for at all addresses of its bus, and a missing serial device on all serial lines of the configuration
+at all baud rates. Chips are identified by registers that no driver changes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Campaign of flights whose configuration values are drawn at random from given distributions, and its plot."""
+"""Campaign of flights with configuration values drawn at random from given distributions, and its plot."""
 
 from __future__ import annotations
 
