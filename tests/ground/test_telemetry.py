@@ -1,20 +1,27 @@
-"""Tests of packets read from bytes and from the folder of a run, and of the damage report."""
+"""Tests of reading packets from bytes and from a run, of the damage report, and of exported files."""
 
 from __future__ import annotations
 
+import csv
+import math
+import sqlite3
+import sys
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET, TRUTH
+from flight.link.telemetry.definitions import CONTROL, EVENT, HOUSEKEEPING, IMU, RUN, TARGET, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
-from ground.telemetry import ScanResult, decode, read_run, scan
+from ground.telemetry import Run, ScanResult, decode, export, read_run, scan
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
+from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock
 from tests.pace import ordinary_seconds
@@ -210,3 +217,177 @@ def test_a_log_four_times_as_long_takes_about_four_times_as_long() -> None:
 def test_noise_holds_no_packets() -> None:
     noise = np.random.default_rng(7).bytes(1_000_000)
     assert scan(noise).counts == {}
+
+
+def read(path: Path) -> tuple[list[str], list[list[str]]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        names, *rows = csv.reader(file)
+    return names, rows
+
+
+def test_every_kind_of_packet_that_came_has_its_file(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=30.0, hold=10.0, rate_hz=10.0)))
+    files = export(run, tmp_path / "csv")
+    kinds = {
+        *("run", "control", "target", "plan", "streak", "stars", "event", "truth"),
+        *("cycle_timing", "rate_group", "job_timing", "housekeeping", "fields"),
+    }
+    assert {path.stem for path in files} == kinds
+    assert sorted(files) == sorted((tmp_path / "csv").iterdir())
+
+
+def test_numbers_come_back_exactly_under_their_names_and_units(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=20.0, hold=10.0, rate_hz=10.0)))
+    export(run, tmp_path / "csv")
+    names, rows = read(tmp_path / "csv" / "truth.csv")
+    assert names[:6] == ["time_s", "quaternion_1", "quaternion_2", "quaternion_3", "quaternion_4", "rate_1"]
+    _, fields = read(tmp_path / "csv" / "fields.csv")
+    own = [field for field in fields if field[0] == "truth"]
+    assert [field[1] for field in own] == names
+    assert [field[2] for field in own[:6]] == ["s", "-", "-", "-", "-", "rad/s"]
+    assert own[1][3] == "rotation of reference frame into body, scalar last"
+    table = np.array(rows, dtype=float)
+    np.testing.assert_array_equal(table[:, 0], np.arange(201) / 10.0)
+    np.testing.assert_array_equal(table[:, 1:5], run["truth"]["quaternion"])
+    np.testing.assert_array_equal(table[:, -2], run["truth"]["energy"])
+
+
+def test_numpy_reads_a_file_by_its_column_names(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=5.0, rate_hz=10.0)))
+    export(run, tmp_path / "csv")
+    table = np.genfromtxt(tmp_path / "csv" / "control.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(table["q2"], run["control"]["q2"])
+
+
+def test_texts_with_commas_quotes_and_accents_survive(tmp_path: Path) -> None:
+    text = 'said "no, thank you", été\nsecond line'
+    log = FlightLog(tmp_path, clock=ManualClock())
+    log.write(Packer().pack(EVENT, 1, code=1, severity=0, suppressed=0, name="a", text=text))
+    log.close()
+    path, _ = export(read_run(tmp_path), tmp_path / "csv")
+    names, rows = read(path)
+    assert dict(zip(names, rows[0], strict=True))["text"] == text
+
+
+def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UsageError, match="csv cannot be written"):
+        export(run, tmp_path / "file")
+
+
+@pytest.fixture
+def rich_run(tmp_path: Path) -> Run:
+    """Return a run with texts, NaN, and 64-bit integers."""
+    log = FlightLog(tmp_path / "run", clock=ManualClock())
+    packer = Packer()
+    for n in range(3):
+        values = {"imu_packets": 7 + n, "coil_voltage": np.nan if n else 5.0}
+        fields = {field.name: values.get(field.name, 0) for field in HOUSEKEEPING.fields}
+        log.write(packer.pack(HOUSEKEEPING, n * 10**9, fields))
+    identity = {f.name: [1.0] * 3 if f.count == 3 else "é" if f.kind[0] == "S" else 1 for f in RUN.fields}
+    log.write(packer.pack(RUN, 0, {**identity, "seed": 2**64 - 1}))
+    log.write(packer.pack(EVENT, 1, code=1, severity=0, suppressed=0, name="a", text='x "y", z\n'))
+    log.close()
+    return read_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("reader", ["pyarrow", "pandas", "polars", "duckdb"])
+def test_readers_of_other_authors_need_no_options(
+    rich_run: Run, tmp_path: Path, reader: str, form: str
+) -> None:
+    """Other programs read the exported files without options.
+
+    NaN is read as a number, and texts keep their quotes and accents.
+    """
+    module = pytest.importorskip(f"pyarrow.{form}" if reader == "pyarrow" else reader)
+    pytest.importorskip("pyarrow", reason="needs the extra `parquet`")
+    files = {path.stem: str(path) for path in export(rich_run, tmp_path / form, form)}
+
+    def column(packet: str, name: str) -> list[Any]:
+        if reader == "duckdb":
+            rows = module.sql(f"SELECT {name} FROM '{files[packet]}'").fetchall()
+            return [row[0] for row in rows]
+        read = getattr(module, f"read_{'table' if (reader, form) == ('pyarrow', 'parquet') else form}")
+        values = read(files[packet])[name]
+        return list(values.to_pylist() if reader == "pyarrow" else values.to_list())
+
+    assert column("housekeeping", "imu_packets") == [7, 8, 9]
+    voltage = [math.nan if value is None else value for value in column("housekeeping", "coil_voltage")]
+    np.testing.assert_array_equal(voltage, [5.0, math.nan, math.nan])
+    assert column("run", "config_name") == ["é"]
+    if form == "parquet":  # pyarrow reads unsigned 64-bit integers in CSV files as floating-point numbers
+        assert column("run", "seed") == [2**64 - 1]
+
+
+def test_one_sqlite_file_has_a_table_for_each_packet_and_the_units(rich_run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "new" / "all.sqlite"
+    for _ in range(2):  # the second export replaces the files of the first
+        assert export(rich_run, file, "sqlite") == [file]
+    assert list(file.parent.iterdir()) == [file]
+    with closing(sqlite3.connect(file)) as database:
+        rows = database.execute("SELECT time_s, imu_packets, coil_voltage FROM housekeeping").fetchall()
+        assert rows == [(0.0, 7, 5.0), (1.0, 8, None), (2.0, 9, None)]
+        assert database.execute("SELECT seed, config_name, coil_resistance_3 FROM run").fetchall() == [
+            (str(2**64 - 1), "é", 1.0)
+        ]
+        assert database.execute("SELECT text FROM event").fetchone() == ('x "y", z\n',)
+        unit = "SELECT unit FROM fields WHERE packet = 'housekeeping' AND name = 'coil_voltage'"
+        assert database.execute(unit).fetchone() == ("V",)
+
+
+def test_parquet_files_hold_every_number_with_its_unit(rich_run: Run, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `parquet`")
+    files = {path.stem: path for path in export(rich_run, tmp_path / "parquet", "parquet")}
+    assert set(files) == {"run", "event", "housekeeping"}
+    table = parquet.read_table(files["housekeeping"])
+    np.testing.assert_array_equal(table["coil_voltage"].to_numpy(), [5.0, np.nan, np.nan])
+    np.testing.assert_array_equal(table["imu_packets"].to_numpy(), [7, 8, 9])
+    assert table.schema.field("coil_voltage").metadata[b"unit"] == b"V"
+    identity = parquet.read_table(files["run"])
+    assert identity["seed"].to_pylist() == [2**64 - 1]
+    assert identity["config_name"].to_pylist() == ["é"]
+
+
+def test_all_formats_have_the_same_columns(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `parquet`")
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=2.0, rate_hz=10.0)))
+    export(run, tmp_path / "csv")
+    export(run, tmp_path / "parquet", "parquet")
+    export(run, tmp_path / "one.sqlite", "sqlite")
+    with closing(sqlite3.connect(tmp_path / "one.sqlite")) as database:
+        for path in (tmp_path / "csv").iterdir():
+            names, rows = read(path)
+            if path.stem == "fields":
+                continue
+            assert parquet.read_schema(tmp_path / "parquet" / f"{path.stem}.parquet").names == names
+            cursor = database.execute(f'SELECT * FROM "{path.stem}"')
+            assert [column[0] for column in cursor.description] == names
+            assert len(cursor.fetchall()) == len(rows)
+
+
+def test_without_pyarrow_the_cure_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UsageError, match=r"pip install 'knightcube-flight\[parquet\]'"):
+        export(run, tmp_path / "parquet", "parquet")
+
+
+@pytest.mark.parametrize("form", ["parquet", "sqlite"])
+def test_no_format_is_written_where_nothing_can_be(tmp_path: Path, form: str) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UsageError, match=f"{form} cannot be written"):
+        export(run, tmp_path / "file" / "x", form)
+    (tmp_path / "folder.sqlite").mkdir()
+    if form == "sqlite":
+        with pytest.raises(UsageError, match="sqlite cannot be written"):
+            export(run, tmp_path / "folder.sqlite", form)
+
+
+def test_the_command_names_the_file_that_it_wrote(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0))
+    done = command("export", folder, "--format", "sqlite")
+    assert (done.returncode, done.stdout) == (0, f"{folder / 'run.sqlite'}\n"), done.stderr
+    assert command("export", folder, "--format", "xml").returncode == 2

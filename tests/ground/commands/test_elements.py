@@ -1,7 +1,8 @@
-"""Tests that `knightcube elements` fits elements to GPS fixes, and that `knightcube check` accepts them."""
+"""Tests of the commands `elements`, whose elements `knightcube check` accepts, `passes` and `day`."""
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 from datetime import UTC, datetime, timedelta
@@ -9,12 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from flight.app.cli import main
+from flight.link.process import directives
+from flight.link.process.directives import Scheduled
+from ground.commands import satellite
 from ground.telemetry import read_run
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
 from sim_hal.worlds.orbit import julian_date
 from tests.ground.commands.in_process import command
+from tests.support.orbit_elements import POLAR_ORBIT
 
 ORBIT = tuple(
     ["--altitude", "500", "--inclination", "97.4", "--epoch", "2026-03-20T12:00:00", "--local-time", "10.5"]
@@ -194,3 +201,81 @@ def test_check_refuses_a_target_if_the_position_is_never_known(tmp_path: Path) -
         "`targets[0].point` is nadir: pointing needs the satellite's position: add `gps`, or `elements`"
         in done.stderr
     )
+
+
+FROM_NOON = ("orbit_3u", "--from", "2026-03-20T12:00:00")
+BERLIN = ("--station", "Berlin,52.5,13.4")
+
+
+def test_the_table_and_the_object_have_the_same_passes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["passes", *FROM_NOON, *BERLIN]) == 0
+    rows = capsys.readouterr().out.splitlines()[1:-1]
+    assert main(["passes", *FROM_NOON, *BERLIN, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["passes"]
+    rises = [datetime.fromisoformat(one["rise_utc"]).strftime("%Y-%m-%d %H:%M:%S") for one in found]
+    assert [" ".join(row.split()[1:3]) for row in rows] == rises
+    assert len(rises) >= 3
+
+
+def test_the_schedule_consists_of_commands_that_can_be_sent(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["passes", *FROM_NOON, *BERLIN, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["passes"]
+    assert main(["passes", *FROM_NOON, *BERLIN, "--schedule", "--lead", "90"]) == 0
+    typed = capsys.readouterr().out.splitlines()
+    parser = argparse.ArgumentParser()
+    satellite.configure_command(parser)
+    sent = []
+    for line in typed:
+        options = satellite._with_scheduled(parser.parse_args(["--to", "socket", *line.split()]))
+        sent.append(directives.unpack(satellite.packet_of(options)))
+    assert len(sent) == 2 * len(found)
+    for one, (begin, end) in zip(found, zip(sent[::2], sent[1::2], strict=True), strict=True):
+        assert isinstance(begin, Scheduled)
+        assert isinstance(end, Scheduled)
+        rise = datetime.fromisoformat(one["rise_utc"]).replace(tzinfo=None)
+        assert abs(datetime.fromisoformat(begin.at) - (rise - timedelta(seconds=90))) < timedelta(seconds=1)
+        assert begin.words.startswith("point ground 52.5deg ")
+        assert end.words == "point nadir"
+
+
+def test_elements_may_stand_in_a_file_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "elements.txt"
+    file.write_text("SATELLITE\n" + "\n".join(POLAR_ORBIT) + "\n")
+    assert main(["passes", str(file), "--from", "2026-03-20T12:00:00", *BERLIN]) == 0
+    assert "Berlin" in capsys.readouterr().out
+
+
+def test_old_elements_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["passes", "orbit_3u", "--from", "2026-12-20T12:00:00", *BERLIN]) == 0
+    assert "the elements are old" in capsys.readouterr().err
+
+
+def test_a_station_that_never_sees_the_satellite_has_no_pass(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["passes", *FROM_NOON, "--station", "Berlin,52.5,13.4,0,89.9", "--days", "0.1"]) == 1
+    assert capsys.readouterr().out == "no pass\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (FROM_NOON, "give a ground station"),
+        ((*FROM_NOON, *BERLIN, *BERLIN), "two stations are called 'Berlin'"),
+        ((*FROM_NOON, *BERLIN, "--days", "31"), "--days 31: must be at most 30"),
+        (("step_demo", *BERLIN), "this needs the configuration of a satellite"),
+    ],
+)
+def test_a_wrong_use_is_refused(
+    arguments: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["passes", *arguments]) == 2
+    assert reason in capsys.readouterr().err
+
+
+def test_a_day_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "day.png"
+    assert main(["day", *FROM_NOON, *BERLIN, "--picture", str(file)]) == 0
+    assert capsys.readouterr().out == f"picture: {file}\n"
+    with Image.open(file) as picture:
+        assert picture.width > 1000
