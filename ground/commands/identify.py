@@ -115,9 +115,8 @@ def run(options: argparse.Namespace) -> int:
     if folder.is_dir():
         for name in ("run", "duration", "seed", "realtime"):
             if getattr(options, name):
-                raise UsageError(
-                    f"--{name}: {options.source} is the folder of a flight, give a configuration"
-                )
+                problem = f"{options.source} is the folder of a flight, give a configuration"
+                raise UsageError(f"--{name}: {problem}")
         config = configuration.load(folder / "config.yaml")
         if isinstance(config, OrbitConfig):
             return _show_learned(options, folder, config)
@@ -217,16 +216,16 @@ def _identify(folder: Path) -> _Identified:
     """Fit the constants to the flight log in a folder."""
     config = configuration.load_testbed(folder / "config.yaml")
     record = read_record(read_run(folder), config.coils.stale_after)
+
+    def show_round(count: int, step: float) -> None:
+        sys.stderr.write(f"\r\x1b[Kfitting, round {count + 1}: the last step was {step:.2g} sigma")
+        sys.stderr.flush()
+
     with_line = sys.stderr.isatty()
-    found = fit(record, noise_of(config), _show_round if with_line else None)
+    found = fit(record, noise_of(config), show_round if with_line else None)
     if with_line:
         sys.stderr.write("\r\x1b[K")
     return _Identified(folder, config, record, found, absolute(found, prior_of(config), record.field))
-
-
-def _show_round(count: int, step: float) -> None:
-    sys.stderr.write(f"\r\x1b[Kfitting, round {count + 1}: the last step was {step:.2g} sigma")
-    sys.stderr.flush()
 
 
 def _facts(made: _Identified) -> dict[str, Any]:

@@ -258,7 +258,9 @@ def _gateway(options: argparse.Namespace, stack: ExitStack) -> Gateway:
     """
     token = new_token()
     terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
-    gateway = Gateway(terminal, "127.0.0.1:0", token, _complain)
+    gateway = Gateway(
+        terminal, "127.0.0.1:0", token, lambda text: sys.stderr.write(f"knightcube: gateway: {text}\n")
+    )
     stack.enter_context(contextlib.closing(gateway))
     stack.enter_context(token_file(token_path(options.keys, gateway.port), token))
     return gateway
@@ -295,10 +297,6 @@ def _runs(session: Session) -> bool:
         return bool(session.ask(f"/instances/{INSTANCE}")["state"] == "RUNNING")
     except (OSError, ValueError):  # a ValueError means that the answer is not JSON
         return False
-
-
-def _complain(text: str) -> None:
-    sys.stderr.write(f"knightcube: gateway: {text}\n")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -18,7 +18,6 @@ from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive, print_result, utc
 from knightcube import plan_slew, plan_step
-from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.plant import Q2_LIMIT, PathCost, SingleAxisPlant, angle_of
@@ -205,7 +204,14 @@ def _run_orbit(options: argparse.Namespace) -> int:
     made = _planned(options, config, config.elements, at)
     solved_s = time.process_time() - begun
     facts = _orbit_facts(made, at, solved_s)
-    print_result(options, facts | _nodes(made), _orbit_text(facts))
+    path = made.plan.path
+    nodes = {
+        "time_s": path.times.tolist(),
+        "quaternion": path.quaternion.tolist(),
+        "rate_rad_s": path.rate.tolist(),
+        "dipole_A_m2": path.dipole.tolist(),
+    }
+    print_result(options, facts | nodes, _orbit_text(facts))
     if options.picture is not None:
         from ground.report import draw_slew  # noqa: PLC0415
 
@@ -232,6 +238,9 @@ def _planned(
     }
     if cones and config.camera is None:
         raise UsageError(f"{options.orbit}: a cone needs a `camera`")
+    boresight = np.array(config.pointing.axis)
+    if config.camera is not None:
+        boresight = attitude_matrix(np.array(config.camera.mounting))[2]
     coils = config.coils.map()
     return plan_slew(
         inertia=config.craft.inertia_matrix(),
@@ -247,17 +256,10 @@ def _planned(
         time_cost=MINIMUM_TIME if options.least_time else options.time_price,
         pointing_axis=config.pointing.axis,
         across_axis=config.pointing.across,
-        camera_axis=_boresight(config),
+        camera_axis=boresight,
         cones=cones,
         nodes=options.nodes or SLEW_NODES,
     )
-
-
-def _boresight(config: OrbitConfig) -> FloatArray:
-    """Return the star camera's boresight (3,) in the body frame, or the pointing axis without a camera."""
-    if config.camera is None:
-        return np.array(config.pointing.axis)
-    return np.asarray(attitude_matrix(np.array(config.camera.mounting))[2])
 
 
 def _target(option: str, text: str) -> PointingTarget:
@@ -313,16 +315,6 @@ def _orbit_facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, 
         "roll_free": isinstance(task.end(plan.horizon), BoresightEnd),
         "steps": plan.steps,
         "processor_s": solved_s,
-    }
-
-
-def _nodes(made: OrderedSlew) -> dict[str, object]:
-    path = made.plan.path
-    return {
-        "time_s": path.times.tolist(),
-        "quaternion": path.quaternion.tolist(),
-        "rate_rad_s": path.rate.tolist(),
-        "dipole_A_m2": path.dipole.tolist(),
     }
 
 

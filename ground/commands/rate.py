@@ -107,14 +107,8 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
     """Return the fit settings: from the options, else from the configuration, else the defaults."""
     settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
-    if options.line_time is not None and not math.isfinite(options.line_time):
-        raise UsageError(f"--line-time {options.line_time}: must be finite")
-    given = {
-        "gain": options.gain,
-        "saturation": options.saturation,
-        "psf_sigma": options.psf,
-        "line_time": options.line_time,
-    }
+    given = {"gain": options.gain, "saturation": options.saturation, "psf_sigma": options.psf}
+    given["line_time"] = options.line_time
     return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 

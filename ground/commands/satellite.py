@@ -69,7 +69,7 @@ from flight.link.telemetry.definitions import (
     PARAMETERS,
     VERIFICATION,
 )
-from flight.link.telemetry.fields import Field, Packet
+from flight.link.telemetry.fields import Packet
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
 from flight.link.telemetry.packets import TelemetryError
 from flight.schema.document import read_document, read_text, to_yaml
@@ -95,7 +95,7 @@ from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 Object = dict[str, Any]
 _Words: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule", "restart")
-_ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name == "table"}
+(_ORIGINS,) = (dict(field.states) for field in PARAMETERS.fields if field.name == "table")
 _OF_TRANSFERS: dict[str, type[CancelFile | SuspendFile | ResumeFile]] = {
     "cancel": CancelFile,
     "suspend": SuspendFile,
@@ -210,17 +210,13 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
         )
         return
     for field in packet.fields if packet is not PING else ():
-        _add_field(parser, field)
-
-
-def _add_field(parser: argparse.ArgumentParser, field: Field) -> None:
-    meaning = meaning_of(replace(field, states=())).replace("%", "%%")
-    if field.states:
-        parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
-    elif field.kind.startswith("S"):
-        parser.add_argument(field.name, nargs="*", help=meaning)
-    else:
-        parser.add_argument(field.name, type=float if field.kind.startswith("f") else int, help=meaning)
+        meaning = meaning_of(replace(field, states=())).replace("%", "%%")
+        if field.states:
+            parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
+        elif field.kind.startswith("S"):
+            parser.add_argument(field.name, nargs="*", help=meaning)
+        else:
+            parser.add_argument(field.name, type=float if field.kind.startswith("f") else int, help=meaning)
 
 
 def run_command(options: argparse.Namespace) -> int:
@@ -325,7 +321,7 @@ class ParameterTable:
         values = {
             key: float(row[field.name]) for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True)
         }
-        origin = _ORIGINS["table"].get(int(row["table"]), "unknown")
+        origin = _ORIGINS.get(int(row["table"]), "unknown")
         return cls(values, int(row["crc"]), int(row["loads"]), origin, bool(row["kept"]))
 
 
@@ -361,10 +357,8 @@ def run_parameters(options: argparse.Namespace) -> int:
         _, refused = _ask(options, LoadParameters(before.crc, tuple(wanted[key] for key in PARAMETER_KEYS)))
         flown = (_ask(options, DumpParameters())[0] or before) if not refused else before
         if not refused and flown.crc != crc_of([wanted[key] for key in PARAMETER_KEYS]):
-            raise FlightError(
-                f"the flight uses table {flown.crc:08x}, not the one that was sent: check it with another "
-                "call"
-            )
+            problem = f"the flight uses table {flown.crc:08x}, not the one that was sent"
+            raise FlightError(f"{problem}: check it with another call")
     _show(flown, before, refused, options.json)
     if options.save is not None:
         sections: dict[str, dict[str, float]] = {}
@@ -556,7 +550,10 @@ class _FileWork:
             case "put":
                 name = f"{options.kind}/{options.path.name}"
                 if options.replace:
-                    self._delete_existing(f"received/{name}")
+                    path = self._get(ListFiles(f"received/{name}"), LISTING)
+                    files = json.loads(path.read_bytes())["files"]
+                    if any(file["name"] == f"received/{name}" for file in files):
+                        self._command(DeleteFile(f"received/{name}"))
                 return self._put(options.path, name)
             case "use":
                 name = f"received/{options.kind}/{options.path.name}"
@@ -565,12 +562,6 @@ class _FileWork:
                 return self._command(DeleteFile(options.name))
             case word:
                 return self._command(_OF_TRANSFERS[word](options.source, options.number))
-
-    def _delete_existing(self, name: str) -> None:
-        """Delete a file on board, if it exists."""
-        path = self._get(ListFiles(name), LISTING)
-        if any(file["name"] == name for file in json.loads(path.read_bytes())["files"]):
-            self._command(DeleteFile(name))
 
     def _facts(self, path: Path) -> Object:
         name, size = path.relative_to(self._session.received).as_posix(), path.stat().st_size
