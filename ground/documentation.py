@@ -126,7 +126,6 @@ def _packet(layout: Layout) -> dict[str, Any]:
 
 
 def _details(field: Field) -> dict[str, Any]:
-    """Return the optional properties of a field: states, bits, limits, and the largest value of a counter."""
     limits = field.limits
     details: dict[str, Any] = {
         "states": [list(state) for state in field.states],
@@ -274,7 +273,6 @@ def _target_inputs(field: str) -> list[Object]:
 
 
 def _input(field: Field) -> Object:
-    """Return the description of the form input for one field of a command."""
     one: Object = {
         "name": field.name.replace("_", " "),
         "field": field.name,
@@ -296,7 +294,6 @@ def _input(field: Field) -> Object:
 
 
 def _range_of(kind: str) -> tuple[int, int] | tuple[()]:
-    """Return the range of an integer type, or an empty range for another type."""
     return (0, 2 ** (8 * int(kind[1:])) - 1) if kind.startswith("u") else ()
 
 

@@ -141,7 +141,6 @@ def _of_satellite() -> list[str]:
 
 
 def _write(path: Path, lines: list[str], as_xml: bool) -> None:
-    """Write a message of keyword = value lines. Raises UsageError if the file cannot be written."""
     text = xml_of(lines) if as_xml else "\n".join(lines)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -211,7 +210,6 @@ def _add_state(place: ET.Element, kind: str, date: str, *numbers: str) -> None:
 
 
 def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
-    """Return the text lines of the message segment that contains the track of one object."""
     dates = [ccsds_date(start_ns + int(time)) for time in track["middle_ns"]]
     sigma = track["measured_sigma"] * _ARCSECONDS
     lines = [

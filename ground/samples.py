@@ -59,7 +59,6 @@ def write_samples(
 
 
 def _stars(name: str, generator: np.random.Generator) -> SamplePicture:
-    """Render Orion with a camera at rest."""
     return _sky(name, generator, ORION.quaternion(), np.zeros(3), STILL_S)
 
 

@@ -281,7 +281,6 @@ def configuration_text(satellite: Satellite, values: Derived, made: FittedElemen
 
 
 def _coil_lines(satellite: Satellite) -> list[Line]:
-    """Return the lines of the configuration file that describe the coils."""
     largest = max(coil.current_limit for coil in satellite.coils)
     windings: list[Line] = []
     for coil in satellite.coils:
@@ -305,7 +304,6 @@ def _coil_lines(satellite: Satellite) -> list[Line]:
 
 
 def _current_lines(satellite: Satellite) -> list[Line]:
-    """Return the lines of the simulated current errors, scaled from those of the configuration `orbit`."""
     least = min(coil.current_limit for coil in satellite.coils)
     fields = np.zeros((3, max(3, len(satellite.coils))))
     for index, coil in enumerate(satellite.coils):
@@ -321,7 +319,6 @@ def _current_lines(satellite: Satellite) -> list[Line]:
 
 
 def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:
-    """Return the lines of the configuration file that describe the star camera."""
     if satellite.field_of_view_deg is None:
         return [("camera: none", "no star camera"), ""]
     half = math.radians(0.5 * (90.0 + TILT_DEG))
@@ -354,7 +351,6 @@ def _cone_lines(satellite: Satellite) -> list[Line]:
 
 
 def _text(value: float) -> str:
-    """Return a number as YAML text."""
     return f"{value:.6g}" if "." in f"{value:.6g}" or "e" in f"{value:.6g}" else f"{value:.6g}.0"
 
 

@@ -219,7 +219,6 @@ def write_csv(run: Run, folder: Path) -> list[Path]:
 
 
 def _printed(values: list[str] | npt.NDArray[Any]) -> list[Any]:
-    """Return the values of a column for a CSV file."""
     if isinstance(values, list):
         return values
     return ["NaN" if math.isnan(value) else value for value in values.tolist()]

@@ -99,8 +99,6 @@ class LogTail:
         return data
 
     def _following(self) -> Path | None:
-        """Return the log segment after the present segment, or None if there is none yet."""
-
         def number(path: Path) -> int:
             return int(path.stem.rpartition("-")[2])
 

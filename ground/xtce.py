@@ -132,7 +132,6 @@ def _size(kind: str) -> int:
 
 
 def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
-    """Add the types and parameters that all packets contain."""
     for name, bits in (*_PRIMARY, ("definition_version", 8), ("error_control", 16)):
         _add_integer(types, f"{name}_Type", "u", bits)
         SubElement(parameters, "Parameter", {"name": name, "parameterTypeRef": f"{name}_Type"})
@@ -144,7 +143,6 @@ def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
 
 
 def _add_primary_container(containers: Element) -> None:
-    """Add the abstract container of the primary and secondary headers."""
     header = SubElement(containers, "SequenceContainer", {"name": "CCSDSPacket", "abstract": "true"})
     entries = SubElement(header, "EntryList")
     for name in (*(name for name, _ in _PRIMARY), "definition_version", "time_ns"):

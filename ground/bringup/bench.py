@@ -349,7 +349,6 @@ def _wrong_part(kind: str, section: Any, rig: Rig, serial: dict[str, Any]) -> Fi
 def _missing(
     kind: str, section: Any, rig: Rig, serial: dict[str, Any], taken: set[Any], error: DeviceError
 ) -> Finding:
-    """Return the finding about a device that does not answer."""
     finding = None
     with suppress(DeviceError):  # if the bus or the line itself is missing, `error` already states this
         if kind in serial:

@@ -94,12 +94,10 @@ def _alone(bright: BoolArray) -> float:
 
 
 def _saturation(camera: Camera | WideCamera) -> float:
-    """Return the counts of a saturated pixel."""
     return getattr(camera, "saturation", None) or float(2**camera.bits - 1)
 
 
 def _frozen(part: str, frames: Sequence[Frame]) -> list[Finding]:
-    """Return the finding about a camera that repeats a frame, if it does."""
     if len(frames) < 2 or frames[-1].sequence > frames[-2].sequence:
         return []
     text = f"frame {frames[-1].sequence} arrives again"
@@ -151,7 +149,6 @@ def step_light(session: Session) -> Outcome:
 
 
 def _wrong_size(part: str, camera: Camera | WideCamera, pixels: Image) -> list[Finding]:
-    """Return the finding about a frame whose size is not the configured one, if any."""
     if pixels.shape == (camera.rows, camera.columns):
         return []
     size = f"{pixels.shape[1]} x {pixels.shape[0]} pixels instead of {camera.columns} x {camera.rows}"

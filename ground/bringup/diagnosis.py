@@ -184,7 +184,6 @@ def diagnose_rest(
 
 
 def _noise_findings(part: str, values: FloatArray, sigma: float, unit: str) -> list[Finding]:
-    """Return the fault that the noise of a sensor shows, if any."""
     noise = noise_of(values)
     if not np.isfinite(values).all():
         return [Finding(part, "dead", "it sends values that are not numbers", "replace the sensor")]
@@ -202,7 +201,6 @@ def _noise_findings(part: str, values: FloatArray, sigma: float, unit: str) -> l
 
 
 def _rest_values(samples: Samples, strongest: float) -> list[Finding]:
-    """Return the faults in the mean values of a resting unit."""
     found, part = [], "inertial_unit"
     bias = samples.rate.mean(axis=0)
     if np.abs(bias).max() > 0.02:
@@ -316,7 +314,6 @@ def _common(found: dict[str, FloatArray]) -> FloatArray | None:
 
 
 def _wrong_axes(part: str, axes: FloatArray) -> Finding:
-    """Return the finding about wrong axes of a sensor or of the whole inertial unit."""
     whole, proper = part == "inertial_unit", np.linalg.det(axes) > 0
     sensors = "the axes of all sensors are wrong" if whole else "its axes differ from the body's"
     if not np.allclose(np.abs(axes).max(axis=1), 1.0):

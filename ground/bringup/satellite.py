@@ -94,7 +94,6 @@ def _monitor_faults(key: str, power: Power, rest: PowerReading, driven: PowerRea
 
 
 def _disagreement(values: Mapping[str, Mapping[str, float]], faulty: set[str]) -> list[Finding]:
-    """Return the finding about two monitors that measure different voltages or changes of the current."""
     if len(values) < 2 or faulty & values.keys():
         return []
     (first, a), (second, b) = values.items()

@@ -189,7 +189,6 @@ def step_coils(session: Session) -> Outcome:
 def _drive(
     session: Session, coils: TorqueCoils, monitor: PowerMonitor | None, commanded: FloatArray
 ) -> CoilTest:
-    """Drive each coil in both directions, and return the measured fields and currents."""
     count, slots = len(commanded), len(session.config.coils.slots)
     fields, currents = np.zeros((count, 2, 3)), np.full((count, 2), math.nan)
     absent, volts = np.zeros((count, 2)), np.full((count, 3), math.nan)

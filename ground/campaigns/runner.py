@@ -137,7 +137,6 @@ def show(facts: dict[str, Any], as_json: bool = False) -> None:
 
 
 def _table(rows: Sequence[Result]) -> list[str]:
-    """Return the text lines of a table with a header, which contains the keys of all rows."""
     keys = list(dict.fromkeys(key for row in rows for key in row))
     cells = [keys, *([_cell(row.get(key)) for key in keys] for row in rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(keys))]
@@ -145,7 +144,6 @@ def _table(rows: Sequence[Result]) -> list[str]:
 
 
 def _cell(value: Any) -> str:
-    """Return a value as text, and None as a dash."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
@@ -355,7 +353,6 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
 
 
 def _worker(campaign: Campaign, scratch: str) -> _Worker:
-    """Start a worker process that runs cases of a campaign."""
     context = get_context("spawn")
     pipe, end = context.Pipe()
     process = context.Process(target=_serve, args=(end, campaign.run, os.getpid(), scratch))
@@ -411,7 +408,6 @@ def _scratch(out: Path) -> Iterator[str]:
 
 
 def _clear(link: Path) -> None:
-    """Delete a link and the folder of temporary files to which the link leads."""
     if link.is_symlink():
         folder = link.readlink()
         if folder.name.startswith(_SCRATCH):

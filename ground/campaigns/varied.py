@@ -91,7 +91,6 @@ def _distribution(spread: str) -> tuple[Draw, bool] | None:
 
 
 def _between(low: float, high: float, logarithmic: bool) -> tuple[Draw, bool]:
-    """Return the uniform or log-uniform distribution between two numbers."""
     if logarithmic:
         ends = math.log(low), math.log(high)
         return (lambda chance, _: math.exp(chance.uniform(*ends))), False
@@ -311,7 +310,6 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
-    """Return median, 95 % quantile and maximum of the finite values; each is None if no value is finite."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return dict.fromkeys(("median", "95 %", "maximum"))

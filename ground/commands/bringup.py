@@ -222,14 +222,12 @@ def _keep(options: argparse.Namespace, key: str, known: Mapping[str, Outcome], n
 
 
 def _write(path: Path, text: str) -> None:
-    """Replace a file when its new content is complete."""
     beside = path.with_name(f".{path.name}.new")
     beside.write_text(text, encoding="utf-8")
     os.replace(beside, path)
 
 
 def _step_text(name: str, outcome: Outcome) -> str:
-    """Return the lines of a step: its measured values, and its findings."""
     faulty = {finding.part for finding in outcome.findings}
     if "skipped" in outcome.values:
         lines = [f"{name:8}skipped: {outcome.values['skipped']}"]
@@ -253,7 +251,6 @@ _FORMATS = {
 
 
 def _measured(name: str, values: Mapping[str, Any]) -> str:
-    """Return the measured values of a step as one line."""
     match name:
         case "rest" if "noise" not in values:
             text = f"{values['samples']} samples"

@@ -90,7 +90,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
-    """Return the pictures, which must have the same size."""
     frames = [(path, read_image(path)) for path in paths]
     first = frames[0]
     for path, pixels in frames:

@@ -136,7 +136,6 @@ def _line(fact: dict[str, Any]) -> str:
 
 
 def _keep(out: Path, frame: Frame, count: int) -> Path:
-    """Write a frame and return its path."""
     path = out if count == 1 else out.with_name(f"{out.stem}-{frame.sequence}{out.suffix}")
     write_picture(path, frame.pixels)
     return path

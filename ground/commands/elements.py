@@ -96,7 +96,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_orbit(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that describe an orbit."""
     orbit = parser.add_argument_group("with --altitude")
     orbit.add_argument("--inclination", type=finite, metavar="DEG", help="required")
     orbit.add_argument("--epoch", metavar="UTC", help="required, such as 2026-03-20T12:00:00")
@@ -332,7 +331,6 @@ def configure_day(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_prediction(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that select satellite, time span and stations."""
     text = "configuration of the satellite with `elements`, or a file of two-line elements or OMM"
     parser.add_argument("config", type=config_path, metavar="CONFIG", help=text)
     add_stations(parser)
@@ -435,7 +433,6 @@ def _elements(path: Path, satellite: int | None) -> tuple[tuple[str, str], Orbit
 
 
 def _lines(found: list[Pass]) -> list[str]:
-    """Return the table of the passes."""
     rows = [
         [
             one.station.name,

@@ -119,7 +119,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _mask(options: argparse.Namespace, pixels: Image) -> BoolArray | None:
-    """Return the mask of the spacecraft structure in the picture, or None if no mask is given."""
     if options.mask is None:
         return None
     hidden = read_image(options.mask) > 0
@@ -145,7 +144,6 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
 
 
 def _facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
-    """Return the values of a horizon solution as JSON data."""
     values: dict[str, Any] = {
         "status": solution.status.value,
         "reason": solution.reason or None,
@@ -204,7 +202,6 @@ METHODS = ("circle", "graphic", "vector")
 
 
 def _add_paper_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the methods of Meller et al."""
     paper = parser.add_argument_group("methods of Meller et al.")
     text = (
         "circle: a circle through the edges of one picture; graphic: the circles of two level cameras "
@@ -231,7 +228,6 @@ class _PaperNadir:
 
 
 def _check_method(options: argparse.Namespace) -> None:
-    """Raise UsageError for options that do not belong to the chosen method."""
     error = options.fov_error
     if error is not None and (options.fov is None or options.method != "default"):
         raise UsageError(f"--fov-error {error:g}: only with --fov and --method default")

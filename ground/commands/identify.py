@@ -136,7 +136,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show_learned(options: argparse.Namespace, folder: Path, config: OrbitConfig) -> int:
-    """Print and write the constants that a satellite has estimated in a run."""
     if options.picture is not None:
         raise UsageError("--picture: draws the fit of a testbed flight only")
     found = learned_description(read_run(folder), config)
@@ -169,7 +168,6 @@ def _quantity_facts(one: LearnedQuantity) -> dict[str, Any]:
 
 
 def _table(found: LearnedDescription, folder: Path) -> str:
-    """Return the estimated values as a table."""
     lines = [
         f"flight: {folder}, values learned until {found.time:.0f} s",
         "",
@@ -186,7 +184,6 @@ def _table(found: LearnedDescription, folder: Path) -> str:
 
 
 def _fly(options: argparse.Namespace) -> Path:
-    """Run a flight with the excitation, and return its folder."""
     if isinstance(configuration.load(options.source), OrbitConfig):
         raise UsageError(
             f"{options.source}: a satellite is identified from a run: make a run with "
@@ -213,7 +210,6 @@ def _fly(options: argparse.Namespace) -> Path:
 
 
 def _identify(folder: Path) -> _Identified:
-    """Fit the constants to the flight log in a folder."""
     config = configuration.load_testbed(folder / "config.yaml")
     record = read_record(read_run(folder), config.coils.stale_after)
 

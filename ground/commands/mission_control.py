@@ -186,7 +186,6 @@ def _failed(process: subprocess.Popen[bytes]) -> bool:
 
 
 def _packets(run: Path) -> list[bytes]:
-    """Return the packets of the flight log in a run's folder, in recorded order. Raises UsageError."""
     segments = find_segments(run, "flight")
     if not segments:
         raise UsageError(f"{run}: no flight log (flight-0001{SUFFIX}) in this folder")
@@ -243,7 +242,6 @@ class Replay:
 
 
 def _address(config: Path, section: Link | None) -> str:
-    """Return the address of the link that a configuration states. Raises UsageError."""
     if section is None:
         raise UsageError(f"{config}: has no section `link`")
     if section.udp is None and section.tcp is None:

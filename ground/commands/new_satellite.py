@@ -187,7 +187,6 @@ class Answers:
             raise UsageError(f"the input has ended; to continue: {self.command()}") from None
 
     def _open(self) -> Iterator[Question]:
-        """Yield the questions whose values are still unknown, in order."""
         yield from (question for question in QUESTIONS if question.name not in self.values)
 
     def _ask(self, question: Question) -> None:

@@ -59,7 +59,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the optional arguments of `knightcube plan`."""
     parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
     text = "cost of time, W: choose the horizon of least energy plus this cost times the horizon"
     parser.add_argument("--time-price", type=positive, metavar="W", help=text)
@@ -83,7 +82,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _run_testbed(options: argparse.Namespace) -> int:
-    """Plan a path of the testbed, and print and draw the path."""
     start, end = _q2("--from", options.start), _q2("--to", options.end)
     _check(options)
     config = configuration.load_testbed(options.config or config_path(_DEFAULT_CONFIG))
@@ -157,7 +155,6 @@ def _q2(option: str, text: str) -> float:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Raise UsageError for a value outside the range of the planner."""
     for option, value, (low, high) in (
         ("--from-rate", options.from_rate, (-FASTEST, FASTEST)),
         ("--to-rate", options.to_rate, (-FASTEST, FASTEST)),
@@ -169,7 +166,6 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of slews in orbit."""
     group = parser.add_argument_group("with --orbit")
     text = (
         "plan a slew of this satellite, a file or an installed name; --from and --to are then targets: "
@@ -193,7 +189,6 @@ def _add_orbit_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_orbit(options: argparse.Namespace) -> int:
-    """Plan a slew in orbit, and print and draw the slew."""
     if options.at is None or options.within is None:
         raise UsageError("--orbit needs --at UTC and --within S")
     config = as_orbit(configuration.load(options.orbit))

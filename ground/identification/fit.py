@@ -427,7 +427,6 @@ def _finished(
 
 
 def _step(passed: Innovations, constants: MotionConstants) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step (6,) and the information (6, 6)."""
     j = passed.whiten(passed.gradient).reshape(-1, len(NAMES))
     prior = _PRIOR_SIGMA**-2.0
     information = j.T @ j + np.diag(prior)

@@ -184,7 +184,6 @@ def fragment(found: LearnedDescription, folder: Path, extends: str) -> str:
 
 
 def _craft(found: LearnedDescription) -> list[str]:
-    """Return the lines of the section `craft`."""
     inertia, coils, dipole = (found.quantities[name] for name in ("inertia", "coils", "dipole"))
     accuracy = found.config.craft.accuracy
     values, accuracies = [], []
@@ -258,7 +257,6 @@ def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
 
 
 def _inertial_unit(found: LearnedDescription) -> list[str]:
-    """Return the lines of the section `inertial_unit`."""
     gyro, field, bias = (found.quantities[name] for name in ("gyro", "field", "field_bias"))
     unit = found.config.inertial_unit
     known, accuracy = unit.calibration, unit.accuracy
@@ -287,7 +285,6 @@ def _inertial_unit(found: LearnedDescription) -> list[str]:
 
 
 def _camera(found: LearnedDescription) -> list[str]:
-    """Return the lines of the section `camera`."""
     one, camera = found.quantities.get("camera"), found.config.camera
     if one is None or camera is None:
         return []
@@ -333,12 +330,10 @@ def _lens(lens: Object, camera: Camera) -> tuple[list[str], list[str]]:
 
 
 def _row(numbers: FloatArray, digits: int = 7) -> str:
-    """Return numbers as a YAML list."""
     return f"[{', '.join(f'{number:.{digits}g}' for number in numbers)}]"
 
 
 def _rows(matrix: FloatArray, indent: int) -> list[str]:
-    """Return the rows of a matrix as lines of a YAML list."""
     return [f"{' ' * indent}- {_row(row)}" for row in matrix]
 
 

@@ -238,7 +238,6 @@ def change_key(
 
 
 def _promote(vault: Vault, spi: int) -> None:
-    """Replace the current key by the next one."""
     with vault.locked():
         following = vault.read(f"{spi}-{NEXT}")
         if following is not None:

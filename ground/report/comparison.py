@@ -201,7 +201,6 @@ def _archived(folder: Path) -> Object:
 
 
 def _end(run: Run) -> str:
-    """Return the reason for the end of a run, as recorded by the control loop."""
     recorded = run["event"]
     stops = recorded["text"][recorded["code"] == events.STOPPED.code]
     return text_of(stops[-1]) if len(stops) else "unclean: the log has no stop event"

@@ -139,7 +139,6 @@ def _power(signals: RunSignals) -> Figure | None:
 
 
 def _paths(signals: RunSignals) -> Figure | None:
-    """Draw the planned paths of the first two steps and the flown attitude."""
     targets = signals.run["target"][:2]
     if not len(targets) or not len(signals.run["plan"]):
         return None
@@ -154,7 +153,6 @@ def _paths(signals: RunSignals) -> Figure | None:
 
 
 def _cycle_times(signals: RunSignals) -> Figure | None:
-    """Draw the distributions of lateness, execution time and job times."""
     timing, jobs = signals.run["cycle_timing"], signals.run["job_timing"]
     if not len(timing):
         return None
@@ -442,7 +440,6 @@ def _field(ax: Axes, run: Run) -> None:
 
 
 def _modes(ax: Axes, run: Run, end: float) -> None:
-    """Draw the modes as steps, and the targets by name at their times."""
     packets = run["mode"]
     if len(packets):
         times, modes = seconds(packets), packets["mode"].astype(int)
@@ -461,7 +458,6 @@ def _modes(ax: Axes, run: Run, end: float) -> None:
 
 
 def _shade(ax: Axes, packets: PacketArray) -> None:
-    """Shade the time in the Earth's shadow."""
     if not len(packets):
         return
     times = seconds(packets)

@@ -116,7 +116,6 @@ def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
 
 
 def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
-    """Return configuration, software, seed and duration of a run."""
     identity: Object = {"folder": str(run.folder), "duration_s": last_time(run), "cut_short": False}
     if attitude.source == "estimate":
         notes.append("no truth log: judged on the estimate")
@@ -145,7 +144,6 @@ def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
 
 
 def _power(run: Run, power: PowerHistory | None, notes: list[str]) -> Object:
-    """Return the coils' supply power, the heat R I^2 of their mean currents, and the largest currents."""
     written, actual = np.abs(run["control"]["current_written"]), np.abs(run["truth"]["current"])
     measured = bus_power(run)[1]
     sums = ("supply_average_w", "supply_peak_w", "supply_j", "heat_average_w", "heat_j")
@@ -195,7 +193,6 @@ def _cycles(timing: PacketArray, control: PacketArray) -> Object:
 
 
 def _percentiles(values: FloatArray) -> Object | None:
-    """Return median, 99th percentile and maximum, or None for an empty array."""
     if not len(values):
         return None
     p50, p99 = np.percentile(values, [50.0, 99.0])
@@ -203,7 +200,6 @@ def _percentiles(values: FloatArray) -> Object | None:
 
 
 def _jobs(packets: PacketArray) -> list[Object]:
-    """Return number, outcomes and execution times of the jobs of each worker."""
     names = np.array([text_of(name) for name in packets["name"]], dtype=object)
     found = []
     for name in sorted(set(names)):
@@ -231,7 +227,6 @@ def _planner(packets: PacketArray) -> Object:
 
 
 def _modes(packets: PacketArray) -> list[Object]:
-    """Return the modes in order, each with its time, trigger and reason."""
     return [
         {
             "mode": Mode(int(row["mode"])).label,
@@ -322,7 +317,6 @@ def _coils(packets: PacketArray) -> list[Object]:
 
 
 def _logs(run: Run) -> list[Object]:
-    """Return the integrity counts of each log that has data."""
     return [
         {
             "log": stem,

@@ -396,7 +396,6 @@ def _failed_frames(frames: list[Object]) -> list[str]:
 
 
 def _star_camera(found: Object | None) -> list[str]:
-    """Return the report's lines on the star camera's availability; none without star camera or truth log."""
     if found is None:
         return []
     share = f" ({number(found['share'], 1, 100.0)} %)" if found["share"] is not None else ""
@@ -409,7 +408,6 @@ def _star_camera(found: Object | None) -> list[str]:
 
 
 def _lens(found: Object | None) -> list[str]:
-    """Return the report's lines on the learned lens, or nothing if no lens was learned."""
     if found is None:
         return []
     (focal, focal_sigma), (x, y), (x_sigma, y_sigma) = (
@@ -480,7 +478,6 @@ def _events(events: list[Object]) -> list[str]:
 
 
 def _coils(judged: list[Object]) -> list[str]:
-    """Return the events by which a coil is isolated, corrected or used again, with their texts."""
     if not judged:
         return []
     return ["Coils", *(f"  {number(one['time_s'], 1)} s  {one['name']}: {one['text']}" for one in judged)]
