@@ -24,8 +24,6 @@ from sim_hal.settings import OrbitSection
 from sim_hal.worlds.orbit import elements, julian_date, log_density, sun_position
 
 Vector = tuple[float, float, float]
-Line = str | tuple[str, str]
-"""A line of the configuration file, or a pair of a value and its comment."""
 
 TILT_DEG = 22.0
 """Angle of the star camera from the normal of the orbit towards the zenith, deg."""
@@ -195,175 +193,133 @@ def _rounded_up(value: float, step: float) -> float:
 def configuration_text(satellite: Satellite, values: Derived, made: FittedElements, command: str) -> str:
     """Return the configuration file of a satellite, which names the `command` that writes the file."""
     x, y, z = satellite.size
-    orbit = satellite.orbit
-    wide = [] if satellite.wide_cameras else [("wide_cameras: []", "no cameras for Sun and horizon")]
-    knowledge = [] if satellite.field_of_view_deg else [("  knowledge_deg: null", "no star camera")]
+    orbit, release = satellite.orbit, satellite.release_deg
     place = ", ".join(
-        f"{key}: {_text(value)}"
-        for key, value in (
-            ("altitude", orbit.altitude),
-            ("inclination_deg", orbit.inclination_deg),
-            ("eccentricity", orbit.eccentricity),
-            ("local_time", orbit.local_time or 0.0),
-        )
+        f"{key}: {_text(getattr(orbit, key) or 0.0)}"
+        for key in ("altitude", "inclination_deg", "eccentricity", "local_time")
     )
-    size = ", ".join(_text(side) for side in satellite.size)
     moments = ", ".join(f"{moment:.3e}" for moment in values.inertia)
-    return _laid_out(
-        f"# {satellite.name}: {satellite.mass:g} kg, {x:g} x {y:g} x {z:g} m. Written by:",
-        f"#   {command}",
-        "# Values are in SI units, unless their name contains another unit. Values marked [given] are those",
-        "# of the command, and values marked [computed] follow from them. All other values are those of the",
-        "# configuration `orbit`, or computed in flight from craft and coils. The command",
-        "# `knightcube check FILE --merged NEW` writes all values into one file.",
-        "",
-        "extends: orbit",
-        f"name: {satellite.name}",
-        "",
-        ("craft:", "model that the flight application uses"),
-        (f"  mass: {_text(satellite.mass)}", "kg [given]"),
-        (f"  size: [{size}]", "m, edges along the body axes [given]"),
-        (
-            f"  inertia: [{moments}]",
-            "kg m^2, body axes [computed: homogeneous cuboid; replace it by that of the CAD model]",
-        ),
-        "",
-        *_coil_lines(satellite),
-        *_camera_lines(satellite, values),
-        *wide,
-        (
-            "elements:",
-            f"two-line elements [computed: fitted to a day of the orbit below, {1e-3 * made.rms:.2g} km rms]",
-        ),
-        f"  - '{made.lines[0]}'",
-        f"  - '{made.lines[1]}'",
-        "",
-        "detumble:",
-        (f"  horizon: {values.detumble_horizon:g}", "s, planning horizon of detumbling [computed]"),
-        "",
-        "estimation:",
-        (
-            f"  current_noise: {_CURRENT_SIGMA * min(coil.current_limit for coil in satellite.coils):.2g}",
-            "A, noise of the current of a coil [computed]",
-        ),
-        "",
-        ("pointing:", "body +z points to the goal, +x in the direction of flight if the roll is given"),
-        (
-            f"  roll: {values.roll:g}",
-            f"rad, roll error ({math.degrees(values.roll):.0f} deg) with the same cost as a pointing "
-            "error of 1 deg [computed]",
-        ),
-        *_cone_lines(satellite),
-        "",
-        "targets:",
-        ("  - {at: 0.0, point: nadir, roll_deg: 0.0}", "body +z down, +x in the direction of flight"),
-        "",
-        ("requirements:", "requirements that `knightcube report` checks; null: not checked"),
-        (
-            f"  slow_within: {values.slow_within:g}",
-            f"s, longest time of detumbling [computed: an estimate for {satellite.release_deg:g} deg/s]",
-        ),
-        *knowledge,
-        ("  pointing_deg: null", "deg, rms error of the pointing axis: your requirement"),
-        "",
-        (f"duration: {values.duration:g}", "s, detumbling and more than one revolution [computed]"),
-        "",
-        ("simulation:", "the simulated satellite; other values equal those above"),
-        (f"  utc: '{satellite.utc}'", "start of the flight [given]"),
-        "  free_body:",
-        (f"    orbit: {{{place}}}", "m, deg, h [given]"),
-        (
-            f"    release: {{speed: {math.radians(satellite.release_deg):.4g}}}",
-            f"rad/s ({satellite.release_deg:g} deg/s), about a random axis [given]",
-        ),
-        *_current_lines(satellite),
-    )
+    limits = [coil.current_limit for coil in satellite.coils]
+    wide = "" if satellite.wide_cameras else "wide_cameras: [] # no cameras for Sun and horizon\n"
+    knowledge = "" if satellite.field_of_view_deg else "  knowledge_deg: null # no star camera\n"
+    return _laid_out(f"""\
+# {satellite.name}: {satellite.mass:g} kg, {x:g} x {y:g} x {z:g} m. Written by:
+#   {command}
+# Values are in SI units, unless their name contains another unit. Values marked [given] are those
+# of the command, and values marked [computed] follow from them. All other values are those of the
+# configuration `orbit`, or computed in flight from craft and coils. The command
+# `knightcube check FILE --merged NEW` writes all values into one file.
+
+extends: orbit
+name: {satellite.name}
+
+craft: # model that the flight application uses
+  mass: {_text(satellite.mass)} # kg [given]
+  size: [{", ".join(map(_text, satellite.size))}] # m, edges along the body axes [given]
+  inertia: [{moments}] # kg m^2, body axes \
+[computed: homogeneous cuboid; replace it by that of the CAD model]
+
+{_coil_lines(satellite)}
+{_camera_lines(satellite, values)}
+{wide}elements: # two-line elements [computed: fitted to a day of the orbit below, \
+{1e-3 * made.rms:.2g} km rms]
+  - '{made.lines[0]}'
+  - '{made.lines[1]}'
+
+detumble:
+  horizon: {values.detumble_horizon:g} # s, planning horizon of detumbling [computed]
+
+estimation:
+  current_noise: {_CURRENT_SIGMA * min(limits):.2g} # A, noise of the current of a coil [computed]
+
+pointing: # body +z points to the goal, +x in the direction of flight if the roll is given
+  roll: {values.roll:g} # rad, roll error ({math.degrees(values.roll):.0f} deg) with the same cost as \
+a pointing error of 1 deg [computed]
+{_cone_line(satellite)}
+targets:
+  - {{at: 0.0, point: nadir, roll_deg: 0.0}} # body +z down, +x in the direction of flight
+
+requirements: # requirements that `knightcube report` checks; null: not checked
+  slow_within: {values.slow_within:g} # s, longest time of detumbling \
+[computed: an estimate for {release:g} deg/s]
+{knowledge}  pointing_deg: null # deg, rms error of the pointing axis: your requirement
+
+duration: {values.duration:g} # s, detumbling and more than one revolution [computed]
+
+simulation: # the simulated satellite; other values equal those above
+  utc: '{satellite.utc}' # start of the flight [given]
+  free_body:
+    orbit: {{{place}}} # m, deg, h [given]
+    release: {{speed: {math.radians(release):.4g}}} # rad/s ({release:g} deg/s), about a random axis [given]
+  current_noise: {_CURRENT_ERROR * min(limits):.2g} # A, largest error of a measured current \
+in each cycle [computed]
+  coil_field: [{_coil_fields(satellite)}] # T/A, field of each coil at the magnetometer [assumed]
+""")
 
 
-def _coil_lines(satellite: Satellite) -> list[Line]:
+def _coil_lines(satellite: Satellite) -> str:
     largest = max(coil.current_limit for coil in satellite.coils)
-    windings: list[Line] = []
+    windings = ""
     for coil in satellite.coils:
-        axis = ", ".join(_text(component) for component in coil.axis)
         values = f"dipole_per_ampere: {_text(coil.dipole_per_ampere)}, resistance: {_text(coil.resistance)}"
         if coil.current_limit != largest:
             values += f", current_limit: {_text(coil.current_limit)}"
         dipole = f"{coil.dipole:.3g} A m^2 at {coil.current_limit:.3g} A"
-        windings.append((f"    - {{axis: [{axis}], {values}}}", f"{dipole} [given]"))
-    return [
-        "coils:",
-        ("  windings:", "direction of the dipole in body axes, dipole per current (m^2), resistance (ohm)"),
-        *windings,
-        (
-            f"  supply_voltage: {_text(satellite.supply_voltage)}",
-            "V across a coil that is fully on [computed]",
-        ),
-        (f"  current_limit: {_text(largest)}", "A [given]"),
-        "",
-    ]
+        windings += f"    - {{axis: [{', '.join(map(_text, coil.axis))}], {values}}} # {dipole} [given]\n"
+    return f"""\
+coils:
+  windings: # direction of the dipole in body axes, dipole per current (m^2), resistance (ohm)
+{windings}  supply_voltage: {_text(satellite.supply_voltage)} # V across a coil that is fully on [computed]
+  current_limit: {_text(largest)} # A [given]
+"""
 
 
-def _current_lines(satellite: Satellite) -> list[Line]:
-    least = min(coil.current_limit for coil in satellite.coils)
+def _coil_fields(satellite: Satellite) -> str:
+    """Return the field of each coil at the magnetometer, scaled from that of the configuration `orbit`."""
     fields = np.zeros((3, max(3, len(satellite.coils))))
     for index, coil in enumerate(satellite.coils):
         fields[:, index] = np.array(coil.axis) * _STRAY_FIELD / coil.current_limit
-    rows = ", ".join(f"[{', '.join(f'{value:.2g}' for value in row)}]" for row in fields)
-    return [
-        (
-            f"  current_noise: {_CURRENT_ERROR * least:.2g}",
-            "A, largest error of a measured current in each cycle [computed]",
-        ),
-        (f"  coil_field: [{rows}]", "T/A, field of each coil at the magnetometer [assumed]"),
-    ]
+    return ", ".join(f"[{', '.join(f'{value:.2g}' for value in row)}]" for row in fields)
 
 
-def _camera_lines(satellite: Satellite, values: Derived) -> list[Line]:
+def _camera_lines(satellite: Satellite, values: Derived) -> str:
     if satellite.field_of_view_deg is None:
-        return [("camera: none", "no star camera"), ""]
+        return "camera: none # no star camera\n"
     half = math.radians(0.5 * (90.0 + TILT_DEG))
     side, other, sine = ("-y", "+y", 1.0) if values.sun_side else ("+y", "-y", -1.0)
-    sun = f"the Sun is {abs(values.beta_deg):.0f} deg from the plane of the orbit, towards {other}"
-    return [
-        ("camera:", "star camera; its other values are those of a camera with 512 x 512 px"),
-        f"  # The boresight is body {side}, turned by {TILT_DEG:g} deg to -z, the zenith if +z points down.",
-        f"  # At the start, {sun} [computed].",
-        f"  mounting: [{sine * math.sin(half):.8f}, 0.0, 0.0, {math.cos(half):.8f}]",
-        (f"  field_of_view_deg: {_text(satellite.field_of_view_deg)}", "deg [given]"),
-        "",
-    ]
+    return f"""\
+camera: # star camera; its other values are those of a camera with 512 x 512 px
+  # The boresight is body {side}, turned by {TILT_DEG:g} deg to -z, the zenith if +z points down.
+  # At the start, the Sun is {abs(values.beta_deg):.0f} deg from the plane of the orbit, \
+towards {other} [computed].
+  mounting: [{sine * math.sin(half):.8f}, 0.0, 0.0, {math.cos(half):.8f}]
+  field_of_view_deg: {_text(satellite.field_of_view_deg)} # deg [given]
+"""
 
 
-def _cone_lines(satellite: Satellite) -> list[Line]:
-    """Return the lines of the star camera's exclusion cones, which are wider than its field of view."""
+def _cone_line(satellite: Satellite) -> str:
+    """Return the line of the star camera's exclusion cones, which are wider than its field of view."""
     if satellite.field_of_view_deg is None:
-        return []
-    corner = math.degrees(
-        math.atan(math.sqrt(2.0) * math.tan(math.radians(0.5 * satellite.field_of_view_deg)))
-    )
+        return ""
+    half = math.radians(0.5 * satellite.field_of_view_deg)
+    corner = math.degrees(math.atan(math.sqrt(2.0) * math.tan(half)))
     sun, earth, moon = (max(angle, math.ceil(corner + 2.0)) for angle in (42.0, 19.0, 16.0))
-    return [
-        (
-            f"  cones: {{sun_deg: {sun:.1f}, earth_deg: {earth:.1f}, moon_deg: {moon:.1f}}}",
-            "exclusion cones of the star camera during slews [computed]",
-        )
-    ]
+    cones = f"{{sun_deg: {sun:.1f}, earth_deg: {earth:.1f}, moon_deg: {moon:.1f}}}"
+    return f"  cones: {cones} # exclusion cones of the star camera during slews [computed]\n"
 
 
 def _text(value: float) -> str:
     return f"{value:.6g}" if "." in f"{value:.6g}" or "e" in f"{value:.6g}" else f"{value:.6g}.0"
 
 
-def _laid_out(*lines: Line) -> str:
-    """Return lines as text; a pair of value and comment becomes a line with an aligned comment."""
-    texts = []
-    for line in lines:
-        if isinstance(line, str):
-            texts.append(line)
-        else:
-            value, comment = line
-            texts.append(f"{value:<27} # {comment}" if len(value) < 27 else f"{value}   # {comment}")
-    return "\n".join(texts) + "\n"
+def _laid_out(text: str) -> str:
+    """Return a text with its comments aligned, except those that fill a line of their own."""
+    lines = []
+    for line in text.splitlines():
+        value, mark, comment = line.partition(" # ")
+        padded = f"{value:<27}" if len(value) < 27 else f"{value}  "
+        lines.append(f"{padded} # {comment}" if mark and value.strip() else line)
+    return "\n".join(lines) + "\n"
 
 
 Values = Mapping[str, Any]
