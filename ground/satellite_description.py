@@ -417,10 +417,7 @@ def read_coils(text: str) -> list[Coil]:
     for key in ("axis", "current", "resistance"):
         if key not in given:
             raise ValueError(f"`{key}` is missing: give coils such as {COIL_EXAMPLE}")
-    current, resistance = (
-        _coil_number("current", given["current"]),
-        _coil_number("resistance", given["resistance"]),
-    )
+    current, resistance = (_coil_number(key, given[key]) for key in ("current", "resistance"))
     kinds = {key for key in ("dipole", "turns", "area") if key in given}
     if kinds == {"dipole"}:
         per_ampere = _coil_number("dipole", given["dipole"]) / current
@@ -490,16 +487,16 @@ def _read_altitude(text: str) -> float | Apsides:
     altitude = 0.5 * (perigee + apogee)
     eccentricity = 0.5 * (apogee - perigee) / (1e-3 * EARTH_RADIUS + altitude)
     if eccentricity > _LARGEST_ECCENTRICITY:
-        raise ValueError(
-            f"the eccentricity is {eccentricity:.3g}: give a lower apogee, up to {_LARGEST_ECCENTRICITY:g}"
-        )
+        cure = f"give a lower apogee, up to {_LARGEST_ECCENTRICITY:g}"
+        raise ValueError(f"the eccentricity is {eccentricity:.3g}: {cure}")
     mean(f"{altitude}")
     return Apsides(altitude, eccentricity)
 
 
-def _read_inclination(text: str) -> float | None:
-    """Return an inclination in deg, or None for a Sun-synchronous orbit."""
-    return None if text.lower() == "sso" else number(0.0, 180.0, "deg, or sso")(text)
+def _number_or(word: str, low: float, high: float) -> Callable[[str], float | None]:
+    """Return a function that reads a number of degrees within a range, or `word` as None."""
+    read = number(low, high, f"deg, or {word}")
+    return lambda text: None if text.lower() == word else read(text)
 
 
 def _read_utc(text: str) -> str:
@@ -511,17 +508,13 @@ def _read_utc(text: str) -> str:
     return whole
 
 
-def _read_camera(text: str) -> float | None:
-    """Return the field of view of the star camera in deg, or None without a star camera."""
-    return None if text.lower() == "none" else number(6.0, 40.0, "deg, or none")(text)
-
-
 def _read_yes(text: str) -> bool:
     if text.lower() not in {"yes", "no"}:
         raise ValueError("give yes or no")
     return text.lower() == "yes"
 
 
+_INCLINATION, _FIELD_OF_VIEW = _number_or("sso", 0.0, 180.0), _number_or("none", 6.0, 40.0)
 QUESTIONS = (
     Question("name", "NAME", "name of the satellite", _read_name, "my_satellite"),
     Question("mass", "KG", "mass, kg", number(0.1, 500.0, "kg")),
@@ -542,7 +535,13 @@ QUESTIONS = (
     Question(
         "eccentricity", "E", "eccentricity of the orbit", number(0.0, _LARGEST_ECCENTRICITY, ""), "0.001"
     ),
-    Question("inclination", "DEG", "inclination, deg, or sso for Sun-synchronous", _read_inclination, "sso"),
+    Question(
+        "inclination",
+        "DEG",
+        "inclination, deg, or sso for Sun-synchronous",
+        _number_or("sso", 0.0, 180.0),
+        "sso",
+    ),
     Question(
         "local-time",
         "H",
@@ -558,7 +557,13 @@ QUESTIONS = (
         f"(ohm), such as {COIL_EXAMPLE}; for an air coil turns and area (m^2) can replace the dipole",
         read_coils,
     ),
-    Question("star-camera", "DEG", "field of view of the star camera, deg, or none", _read_camera, "20"),
+    Question(
+        "star-camera",
+        "DEG",
+        "field of view of the star camera, deg, or none",
+        _number_or("none", 6.0, 40.0),
+        "20",
+    ),
     Question("horizon-cameras", "yes|no", "six cameras for Sun and horizon, yes or no", _read_yes, "yes"),
     Question("release", "DEG/S", "rate at the release, deg/s", number(0.1, 30.0, "deg/s"), "10"),
 )
@@ -618,9 +623,8 @@ def _perigee_problem(altitude: float, eccentricity: float) -> str:
 def _coil_problem(coils: list[Coil]) -> str:
     voltage = max(coil.resistance * coil.current_limit for coil in coils)
     if voltage > _HIGHEST_VOLTAGE:
-        return (
-            f"{voltage:.3g} V at the current limit, above {_HIGHEST_VOLTAGE:g} V: give a lower current limit"
-        )
+        cure = "give a lower current limit"
+        return f"{voltage:.3g} V at the current limit, above {_HIGHEST_VOLTAGE:g} V: {cure}"
     if largest_dipole(tuple(coils)) == 0.0:
         return "these coils control only one axis: give also coils on other axes, such as axis=xyz"
     return ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -11,26 +11,26 @@ from flight.link.telemetry.definitions import SEVERITIES
 from ground.report.steps import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
 
 Object = dict[str, Any]
+Column = tuple[str, int, float] | Callable[[Object], str]
+"""Column of a table: key, decimals and scale of a number in each row, or a function of the row."""
 
 ARCSECONDS = 648_000.0 / math.pi
 DEGREES = 180.0 / math.pi
+_THESIS = "Worst values and limits of the thesis (Sease 2013, Table 5.3 and ch. 5)"
 _MAX_LISTED = 20  # maximum number of lines in the table of failed frames
 
 
 def format_report(summary: Object) -> str:
     """Return the whole report, ending in a newline."""
+    run, origin = summary["run"], provenance(summary["run"])
     blocks = [
-        _headline(summary),
+        [f"Run {run['folder']}: {number(run['duration_s'], 1)} s", *([origin] if origin else [])],
         _steps(summary),
         _detumbling(summary["detumbling"]),
         _knowledge(summary["knowledge"]),
         _pointing(summary["pointing"]),
         _limits("Requirements of the configuration", "required", summary["requirements"]),
-        _limits(
-            "Worst values and limits of the thesis (Sease 2013, Table 5.3 and ch. 5)",
-            "limit",
-            summary["thesis"],
-        ),
+        _limits(_THESIS, "limit", summary["thesis"]),
         _power(summary["power"], bool(summary["thesis"])),
         _battery(summary.get("battery")),
         _loop(summary),
@@ -61,6 +61,15 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     ]
 
 
+def columns(rows: Sequence[Object], shown: Mapping[str, Column]) -> list[str]:
+    """Return rows as aligned lines with a column for each heading in `shown`."""
+    cells = [
+        [one(row) if callable(one) else number(row[one[0]], *one[1:]) for one in shown.values()]
+        for row in rows
+    ]
+    return table(list(shown), cells)
+
+
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
     """Return a number with a fixed count of decimals, or "-" for None."""
     return "-" if value is None else f"{value * scale:.{digits}f}"
@@ -75,32 +84,26 @@ def provenance(run: Object) -> str:
     return f"{run['config_name']} on {devices}, {pace}, software {run['software']}"
 
 
-def _headline(summary: Object) -> list[str]:
-    run = summary["run"]
-    origin = provenance(run)
-    return [f"Run {run['folder']}: {number(run['duration_s'], 1)} s", *([origin] if origin else [])]
-
-
 def _steps(summary: Object) -> list[str]:
+    def named(step: Object) -> str:
+        start, target = ("-" if q2 is None else f"{q2:+.3f}" for q2 in (step["from_q2"], step["target_q2"]))
+        return f"{step['index']}{' again' if step['again'] else ''}  {start} -> {target}"
+
+    def rise(step: Object) -> str:
+        return number(step["rise_s"]) + ("" if step["rise_judged"] or step["rise_s"] is None else " *")
+
     if not summary["steps"]:
         return []
-    rows = []
-    for step in summary["steps"]:
-        start, target = ("-" if q2 is None else f"{q2:+.3f}" for q2 in (step["from_q2"], step["target_q2"]))
-        rise = number(step["rise_s"]) + ("" if step["rise_judged"] or step["rise_s"] is None else " *")
-        rows.append(
-            [
-                f"{step['index']}{' again' if step['again'] else ''}  {start} -> {target}",
-                number(step["start_s"], 1),
-                number(step["steady_state_deg"]),
-                number(step["overshoot_percent"], 1),
-                rise,
-                number(step["settling_s"]),
-            ]
-        )
-    head = ["step, q2", "start s", "steady state deg", "overshoot %", "rise s", "settling s"]
+    shown: dict[str, Column] = {
+        "step, q2": named,
+        "start s": ("start_s", 1, 1.0),
+        "steady state deg": ("steady_state_deg", 2, 1.0),
+        "overshoot %": ("overshoot_percent", 1, 1.0),
+        "rise s": rise,
+        "settling s": ("settling_s", 2, 1.0),
+    }
     source = {"truth": "true", "estimate": "estimated"}[summary["attitude_source"]]
-    lines = [f"Attitude steps, judged on the {source} attitude", *table(head, rows)]
+    lines = [f"Attitude steps, judged on the {source} attitude", *columns(summary["steps"], shown)]
     if any(not step["rise_judged"] for step in summary["steps"]):
         lines.append("  * the step began at the release or during another slew; its rise time is not judged")
     return [
@@ -116,20 +119,18 @@ def _steps(summary: Object) -> list[str]:
 def _detumbling(found: Object | None) -> list[str]:
     if found is None:
         return []
-    rows = [
-        [
-            number(period["begin_s"], 1),
-            number(period["duration_s"], 1),
-            *(number(period[f"{name}_rate_rad_s"], 2, DEGREES) for name in ("first", "largest", "last")),
-            "yes" if period["slowed"] else "no",
-        ]
-        for period in found["periods"]
-    ]
-    head = ["start s", "duration s", "first deg/s", "maximum deg/s", "last deg/s", "detumbled"]
+    shown: dict[str, Column] = {
+        "start s": ("begin_s", 1, 1.0),
+        "duration s": ("duration_s", 1, 1.0),
+        "first deg/s": ("first_rate_rad_s", 2, DEGREES),
+        "maximum deg/s": ("largest_rate_rad_s", 2, DEGREES),
+        "last deg/s": ("last_rate_rad_s", 2, DEGREES),
+        "detumbled": lambda period: "yes" if period["slowed"] else "no",
+    }
     known, error = found["rate_known_share"], found["rate_error_rms_rad_s"]
     return [
         f"Detumbling, rates from the {'truth' if found['rate_source'] == 'truth' else 'gyro'}",
-        *table(head, rows),
+        *columns(found["periods"], shown),
         f"  rate from the magnetometer alone: available {number(known, 1, 100.0)} % of the time, "
         f"{number(error, 3, DEGREES)} deg/s rms error per axis, {found['restarts']} restarts",
     ]
@@ -174,22 +175,19 @@ def _knowledge(found: Object | None) -> list[str]:
 def _pointing(found: Object | None) -> list[str]:
     if found is None:
         return []
-    errors = ("axis_rms_rad", "axis_worst_rad", "all_axes_rms_rad")
-    rows = [
-        [
-            target["target"],
-            number(target["begin_s"], 1),
-            number(target["duration_s"], 1),
-            *(number(target[name], 2, DEGREES) for name in errors),
-            number(target["supply_w"], 2, 1e3),
-            number(target["heat_w"], 2, 1e3),
-        ]
-        for target in found["targets"]
-    ]
-    head = ["target", "start s", "duration s", "axis deg rms", "maximum", "all axes deg rms"]
+    shown: dict[str, Column] = {
+        "target": lambda target: str(target["target"]),
+        "start s": ("begin_s", 1, 1.0),
+        "duration s": ("duration_s", 1, 1.0),
+        "axis deg rms": ("axis_rms_rad", 2, DEGREES),
+        "maximum": ("axis_worst_rad", 2, DEGREES),
+        "all axes deg rms": ("all_axes_rms_rad", 2, DEGREES),
+        "V |I| mW": ("supply_w", 2, 1e3),
+        "R I^2 mW": ("heat_w", 2, 1e3),
+    }
     return [
         f"Pointing, {'true' if found['source'] == 'truth' else 'estimated'} attitude",
-        *table([*head, "V |I| mW", "R I^2 mW"], rows),
+        *columns(found["targets"], shown),
         f"  errors count from {number(found['settled_after_s'], 0)} s after the start, or from the end "
         "of the first slew if that is later",
     ]
@@ -198,44 +196,26 @@ def _pointing(found: Object | None) -> list[str]:
 def _objects(found: list[Object]) -> list[str]:
     if not found:
         return []
-    rows = [
-        [
-            str(row["number"]),
-            number(row["first_s"], 1),
-            number(row["last_s"], 1),
-            f"{row['seen']} of {row['frames']}",
-            number(row["rate_least_rad_s"], 3, DEGREES),
-            number(row["rate_most_rad_s"], 3, DEGREES),
-            number(row["magnitude"], 1),
-            number(row["sighting_sigma_rad"], 2, ARCSECONDS),
-        ]
-        for row in found
-    ]
-    head = [
-        "object",
-        "start s",
-        "end s",
-        "detected in",
-        "minimum deg/s",
-        "maximum deg/s",
-        "V",
-        "sigma arcsec",
-    ]
-    return ["Objects among the stars", *table(head, rows)]
+    shown: dict[str, Column] = {
+        "object": ("number", 0, 1.0),
+        "start s": ("first_s", 1, 1.0),
+        "end s": ("last_s", 1, 1.0),
+        "detected in": lambda row: f"{row['seen']} of {row['frames']}",
+        "minimum deg/s": ("rate_least_rad_s", 3, DEGREES),
+        "maximum deg/s": ("rate_most_rad_s", 3, DEGREES),
+        "V": ("magnitude", 1, 1.0),
+        "sigma arcsec": ("sighting_sigma_rad", 2, ARCSECONDS),
+    }
+    return ["Objects among the stars", *columns(found, shown)]
 
 
 def _limits(title: str, limit: str, judged: list[Object]) -> list[str]:
     if not judged:
         return []
-    rows = [
-        [
-            row["quantity"],
-            number(row["worst"], 2 if row["limit"] >= 1.0 else 4),
-            f"{row['limit']:g} {row['unit']}",
-            row["verdict"],
-        ]
-        for row in judged
-    ]
+    rows = []
+    for row in judged:
+        worst = number(row["worst"], 2 if row["limit"] >= 1.0 else 4)
+        rows.append([row["quantity"], worst, f"{row['limit']:g} {row['unit']}", row["verdict"]])
     return [title, *table(["", "this run", limit, ""], rows)]
 
 
@@ -278,11 +258,7 @@ def _power(power: Object, thesis: bool) -> list[str]:
             f"maximum {number(power['supply_peak_w'], 3)} W, total {number(power['supply_j'], 2)} J",
         ),
         ("supply power measured at the bus", f"average {number(power['bus_average_w'], 1, 1e3)} mW"),
-        *(
-            [("consumption stated in the thesis", "average about 100 mW, maximum about 0.5 W")]
-            if thesis
-            else []
-        ),
+        *([("consumption stated in the thesis", "average about 100 mW, maximum about 0.5 W")] * thesis),
         (
             "heat R I^2 of steady currents",
             f"average {number(power['heat_average_w'], 3, 1e3)} mW, total {number(power['heat_j'], 3)} J",
@@ -300,18 +276,14 @@ def _loop(summary: Object) -> list[str]:
     lines, cycles = [], summary["cycles"]
     clock = "" if summary["run"].get("realtime", True) else ", in host time; the flight ran in lock-step"
     if summary["rate_groups"]:
-        rows = [
-            [
-                group["name"],
-                number(group["period_s"], 3),
-                *(str(group[name]) for name in ("cycles", "slips", "overruns")),
-                number(group["mean_s"], 3, 1e3),
-                number(group["max_s"], 3, 1e3),
-            ]
-            for group in summary["rate_groups"]
-        ]
-        head = ["rate group", "period s", "cycles", "slips", "overruns", "mean ms", "max ms"]
-        lines += [f"Rate groups{clock}", *table(head, rows)]
+        shown: dict[str, Column] = {
+            "rate group": lambda group: str(group["name"]),
+            "period s": ("period_s", 3, 1.0),
+            **{name: (name, 0, 1.0) for name in ("cycles", "slips", "overruns")},
+            "mean ms": ("mean_s", 3, 1e3),
+            "max ms": ("max_s", 3, 1e3),
+        }
+        lines += [f"Rate groups{clock}", *columns(summary["rate_groups"], shown)]
     timed = {
         "lateness of a control cycle": cycles["lateness_s"],
         "execution of a control cycle": cycles["execution_s"],
@@ -378,17 +350,8 @@ def _failed_frames(frames: list[Object]) -> list[str]:
     causes = [(frame["streaks"], frame["stars"] or "-") for frame in frames]
     rows = []
     for (streaks, stars), group in groupby(zip(causes, frames, strict=True), key=lambda pair: pair[0]):
-        own = [frame for _, frame in group]
-        first, last = own[0], own[-1]
-        rows.append(
-            [
-                str(len(own)),
-                number(first["exposed_s"], 1),
-                number(last["exposed_s"], 1),
-                streaks,
-                stars,
-            ]
-        )
+        exposed = [frame["exposed_s"] for _, frame in group]
+        rows.append([str(len(exposed)), number(exposed[0], 1), number(exposed[-1], 1), streaks, stars])
     more = len(rows) - _MAX_LISTED
     head = ["frames", "first at s", "last at s", "streaks", "stars"]
     lines = [f"Frames without rate or attitude: {len(frames)}", *table(head, rows[:_MAX_LISTED])]
@@ -465,16 +428,13 @@ def _events(events: list[Object]) -> list[str]:
     if not events:
         return []
     names = dict(SEVERITIES)
-    rows = [
-        [
-            event["name"],
-            names.get(event["severity"], str(event["severity"])),
-            str(event["count"]),
-            number(event["first_s"], 3),
-        ]
-        for event in events
-    ]
-    return ["Events", *table(["", "severity", "count", "first at s"], rows)]
+    shown: dict[str, Column] = {
+        "": lambda event: str(event["name"]),
+        "severity": lambda event: names.get(event["severity"], str(event["severity"])),
+        "count": ("count", 0, 1.0),
+        "first at s": ("first_s", 3, 1.0),
+    }
+    return ["Events", *columns(events, shown)]
 
 
 def _coils(judged: list[Object]) -> list[str]:
@@ -484,17 +444,9 @@ def _coils(judged: list[Object]) -> list[str]:
 
 
 def _logs(logs: list[Object]) -> list[str]:
-    columns = {
-        "packets": "packets",
-        "bytes": "bytes",
-        "skipped_bytes": "skipped bytes",
-        "truncated_bytes": "truncated bytes",
-        "missing_packets": "missing packets",
-        "other_versions": "other versions",
-        "dropped_segments": "dropped segments",
-    }
-    rows = [[log["log"], *(str(log[key]) for key in columns)] for log in logs]
-    return ["Log integrity", *table(["log", *columns.values()], rows)]
+    counts = "packets bytes skipped_bytes truncated_bytes missing_packets other_versions dropped_segments"
+    shown: dict[str, Column] = {key.replace("_", " "): (key, 0, 1.0) for key in counts.split()}
+    return ["Log integrity", *columns(logs, {"log": lambda log: str(log["log"]), **shown})]
 
 
 def _tally(counts: dict[str, int]) -> str:
