@@ -18,7 +18,7 @@ from flight.link.events import EVENTS
 from flight.link.modes import ORBITAL, TESTBED, Mode
 from flight.link.process.directives import LAYOUTS as DIRECTIVE_LAYOUTS
 from flight.link.process.directives import SCHEDULE
-from flight.link.telemetry.fields import Field, Packet, Range
+from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout, wraps_at
 from flight.loop.facts import FACTS
 from hal.interfaces.devices import COIL_NAMES
@@ -115,12 +115,12 @@ def _packet(layout: Layout) -> dict[str, Any]:
                 "name": field.name,
                 "type": field.kind,
                 "count": field.count,
-                "offset": offset,
+                "offset": layout.offsets[field.name],
                 "unit": field.unit,
                 "meaning": field.meaning,
                 **_details(field),
             }
-            for field, offset in _offsets(layout)
+            for field in packet.fields
         ],
     }
 
@@ -149,19 +149,10 @@ def meaning_of(field: Field) -> str:
     ranges = {"valid": field.valid}
     if field.limits is not None:
         ranges |= {"warning outside": field.limits.warning, "fault outside": field.limits.fault}
-    parts += [f"{word} {low:g} to {high:g}" for word, (low, high) in _given(ranges)]
+    parts += [f"{word} {bounds[0]:g} to {bounds[1]:g}" for word, bounds in ranges.items() if bounds]
     if field.wraps:
         parts.append(f"wraps at 2^{8 * int(field.kind[1:])}")
     return "; ".join(parts)
-
-
-def _given(ranges: dict[str, Range | None]) -> list[tuple[str, Range]]:
-    return [(word, bounds) for word, bounds in ranges.items() if bounds is not None]
-
-
-def _offsets(layout: Layout) -> list[tuple[Field, int]]:
-    where = layout.offsets
-    return [(field, where[field.name]) for field in layout.packet.fields]
 
 
 def _section(layout: Layout) -> str:
@@ -172,10 +163,10 @@ def _section(layout: Layout) -> str:
     lines = ["", f"## {packet.name}", "", f"{packet.meaning}. {', '.join(identity)}.{hazard}"]
     if packet.fields:
         lines += ["", "| byte | field | type | unit | meaning |", "|---|---|---|---|---|"]
-    for field, offset in _offsets(layout):
+    for field in packet.fields:
         kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
         meaning = meaning_of(field).replace("|", r"\|")
-        lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {meaning} |")
+        lines.append(f"| {layout.offsets[field.name]} | {field.name} | {kind} | {field.unit} | {meaning} |")
     return "\n".join(lines) + "\n"
 
 
@@ -280,8 +271,10 @@ def _input(field: Field) -> Object:
         "unit": field.unit,
         "meaning": field.meaning,
         "states": [list(state) for state in field.states],
-        "valid": list(field.valid or _range_of(field.kind)),
+        "valid": list(field.valid or ()),
     }
+    if field.kind.startswith("u") and not field.valid:
+        one["valid"] = [0, 2 ** (8 * int(field.kind[1:])) - 1]
     if field.kind.startswith("S"):
         one |= {"length": int(field.kind[1:]) - 1, "optional": field.name in {"reason", "under"}}
     if field.count > 1 and field.kind == "u1":
@@ -291,10 +284,6 @@ def _input(field: Field) -> Object:
     if field.name == SCHEDULE.fields[0].name:
         one["hint"] = "2026-11-23T21:00:00"
     return one
-
-
-def _range_of(kind: str) -> tuple[int, int] | tuple[()]:
-    return (0, 2 ** (8 * int(kind[1:])) - 1) if kind.startswith("u") else ()
 
 
 def components(packet: str, field: Field) -> list[str]:

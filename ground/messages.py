@@ -312,10 +312,8 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
         return replace(found, reason="the directions were measured without identified stars")
     placed = seen[np.isfinite(seen["place"]).all(axis=1)]
     if len(placed) < MINIMUM_SIGHTINGS:
-        reason = (
-            f"{len(placed)} sightings with the satellite's position: {MINIMUM_SIGHTINGS} or more are needed"
-        )
-        return replace(found, reason=reason)
+        sightings = f"{len(placed)} sightings with the satellite's position"
+        return replace(found, reason=f"{sightings}: {MINIMUM_SIGHTINGS} or more are needed")
     times = placed["middle_ns"] * 1e-9
     middle = len(times) // 2
     measured = np.hstack([placed["place"], placed["velocity"]])
@@ -336,14 +334,10 @@ def write_orbit_messages(found: list[ObjectOrbit], folder: Path, as_xml: bool = 
 
     Raises UsageError if the folder cannot be written.
     """
-    paths = []
-    for item in found:
-        if item.orbit is None:
-            continue
-        path = folder / f"object-{item.number}.opm"
+    paths = {folder / f"object-{item.number}.opm": item for item in found if item.orbit is not None}
+    for path, item in paths.items():
         _write(path, _message(item), as_xml)
-        paths.append(path)
-    return paths
+    return list(paths)
 
 
 def _message(item: ObjectOrbit) -> list[str]:
@@ -351,11 +345,8 @@ def _message(item: ObjectOrbit) -> list[str]:
     assert orbit is not None
     assert item.utc_ns is not None
     low, high = (1e-3 * end for end in orbit.interval)
-    units = ["km"] * 3 + ["km/s"] * 3
-    state = [
-        f"{axis} = {1e-3 * value:.9f} [{unit}]"
-        for axis, value, unit in zip(_AXES, orbit.state, units, strict=True)
-    ]
+    each = zip(_AXES, orbit.state, ["km"] * 3 + ["km/s"] * 3, strict=True)
+    state = [f"{axis} = {1e-3 * value:.9f} [{unit}]" for axis, value, unit in each]
     covariance = []
     for row, first in enumerate(_AXES):
         for column, second in enumerate(_AXES[: row + 1]):

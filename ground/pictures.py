@@ -39,18 +39,12 @@ _OUTLINE = 1.5
 
 
 def draw_marks(
-    picture: npt.NDArray[np.uint8],
-    endpoints: FloatArray,
-    used: BoolArray,
-    objects: Sequence[FloatArray],
+    picture: npt.NDArray[np.uint8], endpoints: FloatArray, used: BoolArray, objects: Sequence[FloatArray]
 ) -> npt.NDArray[np.uint8]:
     """Return `picture` (rows, columns, 3) with rings at the end points of streaks and objects.
 
-    Args:
-        picture: the picture.
-        endpoints: end points of the streaks (n, 2, 2), px.
-        used: whether (n,) each streak was used; rings of used streaks are orange, other rings are blue.
-        objects: end points (2, 2), px, of each object, which are marked by wider vermilion rings.
+    The rings of used streaks are orange, those of other streaks are blue, and those of objects are wider and
+    vermilion. The end points of streaks are (n, 2, 2), px, and those of each object are (2, 2), px.
     """
     drawn = picture.copy()
     for ends, is_used in zip(endpoints, used, strict=True):

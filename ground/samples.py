@@ -147,11 +147,8 @@ def _satellite(attitude: FloatArray) -> star_camera.SourceTrack:
 def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_length: float) -> dict[str, Any]:
     """Return the true parameters of a frame as plain numbers for a JSON file.
 
-    Args:
-        rate: rotation rate (3,) of the camera, rad/s, camera axes.
-        exposure: exposure time, s.
-        attitude: attitude (4,) from ICRS to camera at mid-exposure.
-        focal_length: focal length, px.
+    The camera turns at `rate` (3,), rad/s, in its axes. The attitude (4,) from ICRS to the camera is that at
+    mid-exposure. The focal length is in px.
     """
     pointing = Pointing.of(attitude)
     return {

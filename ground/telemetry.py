@@ -249,7 +249,13 @@ def write_database(run: Run, file: Path) -> list[Path]:
         with closing(sqlite3.connect(made)) as database, database:
             database.execute("CREATE TABLE fields (packet TEXT, name TEXT, unit TEXT, meaning TEXT)")
             for name, columns in tables(run):
-                _write_table(database, name, columns)
+                described = [(name, column.name, column.unit, column.meaning) for column in columns]
+                database.executemany("INSERT INTO fields VALUES (?, ?, ?, ?)", described)
+                kinds, values = zip(*(_in_database(column.values) for column in columns), strict=True)
+                shape = ", ".join(f'"{one.name}" {kind}' for one, kind in zip(columns, kinds, strict=True))
+                database.execute(f'CREATE TABLE "{name}" ({shape})')
+                marks = ", ".join("?" * len(columns))
+                database.executemany(f'INSERT INTO "{name}" VALUES ({marks})', zip(*values, strict=True))
         os.replace(made, file)
     except sqlite3.Error as error:
         raise OSError(None, str(error), str(file)) from error
@@ -258,31 +264,13 @@ def write_database(run: Run, file: Path) -> list[Path]:
     return [file]
 
 
-def _write_table(database: sqlite3.Connection, name: str, columns: Sequence[PacketColumn]) -> None:
-    described = [(name, column.name, column.unit, column.meaning) for column in columns]
-    database.executemany("INSERT INTO fields VALUES (?, ?, ?, ?)", described)
-    shape = ", ".join(f'"{column.name}" {_type(column)}' for column in columns)
-    database.execute(f'CREATE TABLE "{name}" ({shape})')
-    marks = ", ".join("?" * len(columns))
-    rows = zip(*(_plain(column) for column in columns), strict=True)
-    database.executemany(f'INSERT INTO "{name}" VALUES ({marks})', rows)
-
-
-def _type(column: PacketColumn) -> str:
-    values = column.values
-    return "TEXT" if isinstance(values, list) or _is_wide(values) else _TYPES[values.dtype.kind]
-
-
-def _plain(column: PacketColumn) -> list[object]:
-    values = column.values
+def _in_database(values: list[str] | npt.NDArray[Any]) -> tuple[str, list[Any]]:
+    """Return the SQLite type of a column and its values; integers that SQLite does not support are texts."""
     if isinstance(values, list):
-        return list(values)
-    return [str(value) for value in values.tolist()] if _is_wide(values) else list(values.tolist())
-
-
-def _is_wide(values: npt.NDArray[Any]) -> bool:
-    """Return whether a value is too large for an SQLite integer."""
-    return bool(values.dtype.kind == "u" and np.any(values > _MAX_INTEGER))
+        return "TEXT", values
+    if values.dtype.kind == "u" and np.any(values > _MAX_INTEGER):
+        return "TEXT", [str(value) for value in values.tolist()]
+    return _TYPES[values.dtype.kind], values.tolist()
 
 
 def write_parquet(run: Run, folder: Path) -> list[Path]:

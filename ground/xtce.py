@@ -85,8 +85,7 @@ def document(
     meta = SubElement(root, "TelemetryMetaData")
     types, parameters = SubElement(meta, "ParameterTypeSet"), SubElement(meta, "ParameterSet")
     containers = SubElement(meta, "ContainerSet")
-    _add_headers(types, parameters, epoch)
-    _add_primary_container(containers)
+    _add_headers(types, parameters, containers, epoch)
     for layout in telemetry.values():
         _add_packet(layout, types, parameters, containers)
     meta = SubElement(root, "CommandMetaData")
@@ -131,7 +130,7 @@ def _size(kind: str) -> int:
     return int(kind[1:]) if kind.startswith("b") else _BITS_OF[kind]
 
 
-def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
+def _add_headers(types: Element, parameters: Element, containers: Element, epoch: str) -> None:
     for name, bits in (*_PRIMARY, ("definition_version", 8), ("error_control", 16)):
         _add_integer(types, f"{name}_Type", "u", bits)
         SubElement(parameters, "Parameter", {"name": name, "parameterTypeRef": f"{name}_Type"})
@@ -140,9 +139,6 @@ def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
     SubElement(scale, "IntegerDataEncoding", {"sizeInBits": "64", "encoding": "twosComplement"})
     SubElement(SubElement(time, "ReferenceTime"), "Epoch").text = epoch
     SubElement(parameters, "Parameter", {"name": "time_ns", "parameterTypeRef": "time_ns_Type"})
-
-
-def _add_primary_container(containers: Element) -> None:
     header = SubElement(containers, "SequenceContainer", {"name": "CCSDSPacket", "abstract": "true"})
     entries = SubElement(header, "EntryList")
     for name in (*(name for name, _ in _PRIMARY), "definition_version", "time_ns"):
@@ -180,7 +176,9 @@ def _add_type(types: Element, name: str, field: Field, role: str) -> None:
     kind = field.kind
     if kind.startswith("S"):
         text = SubElement(types, f"String{role}Type", {"name": name})
-        _add_text_encoding(text, int(kind[1:]))
+        in_bits = SubElement(SubElement(text, "StringDataEncoding", {"encoding": "UTF-8"}), "SizeInBits")
+        SubElement(SubElement(in_bits, "Fixed"), "FixedValue").text = str(8 * int(kind[1:]))
+        SubElement(in_bits, "TerminationChar").text = "00"
     elif field.states:
         _add_enumeration(types, name, field, role)
     elif kind.startswith("f"):
@@ -196,13 +194,6 @@ def _add_type(types: Element, name: str, field: Field, role: str) -> None:
     else:
         number = _add_integer(types, name, kind[0], _size(kind), role, field.unit)
         _add_ranges(number, field, role)
-
-
-def _add_text_encoding(text: Element, size: int) -> None:
-    encoding = SubElement(text, "StringDataEncoding", {"encoding": "UTF-8"})
-    in_bits = SubElement(encoding, "SizeInBits")
-    SubElement(SubElement(in_bits, "Fixed"), "FixedValue").text = str(8 * size)
-    SubElement(in_bits, "TerminationChar").text = "00"
 
 
 def _add_enumeration(types: Element, name: str, field: Field, role: str) -> None:

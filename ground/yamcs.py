@@ -439,13 +439,7 @@ def stacks_and_displays(body: Body | None = None) -> Mapping[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Access to the HTTP interface of a running Yamcs.
-
-    Attributes:
-        url: address of the interface, such as `http://127.0.0.1:8090/api`.
-        user: name of the user.
-        password: password of the user.
-    """
+    """Access to the HTTP interface of a running Yamcs, such as `http://127.0.0.1:8090/api`."""
 
     url: str
     user: str

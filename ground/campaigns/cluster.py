@@ -102,14 +102,9 @@ def finished(
 ) -> Iterator[tuple[str, Any]]:
     """Run cases on the cluster of the scheduler at `address`, and yield key and result of each case.
 
-    If a worker dies, other workers run its cases. Raises UsageError if no cluster is found at the start, and
-    CampaignError if the scheduler is lost or a case kills every worker that runs it.
-
-    Args:
-        address: address of the scheduler.
-        run: function that runs a case.
-        cases: cases to run.
-        report: function that shows the user a line of text about the cluster.
+    If a worker dies, other workers run its cases. The function `report` shows a line of text about the
+    cluster. Raises UsageError if no cluster is found at the start, and CampaignError if the scheduler is lost
+    or a case kills every worker that runs it.
     """
     distributed, cloudpickle = map(importlib.import_module, ("distributed", "cloudpickle"))
 

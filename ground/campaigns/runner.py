@@ -187,20 +187,14 @@ def fly(
 ) -> Summary:
     """Run the cases of a campaign that have no result in the folder `out`, and summarise all results.
 
-    Raises UsageError if the folder contains another campaign or if no cluster is found, and CampaignError if
-    the cluster is lost.
-
-    Args:
-        campaign: campaign to run.
-        runs: number of runs.
-        seed: seed of all random draws.
-        out: folder of the results.
-        workers: number of processes (default: the number of cores).
-        dask: address of the scheduler of a Dask cluster that runs the cases instead of this machine.
-        progress: whether to show the progress on standard error.
-        only: text that the key of a case must contain for the case to be run.
+    The cases run in `workers` processes (default: the number of cores), or on the Dask cluster whose
+    scheduler has the address `dask`. If `only` is given, only cases run whose key contains this text. Raises
+    UsageError if the folder contains another campaign or if no cluster is found, and CampaignError if the
+    cluster is lost.
     """
-    cases = _selected(campaign, runs, seed, only)
+    cases = [case for case in campaign.cases(runs, seed) if only in case.key]
+    if only and not cases:
+        raise UsageError(f"--only {only!r}: no case of {campaign.name} contains this text")
     label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
     with _opened(out) as sink:
         done = _resume(label, out, sink)
@@ -237,14 +231,6 @@ def results_in(out: Path) -> list[Result]:
 def fly_here(campaign: Campaign, runs: int, seed: int) -> list[Result]:
     """Run a campaign in this process, and return its results."""
     return [campaign.run(case) for case in campaign.cases(runs, seed)]
-
-
-def _selected(campaign: Campaign, runs: int, seed: int, only: str) -> list[Case]:
-    """Return the cases whose key contains the text `only`. Raises UsageError if no key contains the text."""
-    cases = [case for case in campaign.cases(runs, seed) if only in case.key]
-    if only and not cases:
-        raise UsageError(f"--only {only!r}: no case of {campaign.name} contains this text")
-    return cases
 
 
 @contextmanager
@@ -376,7 +362,10 @@ def _stop(crew: Sequence[_Worker]) -> None:
 
 def _serve(pipe: Any, run: Callable[[Case], Result], parent: int, scratch: str) -> None:
     """Run the cases that a worker process receives through a pipe, and send back result or exception."""
-    _end_with_the_campaign(parent)
+    # The kernel kills this process when its parent, the process of the campaign, ends.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # the campaign ended before the call
+        os._exit(1)
     tempfile.tempdir = scratch
     with suppress(EOFError, OSError, KeyboardInterrupt):
         while True:
@@ -413,13 +402,6 @@ def _clear(link: Path) -> None:
         if folder.name.startswith(_SCRATCH):
             shutil.rmtree(folder, ignore_errors=True)
         link.unlink()
-
-
-def _end_with_the_campaign(parent: int) -> None:
-    """Make the kernel kill this worker process when its parent, the process of the campaign, ends."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # the campaign ended before the call
-        os._exit(1)
 
 
 def _on_cluster(address: str, campaign: Campaign, cases: Sequence[Case], bar: Progress | None) -> Results:

@@ -10,6 +10,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -73,7 +74,8 @@ def variation_of(text: str) -> Variation:
 def _distribution(spread: str) -> tuple[Draw, bool] | None:
     """Return the attributes `draw` and `relative` of a variation, or None for an unknown distribution."""
     if "|" in spread:
-        values = [configuration_value(one.strip()) for one in spread.split("|")]
+        scalars = (read_document(f"value: {one.strip()}\n", "value") for one in spread.split("|"))
+        values = [scalar.values["value"] for scalar in scalars]
         return (lambda chance, _: values[int(chance.integers(len(values)))]), False
     if found := re.fullmatch(rf"(log )?({_NUMBER})\.\.({_NUMBER})", spread):
         low, high = float(found[2]), float(found[3])
@@ -97,23 +99,13 @@ def _between(low: float, high: float, logarithmic: bool) -> tuple[Draw, bool]:
     return (lambda chance, _: float(chance.uniform(low, high))), False
 
 
-def configuration_value(text: str) -> Any:
-    """Return the value of a YAML scalar."""
-    return read_document(f"value: {text}\n", "value").values["value"]
-
-
 def varied_campaign(path: Path, variations: Sequence[Variation], duration: float | None) -> Campaign:
     """Return the campaign that flies a simulated configuration with random parameters.
 
     The result of a flight contains its random parameters and those performance measures that have a limit.
     The limits are those of the section `requirements` for a satellite, and those of the thesis for a testbed.
-    Case k does not depend on the number of runs. Raises UsageError for a key or a distribution that the
-    configuration does not allow.
-
-    Args:
-        path: file of the configuration.
-        variations: parameters that are drawn at random for each flight.
-        duration: duration of each flight, s, or None for the configured duration.
+    Case k does not depend on the number of runs. Each flight lasts `duration` s, or as configured if it is
+    None. Raises UsageError for a key or a distribution that the configuration does not allow.
     """
     text = read_text(path)
     base = read_document(text, str(path)).values
@@ -311,13 +303,8 @@ def _summarise(results: Sequence[Result], out: Path) -> Summary:
 
 def _quantiles(values: Sequence[float]) -> dict[str, float | None]:
     known = [value for value in values if math.isfinite(value)]
-    if not known:
-        return dict.fromkeys(("median", "95 %", "maximum"))
-    return {
-        "median": float(np.median(known)),
-        "95 %": float(np.quantile(known, 0.95)),
-        "maximum": float(np.max(known)),
-    }
+    found = [np.median(known), np.quantile(known, 0.95), np.max(known)] if known else []
+    return dict(zip_longest(("median", "95 %", "maximum"), map(float, found)))
 
 
 def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
@@ -336,13 +323,12 @@ def _influence(drawn: dict[str, list[float]], values: Sequence[float]) -> str:
 def _why(result: Result) -> str:
     if result["error"]:
         return str(result["error"])
-    missed = [row for row in result["judged"] if row["verdict"] == "miss"]
-    return "; ".join(
-        f"{row['quantity']} "
-        + ("none" if row["worst"] is None else f"{row['worst']:.3g} {row['unit']}")
-        + f" (limit {row['limit']:g})"
-        for row in missed
-    )
+    missed = []
+    for row in result["judged"]:
+        if row["verdict"] == "miss":
+            worst = "none" if row["worst"] is None else f"{row['worst']:.3g} {row['unit']}"
+            missed.append(f"{row['quantity']} {worst} (limit {row['limit']:g})")
+    return "; ".join(missed)
 
 
 def _again(result: Result, folder: Path) -> str:

@@ -210,13 +210,10 @@ class Replay:
     """
 
     def __init__(self, packets: Sequence[bytes], folder: Path, speed: float | None, begun: float) -> None:
-        """Begin a replay.
+        """Begin a replay at the monotonic time `begun` (s), in the folder of Yamcs's configuration.
 
-        Args:
-            packets: recorded packets in the order of the log.
-            folder: folder of Yamcs's configuration.
-            speed: ratio of mission time to the time of this computer; None replays all packets at once.
-            begun: monotonic time (s) of this computer at the start of the replay.
+        The `speed` is the ratio of mission time to the time of this computer; None replays all packets at
+        once.
         """
         self._folder, self._speed, self._begun = folder, speed, begun
         end = HEADER_BYTES + SECONDARY_BYTES

@@ -307,13 +307,9 @@ class PlantFit:
 
 
 def fit(record: Record, noise: MotionNoise, progress: Callable[[int, float], None] | None = None) -> PlantFit:
-    """Fit the constants to a record.
+    """Fit the constants to a record, beginning with an assumed noise.
 
-    Args:
-        record: the record.
-        noise: assumed noise.
-        progress: called with the number of each round and its step in standard deviations.
-
+    The function `progress` is called with the number of each round and its step in standard deviations.
     Raises IdentificationError if the record does not determine the torque constant, or no constants fit.
     """
     if not np.any(record.current):
@@ -517,13 +513,9 @@ class PriorValue:
 
 @dataclass(frozen=True, slots=True)
 class PlantPrior:
-    """Prior values of the constants, which are known before the flight.
+    """Prior values of inertia (kg m^2), dipole per ampere of the coil on x (m^2) and field (T).
 
-    Attributes:
-        inertia: kg m^2.
-        dipole: dipole per commanded ampere of the coil on body x, n A, m^2.
-        field: T.
-        magnetometer_error: relative standard deviation of the magnetometer's scale factor.
+    The value `magnetometer_error` is the relative standard deviation of the magnetometer's scale factor.
     """
 
     inertia: PriorValue

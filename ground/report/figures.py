@@ -673,10 +673,7 @@ def day_figure(
 ) -> Figure:
     """Return the figure of a day: elevations above the stations, their passes, eclipses and targets.
 
-    Args:
-        prediction: orbit of the satellite over the span that is drawn.
-        stations: ground stations.
-        targets: start (s after the start of the span) and name of each target.
+    The `targets` are start (s after the start of the span) and name of each target.
     """
     rows = len(stations) + bool(targets)
     figure = Figure(figsize=(13.0, 3.6 + 0.45 * rows), layout="constrained")

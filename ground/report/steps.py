@@ -84,14 +84,10 @@ class StepResponse:
 def commanded_steps(
     indices: Sequence[int], times: FloatArray, targets: FloatArray, release_q2: float, end: float
 ) -> list[StepCommand]:
-    """Return the commanded attitude steps between successive targets.
+    """Return the steps between successive `targets`, commanded q2 (n,), at ascending `times` (n,), s.
 
-    Args:
-        indices: numbers (n,) of the steps in the configuration.
-        times: times of the commands (n,), s, ascending.
-        targets: commanded q2 (n,).
-        release_q2: q2 at the first command.
-        end: end of the last step, s.
+    The `indices` (n,) number the steps in the configuration. The first step begins at `release_q2`, and the
+    last step ends at `end`, s.
     """
     starts = np.concatenate([[release_q2], targets[:-1]])
     ends = np.append(times[1:], end)
@@ -106,11 +102,8 @@ def flown_steps(
 ) -> list[StepCommand]:
     """Return the executed steps, which start at the body's attitude and may end early by a mode change.
 
-    Args:
-        commanded: commanded attitude steps, each from one target to the next.
-        time: times of the samples (n,), s.
-        q2: attitude (n,).
-        stops: ascending times, s, at which a mode ended the step in progress.
+    The attitude `q2` (n,) is sampled at `time` (n,), s. The `stops` are ascending times, s, at which a mode
+    ended the step in progress.
     """
     flown: list[StepCommand] = []
     for command in commanded:
