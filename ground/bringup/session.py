@@ -15,24 +15,10 @@ import msgspec
 import numpy as np
 
 from flight.schema.sections import Config
+from ground.bringup import diagnosis
 from ground.bringup.bench import STILL_S, Outcome, Session, StepSkipped, find
 from ground.bringup.cameras import step_dark, step_focus, step_lens, step_light, step_wide
-from ground.bringup.diagnosis import (
-    FEWEST,
-    QUARTER,
-    CoilsFound,
-    CoilTest,
-    Finding,
-    Turns,
-    UnitExpectation,
-    allan_deviation,
-    diagnose_axes,
-    diagnose_coils,
-    diagnose_rest,
-    missing_share,
-    noise_of,
-    turned,
-)
+from ground.bringup.diagnosis import Finding
 from ground.bringup.satellite import step_gps, step_power, step_strings
 from hal.interfaces.devices import COIL_NAMES, InertialUnit, PowerMonitor, TorqueCoils
 from hal.interfaces.wires import SECOND_NS
@@ -54,13 +40,13 @@ def step_find(session: Session) -> Outcome:
     return Outcome([one.finding for one in found if one.finding], {"answers": answers})
 
 
-def expectation(config: Config) -> UnitExpectation:
+def expectation(config: Config) -> diagnosis.UnitExpectation:
     """Return the expected sample rate and noise of the inertial unit, from data sheet and configuration."""
     unit = config.inertial_unit
     if getattr(unit, "driver", "vn100") != "vn100":
-        return UnitExpectation(unit.rate_hz, max(unit.rate_noise, 1e-3), 1e-6, 0.05)
+        return diagnosis.UnitExpectation(unit.rate_hz, max(unit.rate_noise, 1e-3), 1e-6, 0.05)
     gyro, field_noise, force = (density * math.sqrt(0.5 * unit.rate_hz) for density in _DENSITIES)
-    return UnitExpectation(unit.rate_hz, max(gyro, unit.rate_noise), field_noise, force)
+    return diagnosis.UnitExpectation(unit.rate_hz, max(gyro, unit.rate_noise), field_noise, force)
 
 
 def step_rest(session: Session) -> Outcome:
@@ -74,11 +60,11 @@ def step_rest(session: Session) -> Outcome:
     bad = link.bad_checksum - before.bad_checksum
     plant = getattr(session.config, "plant", None)
     strongest = _EARTH_FIELD if plant is None else max(_EARTH_FIELD, 1.3 * plant.field)
-    findings = diagnose_rest(samples, span, expected, bad / max(packets + bad, 1), strongest)
-    if len(samples.times) < FEWEST:
+    findings = diagnosis.diagnose_rest(samples, span, expected, bad / max(packets + bad, 1), strongest)
+    if len(samples.times) < diagnosis.FEWEST:
         return Outcome(findings, {"samples": len(samples.times)})
     measured = {"gyro": samples.rate, "field": samples.field, "acceleration": samples.acceleration}
-    noise = {name: noise_of(sensor).tolist() for name, sensor in measured.items()}
+    noise = {name: diagnosis.noise_of(sensor).tolist() for name, sensor in measured.items()}
     values = {
         "rate_hz": len(samples.times) / span,
         "noise": noise,
@@ -88,7 +74,7 @@ def step_rest(session: Session) -> Outcome:
         "acceleration": samples.acceleration.mean(axis=0).tolist(),
     }
     changes = {} if findings else {"inertial_unit": {"rate_noise": round(max(noise["gyro"]), 9)}}
-    times, deviation = allan_deviation(samples.rate, 1.0 / session.config.inertial_unit.rate_hz)
+    times, deviation = diagnosis.allan_deviation(samples.rate, 1.0 / session.config.inertial_unit.rate_hz)
     arrays = {"times": samples.times - samples.times[0], "rate": samples.rate, "field": samples.field}
     arrays |= {"allan_times": times, "allan": deviation}
     return Outcome(findings, values, changes, arrays)
@@ -108,14 +94,14 @@ def step_axes(session: Session) -> Outcome:
         )
         still = session.record(STILL_S)
         if session.hand is not None:
-            session.hand.turn(np.eye(3)[index], QUARTER, seconds - 0.5)
+            session.hand.turn(np.eye(3)[index], diagnosis.QUARTER, seconds - 0.5)
         moving, held = session.record(seconds), session.record(STILL_S)
-        gyro[index] = turned(moving, still.rate.mean(axis=0))
+        gyro[index] = diagnosis.turned(moving, still.rate.mean(axis=0))
         before[index] = still.acceleration.mean(axis=0), still.field.mean(axis=0)
         after[index] = held.acceleration.mean(axis=0), held.field.mean(axis=0)
     if session.hand is not None:
         session.hand.turn(np.eye(3)[0], 0.0, 1.0)
-    found = diagnose_axes(Turns(gyro, before, after))
+    found = diagnosis.diagnose_axes(diagnosis.Turns(gyro, before, after))
     named = {"gyro": found.gyro, "accelerometer": found.accelerometer, "magnetometer": found.magnetometer}
     axes = {name: None if matrix is None else np.round(matrix, 4).tolist() for name, matrix in named.items()}
     changes = _mounting(session.config, found.gyro, found.findings)
@@ -153,7 +139,7 @@ def step_coils(session: Session) -> Outcome:
     given = session.coil_field
     expected = given if given is not None else np.array([coil.direction() for coil in section.windings])
     magnetometer = axes.get("magnetometer")
-    found = diagnose_coils(
+    found = diagnosis.diagnose_coils(
         test,
         expected,
         COIL_NAMES[: len(section.windings)],
@@ -188,7 +174,7 @@ def step_coils(session: Session) -> Outcome:
 
 def _drive(
     session: Session, coils: TorqueCoils, monitor: PowerMonitor | None, commanded: FloatArray
-) -> CoilTest:
+) -> diagnosis.CoilTest:
     count, slots = len(commanded), len(session.config.coils.slots)
     fields, currents = np.zeros((count, 2, 3)), np.full((count, 2), math.nan)
     absent, volts = np.zeros((count, 2)), np.full((count, 3), math.nan)
@@ -213,7 +199,7 @@ def _drive(
         settled_ns = session.rig.clock.now_ns() + round(_SETTLE_S * SECOND_NS)
         session.wait(_SETTLE_S, repeat)
         samples = session.record(_DRIVE_S, repeat)
-        spread.append(noise_of(samples.field).max() / math.sqrt(len(samples.times)))
+        spread.append(diagnosis.noise_of(samples.field).max() / math.sqrt(len(samples.times)))
         return samples.field, float(np.mean(list(drawn.values()))) if drawn else math.nan
 
     zero = np.zeros(slots)
@@ -227,7 +213,7 @@ def _drive(
             command[index] = sign * commanded[index]
             driven, current = measured(command)
             fields[index, way] = sign * (driven.mean(axis=0) - rest) / commanded[index]
-            absent[index, way] = missing_share(driven - rest, noise_of(at_rest).max())
+            absent[index, way] = diagnosis.missing_share(driven - rest, diagnosis.noise_of(at_rest).max())
             currents[index, way] = current - still
             volts[index, 1 + way] = _voltage(monitor)
             fault = fault or coils.state().error
@@ -239,7 +225,9 @@ def _drive(
     )
     resting, supply = float(np.mean(idle)), (float(np.max(volts[:, 0])), float(np.min(volts[:, 1:])))
     plus, minus, clips = fields[:, 0], fields[:, 1], any(clipped)
-    return CoilTest(commanded, plus, minus, currents, resting, noise, absent, fault, clips, supply, sensed)
+    return diagnosis.CoilTest(
+        commanded, plus, minus, currents, resting, noise, absent, fault, clips, supply, sensed
+    )
 
 
 def _voltage(monitor: PowerMonitor | None) -> float:
@@ -248,7 +236,9 @@ def _voltage(monitor: PowerMonitor | None) -> float:
     return math.nan if reading is None else reading.voltage
 
 
-def _coil_changes(config: Config, found: CoilsFound, clipped: bool, *, axes_known: bool) -> dict[str, Any]:
+def _coil_changes(
+    config: Config, found: diagnosis.CoilsFound, clipped: bool, *, axes_known: bool
+) -> dict[str, Any]:
     """Return the changes of windings and shunt that the findings about single coils imply.
 
     If `axes_known` is false, the axes of the coils are not changed, because a coil's field at the

@@ -26,17 +26,7 @@ from ground.commands.options import (
 from ground.pictures import draw_circle, draw_horizon
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.errors import UsageError
-from knightcube.reference.horizon import (
-    LINES,
-    GraphicMethodError,
-    LevelCamera,
-    NoHorizonError,
-    ScannedHorizon,
-    circle_nadir,
-    graphic_nadir,
-    propagated_nadir,
-    scan_horizon,
-)
+from knightcube.reference import horizon as meller
 from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.horizon.nadir import (
@@ -215,7 +205,7 @@ def _add_paper_options(parser: argparse.ArgumentParser) -> None:
     text = "vector: nadir of the earlier picture in camera axes (default from its circle)"
     paper.add_argument("--nadir", type=finite, nargs=3, metavar=("X", "Y", "Z"), help=text)
     paper.add_argument(
-        "--lines", type=int, metavar="N", help=f"number of scanned lines, 3 to 512 (default {LINES})"
+        "--lines", type=int, metavar="N", help=f"number of scanned lines, 3 to 512 (default {meller.LINES})"
     )
 
 
@@ -224,7 +214,7 @@ class _PaperNadir:
     """Nadir (3,) in camera axes by a method of Meller et al., and the limb circle in the first picture."""
 
     nadir: FloatArray
-    seen: ScannedHorizon
+    seen: meller.ScannedHorizon
 
 
 def _check_method(options: argparse.Namespace) -> None:
@@ -268,7 +258,7 @@ def _run_paper(options: argparse.Namespace, pixels: Image, camera: CameraModel) 
     found, reason = None, ""
     try:
         found = _found(options, pixels, camera)
-    except (NoHorizonError, GraphicMethodError) as error:
+    except (meller.NoHorizonError, meller.GraphicMethodError) as error:
         reason = str(error)
     facts = _paper_facts(options.method, found, reason)
     print_result(options, facts, _paper_text(options.method, found, reason))
@@ -282,11 +272,11 @@ def _run_paper(options: argparse.Namespace, pixels: Image, camera: CameraModel) 
 
 
 def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _PaperNadir:
-    lines = LINES if options.lines is None else options.lines
+    lines = meller.LINES if options.lines is None else options.lines
     altitude = math.nan if options.altitude is None else 1e3 * options.altitude
-    seen = scan_horizon(pixels, camera, lines)
+    seen = meller.scan_horizon(pixels, camera, lines)
     if options.method == "circle":
-        return _PaperNadir(circle_nadir(seen.circle, camera, altitude), seen)
+        return _PaperNadir(meller.circle_nadir(seen.circle, camera, altitude), seen)
     other = read_image(options.second)
     check_size(options.second, other)
     if other.shape != pixels.shape:
@@ -294,26 +284,30 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
             f"{options.second}: {other.shape[1]} x {other.shape[0]} pixels, but {options.image} has"
             f" {pixels.shape[1]} x {pixels.shape[0]}"
         )
-    second = scan_horizon(other, camera, lines)
+    second = meller.scan_horizon(other, camera, lines)
     if options.method == "graphic":
         return _PaperNadir(_graphic(options.turned, camera, seen, second, altitude), seen)
     if options.nadir is None:
-        before = circle_nadir(second.circle, camera, altitude)
+        before = meller.circle_nadir(second.circle, camera, altitude)
     else:
         before = np.array(options.nadir) / np.linalg.norm(options.nadir)
-    return _PaperNadir(propagated_nadir(before, second.middle, seen.middle), seen)
+    return _PaperNadir(meller.propagated_nadir(before, second.middle, seen.middle), seen)
 
 
 def _graphic(
-    turned: float, camera: CameraModel, first: ScannedHorizon, second: ScannedHorizon, altitude: float
+    turned: float,
+    camera: CameraModel,
+    first: meller.ScannedHorizon,
+    second: meller.ScannedHorizon,
+    altitude: float,
 ) -> FloatArray:
     """Return nadir (3,) in axes of the first of two cameras (Graphic Method, `graphic_nadir`)."""
     angle, axis = math.radians(turned), camera.ideal.centre
     cameras = (
-        LevelCamera(np.array([0.0, 1.0]), axis),
-        LevelCamera(np.array([-math.sin(angle), math.cos(angle)]), axis),
+        meller.LevelCamera(np.array([0.0, 1.0]), axis),
+        meller.LevelCamera(np.array([-math.sin(angle), math.cos(angle)]), axis),
     )
-    x, y, z = graphic_nadir(cameras, (first.circle, second.circle), altitude)
+    x, y, z = meller.graphic_nadir(cameras, (first.circle, second.circle), altitude)
     return np.array([y, z, x])
 
 

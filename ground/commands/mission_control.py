@@ -21,6 +21,7 @@ from flight.link.telemetry.log import SUFFIX, find_runs, find_segments
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES, walk
 from flight.schema.document import config_path
 from flight.schema.reader import load
+from ground import yamcs
 from ground.commands.elements import add_stations, predicted
 from ground.commands.options import count, positive
 from ground.link.commanding import terminal_of
@@ -28,21 +29,6 @@ from ground.link.gateway import Gateway, new_token, token_file, token_path
 from ground.link.terminal import DEFAULTS
 from ground.telemetry import decode
 from ground.xtce import EPOCH
-from ground.yamcs import (
-    HTTP_PORT,
-    INSTANCE,
-    KEYS,
-    RECORDED,
-    USER,
-    USERS,
-    Session,
-    add_passes,
-    command_line,
-    compile_link,
-    missing,
-    password_in,
-    write,
-)
 from knightcube.errors import FlightError, UsageError
 
 if TYPE_CHECKING:
@@ -77,11 +63,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     text = "with --recorded: replay S seconds of the run per second, instead of all packets at once"
     parser.add_argument("--speed", type=positive, metavar="S", help=text)
     text = "keys of the ground (default %(default)s)"
-    parser.add_argument("--keys", type=Path, default=KEYS, metavar="FOLDER", help=text)
+    parser.add_argument("--keys", type=Path, default=yamcs.KEYS, metavar="FOLDER", help=text)
     text = "folder of Yamcs's configuration and archive (default %(default)s)"
     parser.add_argument("--out", type=Path, default=Path("mission-control"), metavar="FOLDER", help=text)
     text = "port of Yamcs's page (default %(default)s)"
-    parser.add_argument("--port", type=count, default=HTTP_PORT, metavar="PORT", help=text)
+    parser.add_argument("--port", type=count, default=yamcs.HTTP_PORT, metavar="PORT", help=text)
     text = f"UTC of mission time zero (default that of the flown or recorded run, otherwise {EPOCH})"
     parser.add_argument("--epoch", metavar="UTC", help=text)
     text = "file of two-line elements or OMM that predicts the passes (default `elements` of CONFIG)"
@@ -92,7 +78,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run Yamcs, and the gateway unless a run is replayed, until a signal arrives or Yamcs ends."""
-    if problem := missing():
+    if problem := yamcs.missing():
         raise FlightError(problem)
     if options.speed is not None and options.recorded is None:
         raise UsageError("--speed: replays a recorded run: give --recorded RUN")
@@ -110,26 +96,25 @@ def run(options: argparse.Namespace) -> int:
         running = _flown(options.config, folder, stack) if options.fly else {}
         gateway = None if packets is not None else _gateway(options, stack)
         served = None if gateway is None else f"127.0.0.1:{gateway.port}"
-        compile_link(folder)  # while the flight starts
+        yamcs.compile_link(folder)  # while the flight starts
         zero = _mission_zero(_first_packets(folder, earlier, running) if running else packets or ())
         options.begin = options.begin or zero
         forecast = _forecast(options)
         epoch = options.epoch or (EPOCH if zero is None else zero.replace(tzinfo=None).isoformat())
-        write(folder, served, options.port, epoch, options.keys, frame_bytes, body)
-        yamcs = running["Yamcs"] = _process(command_line(folder), folder / "log", stack)
+        yamcs.write(folder, served, options.port, epoch, options.keys, frame_bytes, body)
+        server = running["Yamcs"] = _process(yamcs.command_line(folder), folder / "log", stack)
 
         def ended() -> bool:
-            return signals.received or yamcs.poll() is not None or any(map(_failed, running.values()))
+            return signals.received or server.poll() is not None or any(map(_failed, running.values()))
 
         replay: Replay | None = None
         if _started(options.port, folder, forecast, ended):
             # The replay begins now, because packets before the start of Yamcs's archive would be lost.
             if packets is not None:
                 replay = Replay(packets, folder, options.speed, time.monotonic())
-            sys.stdout.write(
-                f"Yamcs on http://127.0.0.1:{options.port}/, user {USER}, password in {folder / USERS}, "
-                f"log in {folder / 'log'} (Ctrl-C ends)\n"
-            )
+            page, log = f"http://127.0.0.1:{options.port}/", folder / "log"
+            access = f"user {yamcs.USER}, password in {folder / yamcs.USERS}"
+            sys.stdout.write(f"Yamcs on {page}, {access}, log in {log} (Ctrl-C ends)\n")
             sys.stdout.flush()
         while not ended():
             if replay is not None:
@@ -229,12 +214,12 @@ class Replay:
         due = len(self._packets)
         if self._speed is not None and self._times:
             due = bisect_right(self._times, self._times[0] + 1e9 * self._speed * (now - self._begun))
-        if due == self._sent or any((self._folder / RECORDED).glob(f"run-*{SUFFIX}")):
+        if due == self._sent or any((self._folder / yamcs.RECORDED).glob(f"run-*{SUFFIX}")):
             return
         self._files += 1
         complete = self._folder / f"run-{self._files:06d}{SUFFIX}"
         complete.write_bytes(b"".join(self._packets[self._sent : due]))
-        complete.replace(self._folder / RECORDED / complete.name)
+        complete.replace(self._folder / yamcs.RECORDED / complete.name)
         self._sent = due
 
 
@@ -274,22 +259,22 @@ def _forecast(options: argparse.Namespace) -> _Forecast | None:
 
 def _started(port: int, folder: Path, forecast: _Forecast | None, ended: Callable[[], bool]) -> bool:
     """Wait until Yamcs answers or `ended` is true, show the passes, and return whether Yamcs answers."""
-    session = Session(f"http://127.0.0.1:{port}/api", USER, password_in(folder))
+    session = yamcs.Session(f"http://127.0.0.1:{port}/api", yamcs.USER, yamcs.password_in(folder))
     while not ended() and not _runs(session):
         time.sleep(_ASK_S)
     if ended():
         return False
     if forecast is not None:
         try:
-            add_passes(session, INSTANCE, *forecast)
+            yamcs.add_passes(session, yamcs.INSTANCE, *forecast)
         except OSError as error:
             raise FlightError(f"Yamcs refuses the passes: {error}: see {folder / 'log'}") from error
     return True
 
 
-def _runs(session: Session) -> bool:
+def _runs(session: yamcs.Session) -> bool:
     try:
-        return bool(session.ask(f"/instances/{INSTANCE}")["state"] == "RUNNING")
+        return bool(session.ask(f"/instances/{yamcs.INSTANCE}")["state"] == "RUNNING")
     except (OSError, ValueError):  # a ValueError means that the answer is not JSON
         return False
 

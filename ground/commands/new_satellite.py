@@ -19,22 +19,10 @@ from flight.app.devices import check_settings, check_simulated_elements
 from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
+from ground import satellite_description as description
 from ground.commands.elements import elements_of
 from ground.commands.options import interruptible, print_result, write_new
-from ground.satellite_description import (
-    COIL_EXAMPLE,
-    QUESTIONS,
-    Apsides,
-    Derived,
-    Question,
-    Satellite,
-    Values,
-    check_values,
-    configuration_text,
-    derived,
-    read_value,
-    sun_synchronous_inclination,
-)
+from ground.satellite_description import Derived, Question, Satellite, Values
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.errors import UsageError
 from sim_hal.settings import OrbitSection
@@ -56,13 +44,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "examples:\n"
         f"  {PROGRAM} new-satellite\n"
-        f"  {PROGRAM} new-satellite --mass 4 --size 3u --altitude 550 --coil {COIL_EXAMPLE}\n"
+        f"  {PROGRAM} new-satellite --mass 4 --size 3u --altitude 550 --coil {description.COIL_EXAMPLE}\n"
         f"  {PROGRAM} new-satellite --mass 8 --size 6u --inclination 51.6 --out six.yaml \\\n"
         "    --coil axis=xy,dipole=0.5,current=0.1,resistance=50 \\\n"
         "    --coil axis=z,turns=200,area=0.02,resistance=33,current=0.12"
     )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    for question in QUESTIONS:
+    for question in description.QUESTIONS:
         repeated = question.name == "coil"
         default = f"default {question.default}" if question.default is not None else "required"
         parser.add_argument(
@@ -104,8 +92,8 @@ def _written(answers: Answers, force: bool) -> tuple[dict[str, Any], str]:
     """Write the file, and return the result for the option `--json` and as text. Raises UsageError."""
     path, satellite = answers.path(), satellite_of(answers.values)
     date = julian_date(satellite.utc)
-    values, made = derived(satellite, date), elements_of(satellite.orbit, date)
-    text = configuration_text(satellite, values, made, answers.command())
+    values, made = description.derived(satellite, date), elements_of(satellite.orbit, date)
+    text = description.configuration_text(satellite, values, made, answers.command())
     _check(text, path)
     if force:
         _replace(path, text)
@@ -133,7 +121,7 @@ class Answers:
 
     def take_options(self, options: argparse.Namespace) -> None:
         """Store the given options. Raises UsageError for an impossible value, and if the file exists."""
-        for question in QUESTIONS:
+        for question in description.QUESTIONS:
             given = getattr(options, question.name.replace("-", "_"))
             if given is not None:
                 self._take(question, given if isinstance(given, list) else [given])
@@ -142,7 +130,11 @@ class Answers:
 
     def missing(self) -> list[str]:
         """Return the required options that the user has not given."""
-        return [f"--{one.name}" for one in QUESTIONS if one.default is None and one.name not in self.values]
+        return [
+            f"--{one.name}"
+            for one in description.QUESTIONS
+            if one.default is None and one.name not in self.values
+        ]
 
     def take_defaults(self) -> None:
         """Set each value that the user has not given to its default.
@@ -158,7 +150,7 @@ class Answers:
 
         Raises UsageError if the file exists and may not be replaced.
         """
-        path = self._out or Path(f"{self.values.get('name', QUESTIONS[0].default)}.yaml")
+        path = self._out or Path(f"{self.values.get('name', description.QUESTIONS[0].default)}.yaml")
         if not self._force and os.path.lexists(path):
             raise UsageError(f"{path}: this file exists: give another --out, or --force to replace it")
         return path
@@ -187,7 +179,7 @@ class Answers:
             raise UsageError(f"the input has ended; to continue: {self.command()}") from None
 
     def _open(self) -> Iterator[Question]:
-        yield from (question for question in QUESTIONS if question.name not in self.values)
+        yield from (question for question in description.QUESTIONS if question.name not in self.values)
 
     def _ask(self, question: Question) -> None:
         """Ask until an answer is accepted. Raises EOFError at the end of the input."""
@@ -213,14 +205,14 @@ class Answers:
             raise UsageError(f"--{name} {texts[-1]}: --altitude has perigee and apogee: omit this option")
         found: dict[str, Any] = {}
         for text in texts:
-            value = read_value(name, text)
-            if isinstance(value, Apsides):
+            value = description.read_value(name, text)
+            if isinstance(value, description.Apsides):
                 found = asdict(value)
             else:
                 found[name] = [*found.get(name, ()), *value] if name == "coil" else value
         try:
             self.values |= found
-            check_values(name, self.values)
+            description.check_values(name, self.values)
         except UsageError as error:
             for one in found:
                 del self.values[one]
@@ -233,7 +225,7 @@ def satellite_of(values: Values) -> Satellite:
     altitude, eccentricity = 1e3 * values["altitude"], values["eccentricity"]
     inclination = values["inclination"]
     if inclination is None:
-        inclination = sun_synchronous_inclination(altitude, eccentricity)
+        inclination = description.sun_synchronous_inclination(altitude, eccentricity)
     orbit = {"altitude": altitude, "eccentricity": eccentricity, "inclination_deg": inclination}
     orbit["local_time"] = values["local-time"]
     coils = tuple(values["coil"])

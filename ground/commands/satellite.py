@@ -20,46 +20,11 @@ import numpy as np
 from flight.app.cli import PROGRAM
 from flight.app.run import utc_ns
 from flight.app.service import EndingSignals
-from flight.link.commands import (
-    COMMANDS,
-    LAYOUTS,
-    LOAD_PARAMETERS,
-    PING,
-    POINT,
-    Command,
-    CommandError,
-    CommandPacker,
-    DumpParameters,
-    LoadParameters,
-    Ping,
-    Point,
-    command_of,
-    crc_of,
-    problem_of,
-    words_of,
-)
+from flight.link import commands
 from flight.link.files.store import Store
 from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
-from flight.link.process.directives import (
-    KINDS,
-    PARTS,
-    CancelFile,
-    DeleteFile,
-    Deletion,
-    Directive,
-    ListFiles,
-    Listing,
-    Play,
-    Restart,
-    ResumeFile,
-    Scheduled,
-    SendFile,
-    Stop,
-    SuspendFile,
-    UseFile,
-)
 from flight.link.process.filing import LISTING
 from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import (
@@ -96,10 +61,10 @@ Object = dict[str, Any]
 _Words: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 _DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule", "restart")
 (_ORIGINS,) = (dict(field.states) for field in PARAMETERS.fields if field.name == "table")
-_OF_TRANSFERS: dict[str, type[CancelFile | SuspendFile | ResumeFile]] = {
-    "cancel": CancelFile,
-    "suspend": SuspendFile,
-    "resume": ResumeFile,
+_OF_TRANSFERS: dict[str, type[directives.CancelFile | directives.SuspendFile | directives.ResumeFile]] = {
+    "cancel": directives.CancelFile,
+    "suspend": directives.SuspendFile,
+    "resume": directives.ResumeFile,
 }
 _RATE = 20_000.0  # default rate of frames to the satellite (bytes/s)
 _SILENCE_S = 60.0  # default time (s) without a packet after which a file command fails
@@ -159,14 +124,16 @@ def configure_command(parser: argparse.ArgumentParser) -> None:
     deleted.add_argument("number", type=int, metavar="N", help="number in list-schedule; 0 deletes all")
     words.add_parser("list-schedule", help="with --link: show the scheduled commands")
     restarted = words.add_parser("restart", help="with --link: restart a process or the board")
-    restarted.add_argument("part", choices=PARTS, metavar="PART", help=" or ".join(PARTS))
+    restarted.add_argument(
+        "part", choices=directives.PARTS, metavar="PART", help=" or ".join(directives.PARTS)
+    )
     key = words.add_parser("new-key", help="with --link: change a key of ground and satellite")
     key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
     _allow_behind(words)
     parser.set_defaults(command=run_command)
 
 
-def _add_commands(words: _Words, packets: Sequence[Packet] = COMMANDS) -> None:
+def _add_commands(words: _Words, packets: Sequence[Packet] = commands.COMMANDS) -> None:
     """Add a subparser for each of the telecommands."""
     for packet in packets:
         _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
@@ -182,13 +149,13 @@ def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
     """
     parser = argparse.ArgumentParser(prog=f"{PROGRAM} command schedule UTC")
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
-    _add_commands(words, [packet for packet in COMMANDS if packet is not LOAD_PARAMETERS])
+    _add_commands(words, [packet for packet in commands.COMMANDS if packet is not commands.LOAD_PARAMETERS])
     _allow_behind(words)
     typed = parser.parse_args(options.words)
     behind = {name: getattr(typed, name) for name in ("timeout", "json") if hasattr(typed, name)}
     try:
-        line = words_of(_command_of(typed))
-    except CommandError as error:
+        line = commands.words_of(_command_of(typed))
+    except commands.CommandError as error:
         raise UsageError(str(error)) from error
     return argparse.Namespace(**{**vars(options), **behind, "words": line})
 
@@ -196,11 +163,11 @@ def _with_scheduled(options: argparse.Namespace) -> argparse.Namespace:
 def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
     """Add the arguments of one command from the table of telecommands."""
     parser.description = f"{packet.meaning}. Hazard: {packet.hazard or 'none'}."
-    if packet is POINT:
+    if packet is commands.POINT:
         parser.description = (
             "Point to nadir, velocity or sun; to inertial QX QY QZ QW, an attitude from ICRS into the body "
             "frame, scalar last; to ground LAT LON, degrees; or to object, the moving object that the star "
-            f"camera detects in its field of view, or near RA DEC, degrees. Hazard: {POINT.hazard}."
+            f"camera detects in its field of view, or near RA DEC, degrees. Hazard: {commands.POINT.hazard}."
         )
         text = "QX QY QZ QW of inertial, LAT LON of ground, RA DEC of object"
         parser.add_argument("goal", choices=[goal.label for goal in Goal])
@@ -209,7 +176,7 @@ def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
             "--roll", type=float, metavar="DEG", help="about the pointing axis (default free)"
         )
         return
-    for field in packet.fields if packet is not PING else ():
+    for field in packet.fields if packet is not commands.PING else ():
         meaning = meaning_of(replace(field, states=())).replace("%", "%%")
         if field.states:
             parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
@@ -268,33 +235,33 @@ def packet_of(options: argparse.Namespace) -> bytes:
     try:
         match options.what:
             case "play":
-                directive: Directive = Play(options.run, options.begin, options.end)
+                directive: directives.Directive = directives.Play(options.run, options.begin, options.end)
             case "stop-playback":
-                directive = Stop()
+                directive = directives.Stop()
             case "schedule":
-                directive = Scheduled(options.at, options.words)
+                directive = directives.Scheduled(options.at, options.words)
             case "unschedule":
-                directive = Deletion(options.number)
+                directive = directives.Deletion(options.number)
             case "restart":
-                directive = Restart(PARTS.index(options.part))
+                directive = directives.Restart(directives.PARTS.index(options.part))
             case "list-schedule":
-                directive = Listing()
+                directive = directives.Listing()
             case _:
-                return CommandPacker().pack(_command_of(options), utc_ns())
+                return commands.CommandPacker().pack(_command_of(options), utc_ns())
         return directives.pack(directive, utc_ns())
-    except CommandError as error:
+    except commands.CommandError as error:
         raise UsageError(str(error)) from error
 
 
-def _command_of(options: argparse.Namespace) -> Command:
-    packet = LAYOUTS[options.what].packet
-    if packet is PING:
-        return Ping(os.getpid() & 0xFFFFFFFF)
-    if packet is POINT:
+def _command_of(options: argparse.Namespace) -> commands.Command:
+    packet = commands.LAYOUTS[options.what].packet
+    if packet is commands.PING:
+        return commands.Ping(os.getpid() & 0xFFFFFFFF)
+    if packet is commands.POINT:
         goal = Goal.named(options.goal)
         numbers = options.numbers if goal is Goal.INERTIAL else map(math.radians, options.numbers)
         roll = None if options.roll is None else math.radians(options.roll)
-        return Point(PointingTarget(goal, tuple(numbers), roll))
+        return commands.Point(PointingTarget(goal, tuple(numbers), roll))
     fields = {}
     for field in packet.fields:
         value = getattr(options, field.name)
@@ -302,7 +269,7 @@ def _command_of(options: argparse.Namespace) -> Command:
             value = " ".join(value)
         numbers_by_label = {label: number for number, label in field.states}
         fields[field.name] = numbers_by_label[value] if field.states else value
-    return command_of(packet, fields)
+    return commands.command_of(packet, fields)
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,17 +313,19 @@ def run_parameters(options: argparse.Namespace) -> int:
         raise UsageError(f"--timeout {options.timeout}: must be a positive number of seconds")
     file = _parameters_in(options.load) if options.load is not None else None
     changes = dict(map(_change, options.changes))
-    before, _ = _ask(options, DumpParameters())
+    before, _ = _ask(options, commands.DumpParameters())
     if before is None:
         raise FlightError("the flight sent no table of parameters: repeat it or use a longer --timeout")
     wanted = {**(file or before.values), **changes}
-    if problem := problem_of(wanted):
+    if problem := commands.problem_of(wanted):
         raise UsageError(problem)
     flown, refused = before, ""
     if wanted != before.values:
-        _, refused = _ask(options, LoadParameters(before.crc, tuple(wanted[key] for key in PARAMETER_KEYS)))
-        flown = (_ask(options, DumpParameters())[0] or before) if not refused else before
-        if not refused and flown.crc != crc_of([wanted[key] for key in PARAMETER_KEYS]):
+        _, refused = _ask(
+            options, commands.LoadParameters(before.crc, tuple(wanted[key] for key in PARAMETER_KEYS))
+        )
+        flown = (_ask(options, commands.DumpParameters())[0] or before) if not refused else before
+        if not refused and flown.crc != commands.crc_of([wanted[key] for key in PARAMETER_KEYS]):
             problem = f"the flight uses table {flown.crc:08x}, not the one that was sent"
             raise FlightError(f"{problem}: check it with another call")
     _show(flown, before, refused, options.json)
@@ -369,11 +338,11 @@ def run_parameters(options: argparse.Namespace) -> int:
     return 1 if refused else 0
 
 
-def _ask(options: argparse.Namespace, command: Command) -> tuple[ParameterTable | None, str]:
+def _ask(options: argparse.Namespace, command: commands.Command) -> tuple[ParameterTable | None, str]:
     """Send a command and return the table received with its answer, and the reason for a refusal."""
-    packet = CommandPacker().pack(command, utc_ns())
+    packet = commands.CommandPacker().pack(command, utc_ns())
     if options.link is not None:
-        return _ask_by_link(options, packet, wants_table=isinstance(command, DumpParameters))
+        return _ask_by_link(options, packet, wants_table=isinstance(command, commands.DumpParameters))
     found = decode(exchange(options.to, packet, options.timeout))
     answers, tables = found[COMMAND.name], found[PARAMETERS.name]
     if not len(answers):
@@ -452,7 +421,7 @@ def _parameters_in(path: Path) -> dict[str, float]:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise document.error(f"{section}.{name}", f"is {value!r}: must be a number")
             values[f"{section}.{name}"] = float(value)
-    if problem := problem_of(values):
+    if problem := commands.problem_of(values):
         raise UsageError(f"{path}: {problem}")
     return values
 
@@ -482,7 +451,7 @@ def configure_files(parser: argparse.ArgumentParser) -> None:
         ("use", "use a file uploaded to the satellite", "local copy of the file, whose SHA-256 is sent"),
     ):
         placed = words.add_parser(word, help=purpose)
-        placed.add_argument("kind", choices=KINDS, help="purpose of the file")
+        placed.add_argument("kind", choices=directives.KINDS, help="purpose of the file")
         placed.add_argument("path", type=Path, metavar="FILE", help=text)
         if word == "put":
             placed.add_argument(
@@ -541,25 +510,25 @@ class _FileWork:
         """Return the result of the file command. Raises FlightError."""
         match options.what:
             case "list":
-                path = self._get(ListFiles(options.under), LISTING)
+                path = self._get(directives.ListFiles(options.under), LISTING)
                 listing: Object = json.loads(path.read_bytes())
                 return listing | {"text": f"{listing['free']} bytes are free"}
             case "get":
-                paths = [self._get(SendFile(name), name) for name in options.names]
+                paths = [self._get(directives.SendFile(name), name) for name in options.names]
                 return {"files": [self._facts(path) for path in paths]}
             case "put":
                 name = f"{options.kind}/{options.path.name}"
                 if options.replace:
-                    path = self._get(ListFiles(f"received/{name}"), LISTING)
+                    path = self._get(directives.ListFiles(f"received/{name}"), LISTING)
                     files = json.loads(path.read_bytes())["files"]
                     if any(file["name"] == f"received/{name}" for file in files):
-                        self._command(DeleteFile(f"received/{name}"))
+                        self._command(directives.DeleteFile(f"received/{name}"))
                 return self._put(options.path, name)
             case "use":
                 name = f"received/{options.kind}/{options.path.name}"
-                return self._command(UseFile(name, sha256_of(options.path)))
+                return self._command(directives.UseFile(name, sha256_of(options.path)))
             case "delete":
-                return self._command(DeleteFile(options.name))
+                return self._command(directives.DeleteFile(options.name))
             case word:
                 return self._command(_OF_TRANSFERS[word](options.source, options.number))
 
@@ -567,7 +536,7 @@ class _FileWork:
         name, size = path.relative_to(self._session.received).as_posix(), path.stat().st_size
         return {"name": name, "bytes": size, "path": str(path), "sha256": sha256_of(path).hex()}
 
-    def _get(self, directive: Directive, name: str) -> Path:
+    def _get(self, directive: directives.Directive, name: str) -> Path:
         """Return the path of a file that was received completely."""
         self._session.ask(directive, time.monotonic_ns())
         self._turn(name)
@@ -587,7 +556,7 @@ class _FileWork:
         digest = sha256_of(path).hex()
         return {"name": f"received/{name}", "bytes": begun.size, "sha256": digest, "text": text}
 
-    def _command(self, directive: Directive) -> Object:
+    def _command(self, directive: directives.Directive) -> Object:
         self._session.ask(directive, time.monotonic_ns())
         self._turn("")
         while not self._session.completed():

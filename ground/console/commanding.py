@@ -20,16 +20,6 @@ import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link import commands
-from flight.link.commands import (
-    CLEAR,
-    LAYOUTS,
-    LOAD_PARAMETERS,
-    MODE,
-    CommandError,
-    CommandPacker,
-    Ping,
-    crc_of,
-)
 from flight.link.events import EVENTS
 from flight.link.files.store import Store, problem_of_name
 from flight.link.modes import Mode
@@ -86,7 +76,7 @@ def by_socket(to: str) -> Send:
 class CommandForms:
     """Sender of commands, which packs the values of the page's forms into command packets."""
 
-    def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = LAYOUTS) -> None:
+    def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = commands.LAYOUTS) -> None:
         """Accept the commands of `layouts`; the console is read-only if `send` is None.
 
         The attribute `body` is the kind of body, or None if unknown. Only commands for this kind are
@@ -127,24 +117,24 @@ class CommandForms:
         unknown = sorted(set(given) - {field.name for field in packet.fields})
         if unknown:
             raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
-        if name == LOAD_PARAMETERS.name and not given.get("crc"):
+        if name == commands.LOAD_PARAMETERS.name and not given.get("crc"):
             # The CRC of the parameters is computed here unless the operator has entered it.
             parameters = [float(_value(name, field, given.get(field.name))) for field in PARAMETERS]
-            given = {**given, "crc": crc_of(parameters)}
+            given = {**given, "crc": commands.crc_of(parameters)}
         fields = {field.name: _value(name, field, given.get(field.name)) for field in packet.fields}
         try:
             data = self._packer.pack(packet, utc_ns(), fields)
             _text_of(data)
             self._check(name, fields)
-        except (TelemetryError, CommandError) as error:
+        except (TelemetryError, commands.CommandError) as error:
             raise UsageError(str(error)) from error
         return data
 
     def _check(self, name: str, fields: Object) -> None:
         """Raise UsageError or CommandError for values that the body or the command schedule refuses."""
-        if name == MODE.name and (mode := Mode(fields["mode"])) in foreign_modes(self.body):
+        if name == commands.MODE.name and (mode := Mode(fields["mode"])) in foreign_modes(self.body):
             raise UsageError(f"mode {mode.label}: this body has no such mode")
-        if name == CLEAR.name and fields["event"] not in {kind.name for kind in EVENTS}:
+        if name == commands.CLEAR.name and fields["event"] not in {kind.name for kind in EVENTS}:
             raise UsageError(f"clear: {fields['event']!r} is not the name of an event")
         if name == SCHEDULE.name:
             if utc_of(fields["at"]) <= utc_ns():
@@ -208,7 +198,7 @@ class LinkFeed:
         self._terminal = terminal
         self.lock = threading.Lock()
         self._session: FileSession | None = None
-        self._packer = CommandPacker()
+        self._packer = commands.CommandPacker()
         self._reports: dict[int, list[Report]] = {}
         self._received = time.monotonic()
         self._asked = -np.inf
@@ -224,7 +214,7 @@ class LinkFeed:
             now = time.monotonic()
             if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
                 self._asked = now
-                self._terminal.send(self._packer.pack(Ping(), utc_ns()), _SPI)
+                self._terminal.send(self._packer.pack(commands.Ping(), utc_ns()), _SPI)
             packets = list(self._terminal.packets(_LISTEN_S))
             if self._session is not None:
                 self._session.take(packets, time.monotonic_ns())

@@ -14,18 +14,9 @@ from pathlib import Path
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
+from flight.link.files import units
 from flight.link.files.store import Store
 from flight.link.files.transfer import CRC32, GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
-from flight.link.files.units import (
-    DOWN,
-    UNIT_OVERHEAD_BYTES,
-    UP,
-    Metadata,
-    PduError,
-    UnitPacker,
-    is_unit,
-    unit_of,
-)
 from flight.link.frames import LONGEST_FRAME, TELECOMMAND_MASK
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
@@ -261,11 +252,16 @@ class FileSession:
         self._terminal = terminal
         self._rate = rate
         self._sealer = terminal.sealer(spi, _BLOCK)
-        self._units = UnitPacker(UP)
+        self._units = units.UnitPacker(units.UP)
         self._wanted = {LISTING}
         self.received = store.received
         self.entity = Entity(
-            GROUND, store, self._may_come, LONGEST_FILE, now_ns, terminal.packet_bytes - UNIT_OVERHEAD_BYTES
+            GROUND,
+            store,
+            self._may_come,
+            LONGEST_FILE,
+            now_ns,
+            terminal.packet_bytes - units.UNIT_OVERHEAD_BYTES,
         )
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
@@ -297,10 +293,10 @@ class FileSession:
         """Process received telemetry, given as pairs of virtual channel and packet."""
         for _, packet in packets:
             self.received_ns = now_ns
-            if is_unit(packet, DOWN):
+            if units.is_unit(packet, units.DOWN):
                 try:
-                    self.entity.take(unit_of(packet), now_ns)
-                except PduError:  # the satellite's software release may have different PDUs
+                    self.entity.take(units.unit_of(packet), now_ns)
+                except units.PduError:  # the satellite's software release may have different PDUs
                     continue
             elif packet[:2] == _VERIFICATION:
                 report = report_of(packet)
@@ -326,7 +322,7 @@ class FileSession:
             self._credit -= len(packet) + FRAME_OVERHEAD_BYTES
         self.entity.keep(now_ns)
 
-    def _may_come(self, metadata: Metadata) -> str:
+    def _may_come(self, metadata: units.Metadata) -> str:
         """Return why a file from the satellite is rejected, or an empty text if it is accepted."""
         exists = (self.received / metadata.name).exists()
         return f"{metadata.name} exists" if exists and metadata.name not in self._wanted else ""

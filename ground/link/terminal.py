@@ -16,33 +16,12 @@ from typing import Protocol
 import serial
 
 from flight.app.run import utc_ns
+from flight.link import frames, security
 from flight.link.coding import Framing, LinkCodes
-from flight.link.frames import (
-    TELECOMMAND_HEADER,
-    TELECOMMAND_MASK,
-    TELEMETRY_MASK,
-    PacketAssembler,
-    TelecommandHeader,
-    close_frame,
-    is_idle,
-    open_telemetry,
-)
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import portions
 from flight.link.process.downlink import LIVE
 from flight.link.process.station import host_port
-from flight.link.security import (
-    COMMAND_SPIS,
-    COPIES,
-    OVERHEAD_BYTES,
-    TELEMETRY_SPIS,
-    Association,
-    Gate,
-    RefusedError,
-    Sealer,
-    Vault,
-    new_key,
-)
 from flight.link.telemetry.definitions import LINK, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS
 from flight.schema.sections import Link, LinkCoding
@@ -60,7 +39,7 @@ _ANY_AHEAD = 2**63
 """Width of the anti-replay window, so large that a gap of any length after lost telemetry is accepted."""
 _READ_BYTES = 1 << 16
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
-FRAME_OVERHEAD_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
+FRAME_OVERHEAD_BYTES = frames.TELECOMMAND_HEADER.size + security.OVERHEAD_BYTES + CRC_BYTES
 """Number of bytes that a telecommand frame adds to its packet."""
 _LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))
 
@@ -70,7 +49,7 @@ def make_keys(folder: Path) -> list[Path]:
 
     Raises UsageError if the folder exists or cannot be written.
     """
-    keys = {spi: new_key() for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
+    keys = {spi: security.new_key() for spi in (*security.COMMAND_SPIS, *security.TELEMETRY_SPIS)}
     try:
         folder.mkdir(mode=0o700, parents=True)
     except FileExistsError as error:
@@ -80,9 +59,9 @@ def make_keys(folder: Path) -> list[Path]:
     ends = [folder / end for end in ("satellite", "ground")]
     for end in ends:
         end.mkdir(mode=0o700)
-        vault = Vault(end)
+        vault = security.Vault(end)
         for spi, key in keys.items():
-            if vault.write(Association(spi, 1, 0, key)) != len(COPIES):
+            if vault.write(security.Association(spi, 1, 0, key)) != len(security.COPIES):
                 raise UsageError(f"{end}: keys cannot be written")
     return ends
 
@@ -146,24 +125,28 @@ class Terminal:
     """
 
     def __init__(
-        self, line: GroundLine, vault: Vault, settings: TerminalSettings, codes: LinkCodes | None = None
+        self,
+        line: GroundLine,
+        vault: security.Vault,
+        settings: TerminalSettings,
+        codes: LinkCodes | None = None,
     ) -> None:
         """Create a terminal from an open line, the keys of the ground, and the coding of the frames."""
         self._line = line
         self._vault = vault
         self._settings = settings
         self._sequence = 0
-        self._sealers: dict[int, Sealer] = {}
-        self._channels: dict[int, PacketAssembler] = {}
+        self._sealers: dict[int, security.Sealer] = {}
+        self._channels: dict[int, frames.PacketAssembler] = {}
         self._expected: dict[int, int] = {}  # next counter of each SPI
         self._codes = codes or settings.codes()
         self.lost_frames = self.idle_frames = 0
         self.packet_bytes = settings.command_frame_bytes - FRAME_OVERHEAD_BYTES
-        self.gate = Gate(
+        self.gate = security.Gate(
             vault,
-            TELEMETRY_SPIS,
+            security.TELEMETRY_SPIS,
             self._parse,
-            TELEMETRY_MASK,
+            frames.TELEMETRY_MASK,
             _ANY_AHEAD,
             _STORE_EVERY,
             encrypted=settings.encrypted,
@@ -175,14 +158,14 @@ class Terminal:
 
     def send(self, packet: bytes, spi: int = 1) -> int:
         """Send a command packet and return the counter of its frame. Raises FlightError."""
-        sealer = self._sealers.setdefault(spi, Sealer(self._vault, spi, TELECOMMAND_MASK))
+        sealer = self._sealers.setdefault(spi, security.Sealer(self._vault, spi, frames.TELECOMMAND_MASK))
         return self.send_by(sealer, packet)
 
-    def sealer(self, spi: int, block: int) -> Sealer:
+    def sealer(self, spi: int, block: int) -> security.Sealer:
         """Return the sender of authenticated frames for `send_by`; it reserves `block` counters at once."""
-        return Sealer(self._vault, spi, TELECOMMAND_MASK, block, shared=True)
+        return security.Sealer(self._vault, spi, frames.TELECOMMAND_MASK, block, shared=True)
 
-    def send_by(self, sealer: Sealer, packet: bytes) -> int:
+    def send_by(self, sealer: security.Sealer, packet: bytes) -> int:
         """Send a packet in a frame authenticated by `sealer`, and return the counter of the frame.
 
         A packet that is too long for a frame is sent in portions; the counter is that of the last portion.
@@ -191,11 +174,11 @@ class Terminal:
         if len(packet) > self.packet_bytes:
             return [self.send_by(sealer, portion) for portion in portions(packet, utc_ns())][-1]
         length = FRAME_OVERHEAD_BYTES + len(packet)
-        header = TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
+        header = frames.TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
         with _turn_to_send(self._vault.folder):
             body, counter = sealer.seal(header.pack(length), packet)
             self._sequence += 1
-            self._line.send(close_frame(body))
+            self._line.send(frames.close_frame(body))
         return counter
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
@@ -208,19 +191,19 @@ class Terminal:
     def take(self) -> Iterator[tuple[int, bytes]]:
         """Yield virtual channel and packet of the telemetry received since the last call."""
         for frame in self._line.receive():
-            if is_idle(frame):
+            if frames.is_idle(frame):
                 self.idle_frames += 1
                 continue
             try:
                 admitted = self.gate.admit(frame)
-            except RefusedError:  # counted by the gate
+            except security.RefusedError:  # counted by the gate
                 continue
             # The counters of a new key begin at 0.
             expected = self._expected.get(admitted.spi, admitted.counter)
             self.lost_frames += max(admitted.counter - expected, 0)
             self._expected[admitted.spi] = admitted.counter + 1
             channel = admitted.header[1] >> 1 & 7
-            assembler = self._channels.setdefault(channel, PacketAssembler())
+            assembler = self._channels.setdefault(channel, frames.PacketAssembler())
             for packet in assembler.add(admitted.header, admitted.data, self.lost_frames):
                 if channel == LIVE and packet[:2] == _LINK:
                     self._pass_by(packet)
@@ -264,13 +247,15 @@ class Terminal:
         The stored counters are behind if the folder of keys is an older copy.
         """
         (row,) = LAYOUTS[LINK.name].array(packet)
-        for spi, highest, generation in zip(COMMAND_SPIS, row["highest"], row["generation"], strict=False):
+        for spi, highest, generation in zip(
+            security.COMMAND_SPIS, row["highest"], row["generation"], strict=False
+        ):
             own = self._vault.read(spi)
             if own is not None and own.generation == generation and own.unused <= highest:
                 self._vault.advance(replace(own, unused=int(highest) + 1))
 
     def _parse(self, frame: bytes) -> tuple[bytes, bytes]:
-        header, protected, _ = open_telemetry(frame, self._settings.spacecraft)
+        header, protected, _ = frames.open_telemetry(frame, self._settings.spacecraft)
         return header, protected
 
 
@@ -361,7 +346,7 @@ def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = 
     Raises UsageError for an invalid address or key folder, and FlightError if the line cannot be opened.
     """
     settings = settings or TerminalSettings()
-    vault, codes = Vault(keys), settings.codes()
+    vault, codes = security.Vault(keys), settings.codes()
     kiss = address.startswith("kiss:")
     framing, place = codes.on_ground(kiss), address.removeprefix("kiss:")
     line: GroundLine

@@ -23,16 +23,7 @@ from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import SHED
 from flight.link.telemetry.packets import PacketArray
-from ground.report import panels
-from ground.report.orbit import (
-    AttitudeErrors,
-    attitude_errors,
-    body_speeds,
-    detumbling_periods,
-    magnetometer_rates,
-    object_tracks,
-    pointing_errors,
-)
+from ground.report import orbit, panels
 from ground.report.panels import RunSignals
 from ground.report.signals import PowerHistory, seconds, true_quaternions
 from ground.telemetry import Run, text_of
@@ -317,8 +308,8 @@ def spin_figure(signals: RunSignals) -> Figure | None:
 
 def _detumbling_rate(ax: Axes, run: Run) -> None:
     """Draw the true rate or gyro rate, and the rate from the magnetometer with its uncertainty."""
-    time, speed, source = body_speeds(run)
-    spin = magnetometer_rates(run)
+    time, speed, source = orbit.body_speeds(run)
+    spin = orbit.magnetometer_rates(run)
     if len(spin):
         at, found = seconds(spin), np.degrees(np.linalg.norm(spin["rate"].astype(float), axis=1))
         sigma = np.degrees(spin["rate_sigma"].astype(float))
@@ -327,7 +318,7 @@ def _detumbling_rate(ax: Axes, run: Run) -> None:
         ax.semilogy(at, found, ".", color=panels.ORANGE, markersize=5, label="from the magnetometer alone")
     label = "gyro" if source == "imu" else source
     ax.semilogy(time, np.degrees(speed), color=panels.BLUE, linewidth=1.2, label=label, zorder=3)
-    periods = detumbling_periods(run, float(time[-1]) if len(time) else 0.0)
+    periods = orbit.detumbling_periods(run, float(time[-1]) if len(time) else 0.0)
     for k, (begin, stop, _) in enumerate(periods):
         label = "" if k else "detumbling"
         ax.axvspan(begin, stop, color=panels.GREY, alpha=0.12, linewidth=0, label=label)
@@ -345,7 +336,7 @@ def knowledge_figure(signals: RunSignals) -> Figure | None:
 
     Returns None for a run without navigation packets or without a truth log.
     """
-    found, packets = attitude_errors(signals.run), signals.run["navigation"]
+    found, packets = orbit.attitude_errors(signals.run), signals.run["navigation"]
     if not (len(found.times) and len(packets)):
         return None
     figure = Figure(figsize=(10.9, 9.4), layout="constrained")
@@ -372,7 +363,7 @@ def pointing_figure(signals: RunSignals) -> Figure | None:
     power panel is omitted for a run without power data.
     """
     run = signals.run
-    found = pointing_errors(run)
+    found = orbit.pointing_errors(run)
     if not len(found.times):
         return None
     spent = signals.power
@@ -400,7 +391,7 @@ def pointing_figure(signals: RunSignals) -> Figure | None:
     return figure
 
 
-def _pointing_error(ax: Axes, found: AttitudeErrors) -> None:
+def _pointing_error(ax: Axes, found: orbit.AttitudeErrors) -> None:
     panels.vectors(ax, found.times, np.degrees(found.error))
     sigma = 3.0 * np.degrees(found.sigma.max(axis=1))
     for sign, label in ((1.0, "3 sigma of the attitude"), (-1.0, None)):
@@ -538,7 +529,7 @@ def battery_figure(signals: RunSignals) -> Figure | None:
 
 def objects_figure(signals: RunSignals) -> Figure | None:
     """Return the figure of the tracked objects' paths, rates and brightness, or None without objects."""
-    tracks = object_tracks(signals.run)
+    tracks = orbit.object_tracks(signals.run)
     if not tracks:
         return None
     figure = Figure(figsize=(11.0, 7.6), layout="constrained")

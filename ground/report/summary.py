@@ -21,21 +21,8 @@ from flight.schema import reader
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.identification.orbit import learned_lens
+from ground.report import signals
 from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements, star_camera
-from ground.report.signals import (
-    PowerHistory,
-    ThreadMotion,
-    bus_power,
-    coil_power,
-    estimate_errors,
-    estimated_attitude,
-    failed_frames,
-    last_time,
-    seconds,
-    star_attitudes,
-    streaks,
-    true_attitude,
-)
 from ground.report.steps import against_thesis, judged_steps, step_row
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
@@ -46,12 +33,12 @@ Object = dict[str, Any]
 @np.errstate(all="ignore")  # packets may contain any numbers; results that are not finite become None
 def summarise(run: Run) -> Object:
     """Return all values of the report, which contains only None, bool, int, float, str, list and dict."""
-    attitude = true_attitude(run) or estimated_attitude(run)
+    attitude = signals.true_attitude(run) or signals.estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
     in_orbit = len(run["spin"]) > 0
     steps = [] if in_orbit else judged_steps(run, attitude, identity["duration_planned_s"], notes)
-    power = coil_power(run)
+    power = signals.coil_power(run)
     powers = _power(run, power, notes)
     detumbled, known = detumbling(run), knowledge(run)
     config = _orbit_config(run, notes) if in_orbit else None
@@ -71,12 +58,12 @@ def summarise(run: Run) -> Object:
         "cycles": _cycles(run["cycle_timing"], run["control"]),
         "jobs": _jobs(run["job_timing"]),
         "planner": _planner(run["plan"]),
-        "estimate": estimate_errors(run),
-        "streaks": streaks(run),
-        "stars": star_attitudes(run),
+        "estimate": signals.estimate_errors(run),
+        "streaks": signals.streaks(run),
+        "stars": signals.star_attitudes(run),
         "star_camera": seen,
         "lens": learned_lens(run),
-        "failed_frames": failed_frames(run),
+        "failed_frames": signals.failed_frames(run),
         "objects": objects(run),
         "modes": _modes(run["mode"]),
         "health": _health(run["health"]),
@@ -115,8 +102,8 @@ def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
     return None
 
 
-def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
-    identity: Object = {"folder": str(run.folder), "duration_s": last_time(run), "cut_short": False}
+def _identity(run: Run, attitude: signals.ThreadMotion, notes: list[str]) -> Object:
+    identity: Object = {"folder": str(run.folder), "duration_s": signals.last_time(run), "cut_short": False}
     if attitude.source == "estimate":
         notes.append("no truth log: judged on the estimate")
     if not len(run["run"]):
@@ -143,9 +130,9 @@ def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
     }
 
 
-def _power(run: Run, power: PowerHistory | None, notes: list[str]) -> Object:
+def _power(run: Run, power: signals.PowerHistory | None, notes: list[str]) -> Object:
     written, actual = np.abs(run["control"]["current_written"]), np.abs(run["truth"]["current"])
-    measured = bus_power(run)[1]
+    measured = signals.bus_power(run)[1]
     sums = ("supply_average_w", "supply_peak_w", "supply_j", "heat_average_w", "heat_j")
     found: Object = {
         "bus_average_w": float(measured.mean()) if len(measured) else math.nan,
@@ -234,7 +221,7 @@ def _modes(packets: PacketArray) -> list[Object]:
             "trigger": text_of(row["trigger"]),
             "reason": text_of(row["reason"]),
         }
-        for row, time in zip(packets, seconds(packets), strict=True)
+        for row, time in zip(packets, signals.seconds(packets), strict=True)
     ]
 
 
@@ -272,7 +259,7 @@ def _events(packets: PacketArray) -> list[Object]:
     The value `count` includes the events whose packets were suppressed by throttling.
     """
     found: dict[str, Object] = {}
-    for row, time in zip(packets, seconds(packets), strict=True):
+    for row, time in zip(packets, signals.seconds(packets), strict=True):
         name, text = text_of(row["name"]), text_of(row["text"])
         first = {"name": name, "count": 0, "severity": int(row["severity"]), "first_s": float(time)}
         found.setdefault(name, {**first, "text": text})["count"] += 1 + int(row["suppressed"])
@@ -281,7 +268,7 @@ def _events(packets: PacketArray) -> list[Object]:
 
 def _battery(run: Run) -> Object:
     """Return state of charge, energies and load shedding; true values are NaN without a truth log."""
-    packets, true, times = run["power"], run["true_power"], seconds(run["power"])
+    packets, true, times = run["power"], run["true_power"], signals.seconds(run["power"])
     charge = packets["charge"].astype(float)
     known = charge[np.isfinite(charge)]
     steps = np.append(np.diff(times), 0.0)
@@ -296,7 +283,7 @@ def _battery(run: Run) -> Object:
     names = ("charge_error_rms", "true_charge_lowest", "true_charge_last", "solar_j", "loads_j", "coils_j")
     found |= dict.fromkeys(names, math.nan)
     if len(true):
-        at = np.interp(times, seconds(true), true["charge"].astype(float))
+        at = np.interp(times, signals.seconds(true), true["charge"].astype(float))
         errors = (charge - at)[np.isfinite(charge)]
         rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
         # The true powers (W) are recorded once a second, so their sum is the energy (J).
@@ -311,7 +298,7 @@ _OF_COILS = {events.COIL_BROKEN.name, events.COIL_CORRECTED.name, events.COIL_TR
 
 def _coils(packets: PacketArray) -> list[Object]:
     """Return time, name and text of the events by which a coil is isolated, corrected or used again."""
-    rows = ((float(time), row) for row, time in zip(packets, seconds(packets), strict=True))
+    rows = ((float(time), row) for row, time in zip(packets, signals.seconds(packets), strict=True))
     named = ((time, text_of(row["name"]), text_of(row["text"])) for time, row in rows)
     return [{"time_s": time, "name": name, "text": text} for time, name, text in named if name in _OF_COILS]
 
