@@ -201,13 +201,9 @@ class OrbitPrediction:
         top = 1 + int(np.argmax(elevations[1:-1]))
         sun = -earth_from_sun(float(terrestrial_time(julian_date(own[top]))))[0]
         position = np.asarray(self._satellite.at(self._scale.from_datetime(own[top])).position.m, dtype=float)
-        up = np.array(
-            [
-                math.cos(math.radians(station.latitude_deg)) * math.cos(math.radians(station.longitude_deg)),
-                math.cos(math.radians(station.latitude_deg)) * math.sin(math.radians(station.longitude_deg)),
-                math.sin(math.radians(station.latitude_deg)),
-            ]
-        )
+        north, east = math.radians(station.latitude_deg), math.radians(station.longitude_deg)
+        level = math.cos(north)
+        up = np.array([level * math.cos(east), level * math.sin(east), math.sin(north)])
         towards = celestial_to_terrestrial(julian_date(own[top])) @ (sun / np.linalg.norm(sun))
         return Pass(
             station,

@@ -286,29 +286,17 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
         )
     second = meller.scan_horizon(other, camera, lines)
     if options.method == "graphic":
-        return _PaperNadir(_graphic(options.turned, camera, seen, second, altitude), seen)
+        # The axes of both cameras are level (Graphic Method, `graphic_nadir`).
+        angle, axis = math.radians(options.turned), camera.ideal.centre
+        towards = (np.array([0.0, 1.0]), np.array([-math.sin(angle), math.cos(angle)]))
+        first, other_camera = (meller.LevelCamera(one, axis) for one in towards)
+        x, y, z = meller.graphic_nadir((first, other_camera), (seen.circle, second.circle), altitude)
+        return _PaperNadir(np.array([y, z, x]), seen)
     if options.nadir is None:
         before = meller.circle_nadir(second.circle, camera, altitude)
     else:
         before = np.array(options.nadir) / np.linalg.norm(options.nadir)
     return _PaperNadir(meller.propagated_nadir(before, second.middle, seen.middle), seen)
-
-
-def _graphic(
-    turned: float,
-    camera: CameraModel,
-    first: meller.ScannedHorizon,
-    second: meller.ScannedHorizon,
-    altitude: float,
-) -> FloatArray:
-    """Return nadir (3,) in axes of the first of two cameras (Graphic Method, `graphic_nadir`)."""
-    angle, axis = math.radians(turned), camera.ideal.centre
-    cameras = (
-        meller.LevelCamera(np.array([0.0, 1.0]), axis),
-        meller.LevelCamera(np.array([-math.sin(angle), math.cos(angle)]), axis),
-    )
-    x, y, z = meller.graphic_nadir(cameras, (first.circle, second.circle), altitude)
-    return np.array([y, z, x])
 
 
 def _paper_facts(method: str, found: _PaperNadir | None, reason: str) -> dict[str, Any]:

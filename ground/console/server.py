@@ -21,18 +21,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from aiohttp import WSMsgType, web
 
 from flight.link.commands import Point, words_of
 from flight.link.process.directives import KINDS
 from flight.link.telemetry.definitions import CONTROL, LINK, NAVIGATION, SPIN, TRANSFER, VERIFICATION
-from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
+from flight.link.telemetry.packets import LAYOUTS, TelemetryError
 from ground.console.commanding import CommandForms, Files
 from ground.console.history import MAX_TIME, History, PageCursor, PageState
 from ground.console.surroundings import FlightSurroundings, FrameFolder
 from ground.documentation import Body, add_components, database, endings
+from ground.watch import PacketSource
 from knightcube.errors import FlightError, UsageError
 
 PAGE = Path(__file__).parent / "page"
@@ -65,17 +66,6 @@ _HEADERS = {
 }
 
 
-class PacketFeed(Protocol):
-    """Source of packets: `ground.watch.LogTail` or `ground.console.commanding.LinkFeed`."""
-
-    @property
-    def silence(self) -> float:
-        """Time (s) since the last new packets."""
-
-    def new(self) -> dict[str, PacketArray]:
-        """Return the new packets by name since the last call. Raises FlightError."""
-
-
 @dataclass(slots=True)
 class Console:
     """One flight on the page.
@@ -97,7 +87,7 @@ class Console:
     """
 
     name: str
-    feed: PacketFeed
+    feed: PacketSource
     history: History
     surroundings: FlightSurroundings
     forms: CommandForms
@@ -316,9 +306,8 @@ class _Pages:
         span = (int(_real(request, "from") * 1e9), int(_real(request, "to") * 1e9))
         points = _whole(request, "points", 1000)
         points = min(max(points, 2), _MAX_POINTS) if points else _MOST_EXPORTED
-        times, values = await asyncio.to_thread(
-            self._console.history.series, name, column, component, span, points
-        )
+        series = self._console.history.series
+        times, values = await asyncio.to_thread(series, name, column, component, span, points)
         finite = [value if abs(value) < float("inf") else None for value in values.tolist()]
         return web.json_response({"times": times.tolist(), "values": finite})
 
@@ -330,9 +319,8 @@ class _Pages:
 
     async def frame(self, request: web.Request) -> web.StreamResponse:
         """Answer the query ?sequence= with the results of this frame, or null if the frame was not kept."""
-        sequence = _whole(request, "sequence", 0)
-        facts = await self._drawn(self._console.frames.facts, sequence)
-        return web.json_response(facts)
+        found = await self._drawn(self._console.frames.facts, _whole(request, "sequence", 0))
+        return web.json_response(found)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Answer the query ?sequence= with the image of the kept frame that has this number."""
@@ -349,11 +337,8 @@ class _Pages:
         stations = request.query.getall("station", [])
         if len(stations) > _MOST_STATIONS:
             raise UsageError(f"{len(stations)} stations: give at most {_MOST_STATIONS}")
-        at, days, lines = (
-            self._utc(_real(request, "at")),
-            _real(request, "days"),
-            self._console.surroundings.lines,
-        )
+        at, days = self._utc(_real(request, "at")), _real(request, "days")
+        lines = self._console.surroundings.lines
         if lines is None or at is None:
             raise UsageError(
                 "the orbit is not known: passes need two-line elements and the time of the flight"
@@ -451,14 +436,10 @@ def _predicted(lines: tuple[str, str], begin: datetime, days: float, stations: l
     prediction = OrbitPrediction(lines, begin, days)
     found = []
     for one in prediction.passes([station_of(text) for text in stations]):
-        schedule = [
-            {
-                "at": f"{at:%Y-%m-%dT%H:%M:%S}",
-                "words": words_of(Point(target)),
-                "text": f"point {target.text}",
-            }
-            for at, target in scheduled_targets(one)
-        ]
+        schedule = []
+        for utc, target in scheduled_targets(one):
+            at, words = f"{utc:%Y-%m-%dT%H:%M:%S}", words_of(Point(target))
+            schedule.append({"at": at, "words": words, "text": f"point {target.text}"})
         found.append({**facts_of(one), "mask_deg": one.station.mask_deg, "schedule": schedule})
     return {"passes": found, "timing_error_s": prediction.timing_error_s}
 
@@ -467,10 +448,10 @@ async def _command_of(request: web.Request) -> tuple[str, dict[str, Any]]:
     try:
         body = await request.json()
         name, given = body["command"], body.get("values", {})
+        if not isinstance(name, str) or not isinstance(given, dict):
+            raise TypeError
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UsageError('a command has the form {"command": NAME, "values": {...}}') from error
-    if not isinstance(name, str) or not isinstance(given, dict):
-        raise UsageError('a command has the form {"command": NAME, "values": {...}}')
     return name, given
 
 

@@ -149,10 +149,8 @@ class FrameFolder:
     def picture(self, sequence: int) -> bytes | None:
         """Return a frame as PNG, binned to the size of the page and stretched, or None if it was not kept."""
         data = self._read(sequence)
-        if data is None:
-            return None
         try:
-            return png(stretched(binned(pixels_of(data))))
+            return None if data is None else png(stretched(binned(pixels_of(data))))
         except ValueError:
             return None
 

@@ -172,15 +172,8 @@ def summarise_archive(archive: Path) -> Object:
 
 
 def _archived(folder: Path) -> Object:
-    row: Object = {
-        "folder": str(folder),
-        "config_name": None,
-        "utc": None,
-        "duration_s": None,
-        "packets": 0,
-        "bad_bytes": 0,
-        "missing_packets": 0,
-    }
+    row: Object = {"folder": str(folder), "config_name": None, "utc": None, "duration_s": None}
+    row |= {"packets": 0, "bad_bytes": 0, "missing_packets": 0}
     try:
         run = read_run(folder)
     except UsageError:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -130,17 +131,9 @@ def legend(ax: Axes) -> None:
     """Put the legend above the axes, to the right of the title."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
-        ax.legend(
-            handles,
-            labels,
-            ncols=len(handles),
-            loc="lower right",
-            bbox_to_anchor=(1.0, 0.98),
-            fontsize=9,
-            frameon=False,
-            borderaxespad=0.2,
-            columnspacing=1.4,
-        )
+        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "frameon": False}
+        gaps: dict[str, Any] = {"borderaxespad": 0.2, "columnspacing": 1.4}
+        ax.legend(handles, labels, ncols=len(handles), fontsize=9, **place, **gaps)
 
 
 def level(ax: Axes, value: float, label: str, colour: str = VERMILLION) -> None:
@@ -158,17 +151,9 @@ def attitude(ax: Axes, signals: RunSignals) -> None:
     """Draw q2 of the target, the estimate and the truth (Sease 2013, Figure 5.9)."""
     targets = signals.run["target"]
     if len(targets):
-        times, values = seconds(targets), targets["q2"].astype(float)
-        ax.step(
-            np.append(times, signals.end),
-            np.append(values, values[-1]),
-            where="post",
-            color=VERMILLION,
-            linewidth=1.4,
-            linestyle=DASHED,
-            label="target",
-            zorder=3,
-        )
+        times, values = np.append(seconds(targets), signals.end), targets["q2"].astype(float)
+        look: dict[str, Any] = {"color": VERMILLION, "linewidth": 1.4, "linestyle": DASHED, "zorder": 3}
+        ax.step(times, np.append(values, values[-1]), where="post", label="target", **look)
     if len(signals.estimate.time):
         ax.plot(signals.estimate.time, signals.estimate.q2, color=SKY, linewidth=2.6, label="estimated")
     if signals.truth is not None:
@@ -183,9 +168,8 @@ def current(ax: Axes, signals: RunSignals) -> None:
     time, written = seconds(control), control["current_written"]
     for values, (name, colour) in zip(written.T, AXIS_COLOURS.items(), strict=True):
         if np.any(values):
-            ax.step(
-                time, values.astype(float), where="post", color=colour, linewidth=0.8, label=f"coil {name}"
-            )
+            amperes = values.astype(float)
+            ax.step(time, amperes, where="post", color=colour, linewidth=0.8, label=f"coil {name}")
     level(ax, -signals.current_limit, "")
     level(ax, signals.current_limit, f"limit, {signals.current_limit:g} A")
     style(ax, "current, A", "Torque coil current")
@@ -232,14 +216,8 @@ def paths(ax: Axes, signals: RunSignals, start: float, stop: float, target: floa
     flown = signals.flown
     inside = (flown.time >= start) & (flown.time <= stop)
     source = "true" if flown.source == "truth" else "estimated"
-    ax.plot(
-        flown.time[inside] - start,
-        flown.q2[inside],
-        color=BLACK,
-        linewidth=3.2,
-        alpha=0.3,
-        label=f"flown ({source})",
-    )
+    times, label = flown.time[inside] - start, f"flown ({source})"
+    ax.plot(times, flown.q2[inside], color=BLACK, linewidth=3.2, alpha=0.3, label=label)
     plans = signals.run["plan"]
     origin = plans["origin_ns"] / 1e9
     drawable = (plans["accepted"] == 1) & (plans["nodes"] >= 2) & (plans["nodes"] <= MAX_NODES)
@@ -293,17 +271,8 @@ def rate_error(ax: Axes, signals: RunSignals) -> None:
 
 def _error_bars(ax: Axes, time: FloatArray, rate: FloatArray, sigma: FloatArray, label: str) -> None:
     if len(time):
-        ax.errorbar(
-            time,
-            1e3 * rate,
-            1e3 * sigma,
-            fmt="o",
-            markersize=3.5,
-            color=ORANGE,
-            elinewidth=1.0,
-            label=label,
-            zorder=4,
-        )
+        look: dict[str, Any] = {"fmt": "o", "markersize": 3.5, "color": ORANGE, "elinewidth": 1.0}
+        ax.errorbar(time, 1e3 * rate, 1e3 * sigma, label=label, zorder=4, **look)
 
 
 def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
