@@ -107,10 +107,6 @@ _MAKERS: dict[str, Callable[[str, np.random.Generator], SamplePicture]] = {
 }
 
 
-def _camera() -> star_camera.StarCameraModel:
-    return star_camera.StarCameraModel(columns=PIXELS, rows=PIXELS, field_of_view=math.radians(FIELD_DEG))
-
-
 def _sky(
     name: str,
     generator: np.random.Generator,
@@ -122,16 +118,10 @@ def _sky(
     """Return the sky with `attitude` (4,) at mid-exposure and a rate (3,), rad/s."""
     times = np.linspace(0.0, exposure, 41)
     turns = from_rotation_vector((times[:, None] - 0.5 * exposure) * rate)
-    stars, model = load(), _camera()
-    pixels = star_camera.render(
-        model,
-        stars.directions_at(YEAR),
-        stars.magnitude,
-        times,
-        multiply(turns, attitude),
-        generator,
-        extra or [],
-    )
+    stars, attitudes = load(), multiply(turns, attitude)
+    model = star_camera.StarCameraModel(columns=PIXELS, rows=PIXELS, field_of_view=math.radians(FIELD_DEG))
+    sky = stars.directions_at(YEAR), stars.magnitude
+    pixels = star_camera.render(model, *sky, times, attitudes, generator, extra or [])
     truth = sky_truth(rate, exposure, attitude, model.pinhole.focal_length)
     return SamplePicture(name, pixels, truth, f"solve {{}} --fov {FIELD_DEG:g}")
 

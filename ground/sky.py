@@ -162,10 +162,7 @@ def bodies_in(sky: SkyMap, julian_date: float) -> list[SkyBody]:
 def directions_of_bodies(julian_date: float) -> dict[str, FloatArray]:
     """Return the unit vectors (3,), ICRS, from the Earth's centre to each body, corrected for light time."""
     earth = earth_from_sun(julian_date)[0] / ASTRONOMICAL_UNIT
-    found = {
-        "Sun": -earth,
-        "Moon": np.asarray(erfa.moon98(julian_date, 0.0)["p"], dtype=float),
-    }
+    found = {"Sun": -earth, "Moon": np.asarray(erfa.moon98(julian_date, 0.0)["p"], dtype=float)}
     for name, number in PLANETS.items():
         away = np.zeros(3)
         for _ in range(3):

@@ -293,11 +293,7 @@ def attitude_text(state: FlightState) -> str:
 
 
 _BAR = 20  # width (characters) of the bar that shows a coil current
-_MODE_COLOURS = {
-    "safe": "bold white on red",
-    "boot": "bold black on yellow",
-    "detumble": "bold black on yellow",
-}
+_MODE_COLOURS = {"safe": "bold white on red"} | dict.fromkeys(("boot", "detumble"), "bold black on yellow")
 _STREAM_COLOURS = {"good": "green", "no-reading-yet": "dim"}
 """Colours of the stream states that are not alarms."""
 _SEVERITY_COLOURS = ("dim", "yellow", "bold red")

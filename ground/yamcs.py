@@ -360,14 +360,8 @@ def main() -> None:
     size = DEFAULTS.command_frame_bytes
     parser.add_argument("--command-frame-bytes", type=int, default=size, metavar="N", help=text)
     options = parser.parse_args()
-    write(
-        options.folder,
-        options.gateway,
-        options.http,
-        options.epoch,
-        options.keys,
-        options.command_frame_bytes,
-    )
+    frame_bytes = options.command_frame_bytes
+    write(options.folder, options.gateway, options.http, options.epoch, options.keys, frame_bytes)
     sys.stdout.write(f"Yamcs asks for user and password: {USER}, and the one in {options.folder / USERS}\n")
 
 
@@ -425,11 +419,8 @@ def stacks_and_displays(body: Body | None = None) -> Mapping[str, str]:
     found: dict[str, str] = {}
     advancement = {"acknowledgment": "CommandComplete", "wait": 0}
     for name, steps in procedures_of(body).items():
-        stack = {
-            "$schema": f"{_SCHEMA}/command-stack.schema.json",
-            "steps": steps,
-            "advancement": advancement,
-        }
+        schema = f"{_SCHEMA}/command-stack.schema.json"
+        stack = {"$schema": schema, "steps": steps, "advancement": advancement}
         found[f"{STACKS}/{name}.ycs"] = json.dumps(stack, indent=2) + "\n"
     shown = [f"/{SPACE}/{name}" for name, _ in spread(LAYOUTS["health"]) if not name.endswith(UNUSED)]
     display = {"$schema": f"{_SCHEMA}/parameter-table.schema.json", "scroll": False, "parameters": shown}

@@ -139,13 +139,9 @@ def step_coils(session: Session) -> Outcome:
     given = session.coil_field
     expected = given if given is not None else np.array([coil.direction() for coil in section.windings])
     magnetometer = axes.get("magnetometer")
-    found = diagnosis.diagnose_coils(
-        test,
-        expected,
-        COIL_NAMES[: len(section.windings)],
-        None if magnetometer is None else np.array(magnetometer),
-        size_known=given is not None,
-    )
+    sensor = None if magnetometer is None else np.array(magnetometer)
+    names = COIL_NAMES[: len(section.windings)]
+    found = diagnosis.diagnose_coils(test, expected, names, sensor, size_known=given is not None)
     axes_findings = session.known.get("axes", Outcome()).findings
     if any(one.part == "inertial_unit.magnetometer" and one.kind == "wrong scale" for one in axes_findings):
         found.findings[:] = [one for one in found.findings if one.kind != "wrong strength"]

@@ -142,12 +142,8 @@ def _case(
         except FlightError as error:
             refusal = str(error)
             continue
-        parameters = {
-            "config": text,
-            "drawn": drawn,
-            "duration": duration,
-            "seed": int(chance.integers(2**31)),
-        }
+        parameters = {"config": text, "drawn": drawn, "duration": duration}
+        parameters["seed"] = int(chance.integers(2**31))
         return Case(f"flight-{seed[1]:05d}", seed, parameters)
     raise UsageError(f"{_DRAWS} draws in a row were refused, the last draw because {refusal}: vary less")
 
@@ -212,14 +208,8 @@ def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) 
 def fly_case(case: Case) -> Result:
     """Fly a case in lock-step, and return its random parameters and its limited performance measures."""
     given = case.parameters
-    found: Result = {
-        "key": case.key,
-        "drawn": given["drawn"],
-        "judged": [],
-        "error": "",
-        "seed": given["seed"],
-        "duration": given["duration"],
-    }
+    kept = {name: given[name] for name in ("drawn", "seed", "duration")}
+    found: Result = {"key": case.key, "judged": [], "error": "", **kept}
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         config = Path(place) / f"{case.key}.yaml"
         config.write_text(given["config"], encoding="utf-8")

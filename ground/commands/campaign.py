@@ -60,16 +60,8 @@ def run(options: argparse.Namespace) -> int:
     )
     out = options.out or Path("runs") / "campaigns" / options.config.stem
     try:
-        found = fly(
-            campaign,
-            options.runs,
-            options.seed,
-            out,
-            options.workers,
-            options.dask,
-            progress=True,
-            only=options.only,
-        )
+        where = {"workers": options.workers, "dask": options.dask, "only": options.only}
+        found = fly(campaign, options.runs, options.seed, out, progress=True, **where)
     except KeyboardInterrupt:
         sys.stderr.write(f"\ninterrupted; run the same command again to continue in {out}\n")
         return 130

@@ -44,14 +44,8 @@ from ground.identification.record import Record, read_record
 from ground.telemetry import read_run
 from knightcube.errors import UsageError
 
-_ABSOLUTE_UNITS = {
-    "inertia": "kg m^2",
-    "dipole": "m^2",
-    "field": "T",
-    "torque_constant": "N m/A",
-    "stiffness": "N m/rad",
-    "damping": "N m s/rad",
-}
+_ABSOLUTE_UNITS = {"inertia": "kg m^2", "dipole": "m^2", "field": "T"}
+_ABSOLUTE_UNITS |= {"torque_constant": "N m/A", "stiffness": "N m/rad", "damping": "N m s/rad"}
 
 _TITLES = {
     "inertia": "inertia",

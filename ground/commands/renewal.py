@@ -32,18 +32,8 @@ from knightcube.errors import FlightError, UsageError
 
 ENDLESS = datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)
 """Expiry date of metadata that never expire, so that a wrong clock on board does not matter."""
-PARTS = (
-    "knightcube",
-    "flight",
-    "hal",
-    "sim_hal",
-    "deploy",
-    "config",
-    "pyproject.toml",
-    "README.md",
-    "LICENSE",
-    "wheels",
-)
+_FOLDERS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config")
+PARTS = (*_FOLDERS, "pyproject.toml", "README.md", "LICENSE", "wheels")
 """Source files and folders that a release contains."""
 _SIGNED_BY_ONE = ("targets", "snapshot", "timestamp")
 _TIMEOUT_S, _BUILD_TIMEOUT_S = 60.0, 1800.0

@@ -354,16 +354,8 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     forms = CommandForms(by_socket(to) if to else None)
     place = FlightSurroundings.of(folder / "config.yaml")
     frames = FrameFolder(options.frames or folder / images.KEPT_FRAMES_FOLDER)
-    return Console(
-        folder.name,
-        LogTail(folder),
-        history,
-        place,
-        forms,
-        frames=frames,
-        files=RunFiles(folder),
-        stations=stations,
-    )
+    name, tail, listed = folder.name, LogTail(folder), RunFiles(folder)
+    return Console(name, tail, history, place, forms, frames=frames, files=listed, stations=stations)
 
 
 def _stations(options: argparse.Namespace) -> tuple[str, ...]:

@@ -255,14 +255,8 @@ class FileSession:
         self._units = units.UnitPacker(units.UP)
         self._wanted = {LISTING}
         self.received = store.received
-        self.entity = Entity(
-            GROUND,
-            store,
-            self._may_come,
-            LONGEST_FILE,
-            now_ns,
-            terminal.packet_bytes - units.UNIT_OVERHEAD_BYTES,
-        )
+        unit_bytes = terminal.packet_bytes - units.UNIT_OVERHEAD_BYTES
+        self.entity = Entity(GROUND, store, self._may_come, LONGEST_FILE, now_ns, unit_bytes)
         self.received_ns = now_ns
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None

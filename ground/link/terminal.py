@@ -80,21 +80,13 @@ class TerminalSettings:
     @classmethod
     def of(cls, link: Link) -> TerminalSettings:
         """Return the settings of the section `link`."""
-        return cls(
-            link.spacecraft,
-            link.frame_bytes,
-            link.command_frame_bytes,
-            link.encrypt_telemetry,
-            link.coding,
-            link.call_signs,
-        )
+        sizes = link.frame_bytes, link.command_frame_bytes
+        return cls(link.spacecraft, *sizes, link.encrypt_telemetry, link.coding, link.call_signs)
 
     def codes(self) -> LinkCodes:
         """Return the codes of the link, with error counters at zero."""
-        coding = self.coding
-        return LinkCodes(
-            self.frame_bytes, coding.randomiser, coding.reed_solomon, coding.cltu, self.call_signs
-        )
+        codes = self.coding.randomiser, self.coding.reed_solomon, self.coding.cltu
+        return LinkCodes(self.frame_bytes, *codes, self.call_signs)
 
 
 class GroundLine(Protocol):
@@ -142,14 +134,9 @@ class Terminal:
         self._codes = codes or settings.codes()
         self.lost_frames = self.idle_frames = 0
         self.packet_bytes = settings.command_frame_bytes - FRAME_OVERHEAD_BYTES
+        spis, mask, encrypted = security.TELEMETRY_SPIS, frames.TELEMETRY_MASK, settings.encrypted
         self.gate = security.Gate(
-            vault,
-            security.TELEMETRY_SPIS,
-            self._parse,
-            frames.TELEMETRY_MASK,
-            _ANY_AHEAD,
-            _STORE_EVERY,
-            encrypted=settings.encrypted,
+            vault, spis, self._parse, mask, _ANY_AHEAD, _STORE_EVERY, encrypted=encrypted
         )
 
     def fileno(self) -> int:

@@ -20,17 +20,8 @@ if TYPE_CHECKING:
     from knightcube.gnc.guidance.slew_plan import OrderedSlew, SlewOrder
     from knightcube.gnc.guidance.vmc import StepPlan
 
-__all__ = [
-    "draw",
-    "draw_both",
-    "draw_day",
-    "draw_fit",
-    "draw_path",
-    "draw_slew",
-    "drawing",
-    "format_report",
-    "summarise",
-]
+__all__ = ["draw", "draw_both", "draw_day", "draw_fit", "draw_path", "draw_slew", "drawing"]
+__all__ += ["format_report", "summarise"]
 
 
 def draw(run: Run, folder: Path) -> list[Path]:

@@ -184,13 +184,8 @@ def _archived(folder: Path) -> Object:
         row |= {"config_name": text_of(first["config_name"]), "utc": _label(int(run["run"]["utc_ns"][-1]))}
     if len(run["control"]):
         row["duration_s"] = float(run["control"]["time_ns"][-1]) * 1e-9
-    return {
-        **row,
-        "packets": sum(log.counts.values()),
-        "bad_bytes": log.skipped_bytes + log.truncated_bytes,
-        "missing_packets": sum(log.missing.values()),
-        "end": _end(run),
-    }
+    row |= {"packets": sum(log.counts.values()), "bad_bytes": log.skipped_bytes + log.truncated_bytes}
+    return row | {"missing_packets": sum(log.missing.values()), "end": _end(run)}
 
 
 def _end(run: Run) -> str:

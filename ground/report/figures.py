@@ -782,15 +782,8 @@ def _supply_current(ax: Axes, outcome: Outcome) -> None:
     places = np.arange(len(commanded))
     for way, (label, colour) in enumerate((("positive", panels.BLUE), ("negative", panels.SKY))):
         ax.bar(places + 0.3 * (way - 0.5), np.nan_to_num(current[:, way]), 0.28, color=colour, label=label)
-    ax.plot(
-        places,
-        commanded,
-        linestyle="",
-        marker="_",
-        markersize=40.0,
-        color=panels.VERMILLION,
-        label="commanded",
-    )
+    marks: dict[str, Any] = {"linestyle": "", "marker": "_", "markersize": 40.0, "color": panels.VERMILLION}
+    ax.plot(places, commanded, label="commanded", **marks)
     ax.set_xticks(places, [f"coil {COIL_NAMES[place]}" for place in places])
     panels.style(ax, "current, mA", "Supply current", "")
 
