@@ -33,6 +33,7 @@ from knightcube.gnc.first_orbit import (
 
 _ARCSECONDS = math.degrees(3600.0)
 ORIGINATOR = "KNIGHTCUBE"
+_OF_SATELLITE = (f"OBJECT_NAME = {ORIGINATOR}", "OBJECT_ID = UNKNOWN", "CENTER_NAME = EARTH")
 _SECOND_NS = 1_000_000_000
 
 
@@ -75,7 +76,7 @@ def _ephemeris(placed: PacketArray, start_ns: int) -> list[str]:
         "META_START",
         "COMMENT Orbit as the satellite knew it at each sighting; standard deviation per axis "
         f"{1e-3 * float(np.max(placed['place_sigma'])):.3f} km or less.",
-        *_of_satellite(),
+        *_OF_SATELLITE,
         "REF_FRAME = ICRF",
         "TIME_SYSTEM = UTC",
         f"START_TIME = {dates[0]}",
@@ -109,7 +110,7 @@ def write_attitudes(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
         "META_START",
         "COMMENT Largest standard deviation about a body axis "
         f"{math.degrees(float(np.nanmax(packets['angle_sigma']))):.4f} deg.",
-        *_of_satellite(),
+        *_OF_SATELLITE,
         "REF_FRAME_A = ICRF",
         "REF_FRAME_B = SC_BODY_1",
         "ATTITUDE_DIR = A2B",
@@ -134,10 +135,6 @@ def write_attitudes(run: Run, path: Path, as_xml: bool = False) -> list[Path]:
 def _header(version: str) -> list[str]:
     now = ccsds_date(round(datetime.now(UTC).timestamp() * 1e9))
     return [version, f"CREATION_DATE = {now}", f"ORIGINATOR = {ORIGINATOR}"]
-
-
-def _of_satellite() -> list[str]:
-    return [f"OBJECT_NAME = {ORIGINATOR}", "OBJECT_ID = UNKNOWN", "CENTER_NAME = EARTH"]
 
 
 def _write(path: Path, lines: list[str], as_xml: bool) -> None:

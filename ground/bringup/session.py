@@ -88,10 +88,8 @@ def step_axes(session: Session) -> Outcome:
         if session.hand is not None:
             session.hand.turn(np.eye(3)[index], 0.0, 1.0)
             seconds = 2.5
-        session.ask(
-            f"Stand the body with its z axis up. After Enter, wait 1 s, turn it right-handed by 90 deg about "
-            f"its {name} axis within {seconds - 2.0:g} s, and hold it."
-        )
+        turn = f"turn it right-handed by 90 deg about its {name} axis within {seconds - 2.0:g} s"
+        session.ask(f"Stand the body with its z axis up. After Enter, wait 1 s, {turn}, and hold it.")
         still = session.record(STILL_S)
         if session.hand is not None:
             session.hand.turn(np.eye(3)[index], diagnosis.QUARTER, seconds - 0.5)

@@ -208,8 +208,8 @@ def _drawn(values: dict[str, Any], one: Variation, chance: np.random.Generator) 
 def fly_case(case: Case) -> Result:
     """Fly a case in lock-step, and return its random parameters and its limited performance measures."""
     given = case.parameters
-    kept = {name: given[name] for name in ("drawn", "seed", "duration")}
-    found: Result = {"key": case.key, "judged": [], "error": "", **kept}
+    found: Result = {"key": case.key, "drawn": given["drawn"], "judged": [], "error": ""}
+    found |= {name: given[name] for name in ("seed", "duration")}
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         config = Path(place) / f"{case.key}.yaml"
         config.write_text(given["config"], encoding="utf-8")

@@ -43,6 +43,7 @@ _LISTED = 5  # maximum number of satellites that a message lists
 _ECCENTRICITY = OrbitSection().eccentricity  # default eccentricity of an orbit
 _COLUMNS, _VELOCITY = ("utc", "x", "y", "z"), ("vx", "vy", "vz")
 """Required columns of a CSV file of fixes, and its optional velocity columns."""
+_WANTED = f"{', '.join(_COLUMNS)} and, if known, {', '.join(_VELOCITY)}"
 _ORBIT = ("inclination", "eccentricity", "node", "local_time", "perigee", "anomaly", "epoch")
 _LONGEST_DAYS = 30.0
 """Longest span (days) of a prediction, because older elements do not give times of useful accuracy."""
@@ -219,7 +220,7 @@ def read_fixes(path: Path) -> Fixes:
     if path.is_dir():
         rows = read_run(path)["fix"]
         if not len(rows):
-            raise UsageError(f"{path}: the flight log has no GPS fixes: give a CSV file with {_wanted()}")
+            raise UsageError(f"{path}: the flight log has no GPS fixes: give a CSV file with {_WANTED}")
         dates = UNIX_EPOCH + rows["utc_ns"] / (1e9 * DAY)
         return _celestial(dates, np.hstack([rows["position"], rows["velocity"]]))
     found = []
@@ -228,7 +229,7 @@ def read_fixes(path: Path) -> Fixes:
             reader = csv.DictReader(file)
             names = reader.fieldnames or ()
             if missing := [name for name in _COLUMNS if name not in names]:
-                raise UsageError(f"{path}: the column {missing[0]} is missing: give {_wanted()}")
+                raise UsageError(f"{path}: the column {missing[0]} is missing: give {_WANTED}")
             columns = [*_COLUMNS[1:], *(_VELOCITY if set(_VELOCITY) <= set(names) else ())]
             for row in reader:
                 place = f"{path}:{reader.line_num}"
@@ -248,10 +249,6 @@ def _celestial(dates: FloatArray, states: FloatArray) -> Fixes:
         return Fixes(dates, positions, None)
     ground = states[:, 3:] + np.cross([0.0, 0.0, ROTATION_RATE], states[:, :3])
     return Fixes(dates, positions, np.einsum("nji,nj->ni", turns, ground))
-
-
-def _wanted() -> str:
-    return f"{', '.join(_COLUMNS)} and, if known, {', '.join(_VELOCITY)}"
 
 
 def _number(text: str | None, place: str) -> float:

@@ -126,10 +126,8 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
         return Pinhole.from_field_of_view(columns, rows, math.radians(options.fov))
     model = camera_model(configuration.load_camera(options.camera))
     if (rows, columns) != (model.rows, model.columns):
-        raise UsageError(
-            f"{options.image}: {columns} x {rows} pixels, but the camera of {options.camera} has"
-            f" {model.columns} x {model.rows}"
-        )
+        own = f"the camera of {options.camera} has {model.columns} x {model.rows}"
+        raise UsageError(f"{options.image}: {columns} x {rows} pixels, but {own}")
     return model
 
 

@@ -149,16 +149,10 @@ def _written(options: argparse.Namespace, fragment: str) -> str:
 
 
 def _quantity_facts(one: LearnedQuantity) -> dict[str, Any]:
+    names = {"described": "described", "value": "value", "claim": "claim", "described_sigma": "prior"}
     changes = [None if math.isnan(change) else change for change in one.change.tolist()]
-    return {
-        "unit": one.unit,
-        "learned": one.learned,
-        "described": one.described.tolist(),
-        "value": one.value.tolist(),
-        "claim": one.claim.tolist(),
-        "described_sigma": one.prior.tolist(),
-        "change_sigmas": changes,
-    }
+    values = {key: getattr(one, name).tolist() for key, name in names.items()}
+    return {"unit": one.unit, "learned": one.learned, **values, "change_sigmas": changes}
 
 
 def _table(found: LearnedDescription, folder: Path) -> str:
@@ -179,10 +173,8 @@ def _table(found: LearnedDescription, folder: Path) -> str:
 
 def _fly(options: argparse.Namespace) -> Path:
     if isinstance(configuration.load(options.source), OrbitConfig):
-        raise UsageError(
-            f"{options.source}: a satellite is identified from a run: make a run with "
-            "`knightcube run`, and give its folder"
-        )
+        cure = "make a run with `knightcube run`, and give its folder"
+        raise UsageError(f"{options.source}: a satellite is identified from a run: {cure}")
     from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
     from flight.app.run import default_folder  # noqa: PLC0415
 

@@ -163,10 +163,7 @@ def _process(command: list[str], log: Path, stack: ExitStack) -> subprocess.Pope
 
 
 def _failed(process: subprocess.Popen[bytes]) -> bool:
-    """Return whether a process has ended with an error.
-
-    A flight ends without an error after its duration.
-    """
+    """Return whether a process has ended with an error, unlike a flight at the end of its duration."""
     return process.poll() not in (None, 0)
 
 
@@ -232,10 +229,7 @@ def _address(config: Path, section: Link | None) -> str:
 
 
 def _gateway(options: argparse.Namespace, stack: ExitStack) -> Gateway:
-    """Return a gateway to the satellite, which `stack` closes.
-
-    The token of the gateway is in a file in the folder of the keys.
-    """
+    """Return a gateway to the satellite, which `stack` closes, with its token in the folder of the keys."""
     token = new_token()
     terminal = stack.enter_context(contextlib.closing(terminal_of(options)))
     gateway = Gateway(

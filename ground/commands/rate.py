@@ -94,10 +94,8 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
         raise UsageError("give --fov and --exposure, or --camera with a configuration that has them")
     if options.fov is None and camera is not None and camera.lens is not None:
         if (camera.rows, camera.columns) != pixels.shape:
-            raise UsageError(
-                f"{options.image} has {columns} x {rows} pixels, "
-                f"but the camera has {camera.columns} x {camera.rows}"
-            )
+            own = f"{camera.columns} x {camera.rows}"
+            raise UsageError(f"{options.image} has {columns} x {rows} pixels, but the camera has {own}")
         return camera_model(camera).ideal, exposure
     if not 0.1 <= fov_deg <= 120.0:
         raise UsageError(f"--fov {fov_deg}: a pinhole camera can have 0.1 to 120 degrees")

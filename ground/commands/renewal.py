@@ -164,10 +164,8 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
     before = targets.targets.get(kind)
     last = before.unrecognized_fields["custom"]["version"] if before is not None else 0
     if options.version <= last and not options.back:
-        raise UsageError(
-            f"--version {options.version}: {kind} {last} is signed already: "
-            "give a higher version, or add --back"
-        )
+        problem = f"{kind} {last} is signed already: give a higher version, or add --back"
+        raise UsageError(f"--version {options.version}: {problem}")
     target = TargetFile.from_data(kind, data)
     target.unrecognized_fields["custom"] = {"version": options.version, "back": bool(options.back)}
     targets.targets[kind] = target

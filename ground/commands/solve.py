@@ -122,10 +122,9 @@ def _tracker(options: argparse.Namespace, pixels: Image) -> tuple[StarTracker, f
     if options.camera is not None:
         camera = configuration.load_camera(options.camera)
         if pixels.shape != (camera.rows, camera.columns):
-            raise UsageError(
-                f"{options.image}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but the camera of"
-                f" {options.camera} has {camera.columns} x {camera.rows}"
-            )
+            size = f"{pixels.shape[1]} x {pixels.shape[0]} pixels"
+            own = f"the camera of {options.camera} has {camera.columns} x {camera.rows}"
+            raise UsageError(f"{options.image}: {size}, but {own}")
         lens, exposure = camera_model(camera), exposure or camera.exposure
         if camera.lens is None and error is None:
             # The field of view has a tolerance unless the lens is calibrated.

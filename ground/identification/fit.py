@@ -179,13 +179,9 @@ def innovations(
         if jump and with_gradient:
             predictor.note_switch(jump)
     errors, covariances, gradients, taken = zip(*made, strict=True)
-    return Innovations(
-        np.array(errors),
-        np.array(covariances).reshape(-1, 2, 2),
-        np.array(gradients if with_gradient else ()).reshape(-1, 2, len(NAMES)),
-        np.array(taken),
-        frozenset(restarted),
-    )
+    covariance = np.array(covariances).reshape(-1, 2, 2)
+    gradient = np.array(gradients if with_gradient else ()).reshape(-1, 2, len(NAMES))
+    return Innovations(np.array(errors), covariance, gradient, np.array(taken), frozenset(restarted))
 
 
 class _Predictor:

@@ -73,16 +73,10 @@ def detumbling(run: Run) -> Object | None:
     periods = []
     for begin, stop, slowed in detumbling_periods(run, end):
         inside = speed[(time >= begin) & (time <= stop)]
-        periods.append(
-            {
-                "begin_s": begin,
-                "duration_s": stop - begin,
-                "slowed": slowed,
-                "first_rate_rad_s": float(inside[0]) if len(inside) else math.nan,
-                "largest_rate_rad_s": float(inside.max()) if len(inside) else math.nan,
-                "last_rate_rad_s": float(inside[-1]) if len(inside) else math.nan,
-            }
-        )
+        rates = (inside[0], inside.max(), inside[-1]) if len(inside) else (math.nan,) * 3
+        names = ("first_rate_rad_s", "largest_rate_rad_s", "last_rate_rad_s")
+        period = {"begin_s": begin, "duration_s": stop - begin, "slowed": slowed}
+        periods.append(period | dict(zip(names, map(float, rates), strict=True)))
     spin, truth, rms = magnetometer_rates(run), run["truth"], math.nan
     if len(truth) and len(spin):
         at, times, rate = seconds(spin), seconds(truth), truth["rate"].astype(float)
@@ -371,9 +365,8 @@ def requirements(
         rows.append((f"pointing to {target['target']}, rms", error, limits.pointing_deg, "deg"))
     if seen is not None:
         missed = [100.0 * (1.0 - seen["share"])]
-        rows.append(
-            ("unobstructed frames without attitude or rate", missed, limits.camera_missed_percent, "%")
-        )
+        name = "unobstructed frames without attitude or rate"
+        rows.append((name, missed, limits.camera_missed_percent, "%"))
     return [judge(name, values, limit, unit) for name, values, limit, unit in rows if limit is not None]
 
 

@@ -111,15 +111,9 @@ def flown_steps(
         held = abs(was - command.start) <= SETTLING_BAND * abs(command.target - command.start)
         later = stops[stops > command.time]
         duration = min(command.duration, float(later[0]) - command.time if len(later) else math.inf)
-        flown.append(
-            replace(
-                command,
-                start=command.start if held else was,
-                duration=duration,
-                from_target=held and bool(flown),
-                again=any(before.index == command.index for before in flown),
-            )
-        )
+        start, again = command.start if held else was, any(one.index == command.index for one in flown)
+        changes = {"start": start, "from_target": held and bool(flown), "again": again}
+        flown.append(replace(command, duration=duration, **changes))
     return flown
 
 
@@ -149,12 +143,8 @@ def response(time: FloatArray, q2: FloatArray, command: StepCommand) -> StepResp
     if len(outside):
         i = int(outside[-1])
         settling = math.inf if i == len(t) - 1 else _interpolate(t, distance, i, SETTLING_BAND)
-    return StepResponse(
-        steady_state_deg=steady,
-        overshoot_percent=100.0 * max(0.0, float(progress.max()) - 1.0),
-        rise_s=math.inf if math.isnan(rise) else rise,
-        settling_s=settling,
-    )
+    overshoot = 100.0 * max(0.0, float(progress.max()) - 1.0)
+    return StepResponse(steady, overshoot, math.inf if math.isnan(rise) else rise, settling)
 
 
 def _angle(q2: FloatArray) -> FloatArray:
@@ -202,9 +192,8 @@ def judged_steps(
     sample = 3.0 * float(np.median(np.diff(attitude.time)))
     steps: list[tuple[StepCommand, StepResponse | None]] = []
     for command in listed:
-        complete = (
-            attitude.time[0] - sample <= command.time and command.time + command.duration <= log_end + sample
-        )
+        begun = attitude.time[0] - sample <= command.time
+        complete = begun and command.time + command.duration <= log_end + sample
         found = response(attitude.time, attitude.q2, command) if complete else None
         if found is not None and is_interrupted(command, found):
             found = None
