@@ -142,17 +142,17 @@ def _with_text(
         # The label is right of the star, or left if a brighter star's label is on the right, or omitted.
         for place, anchor in (((x + 11.0 * scale, y), "lm"), ((x - 11.0 * scale, y), "rm")):
             box = draw.textbbox(place, text, font=font, anchor=anchor)
-            if box[0] >= 0 and box[2] < picture.shape[1] and not any(_overlap(box, other) for other in taken):
+            free = all(
+                box[2] < other[0] or other[2] < box[0] or box[3] < other[1] or other[3] < box[1]
+                for other in taken
+            )
+            if box[0] >= 0 and box[2] < picture.shape[1] and free:
                 draw.text(place, text, fill=_NAME, font=font, anchor=anchor)
                 taken.append(box)
                 break
     if solution.fix is not None:
         _draw_compass(draw, picture.shape, solution, font, scale)
     return np.asarray(image)
-
-
-def _overlap(box: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
-    return box[0] <= other[2] and other[0] <= box[2] and box[1] <= other[3] and other[1] <= box[3]
 
 
 def _draw_compass(

@@ -155,17 +155,16 @@ def read_run(folder: Path) -> Run:
         raise UsageError(f"{folder}: no such folder; give the folder of a run (option --out of the run)")
     if not find_segments(folder, "flight"):
         raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder")
-    flight, truth, performance = (_read_log(folder, stem) for stem in ("flight", "truth", "performance"))
+    logs = []
+    for stem in ("flight", "truth", "performance"):
+        try:
+            logs.append(scan(b"".join(path.read_bytes() for path in find_segments(folder, stem))))
+        except OSError as error:
+            raise UsageError(f"{folder}: the {stem} log cannot be read: {error.strerror or error}") from error
+    flight, truth, performance = logs
     if not flight.counts:
         raise UsageError(f"{folder}: no valid packet in the {flight.total_bytes} bytes of the flight log")
     return Run(folder, flight, truth, performance)
-
-
-def _read_log(folder: Path, stem: str) -> ScanResult:
-    try:
-        return scan(b"".join(path.read_bytes() for path in find_segments(folder, stem)))
-    except OSError as error:
-        raise UsageError(f"{folder}: the {stem} log cannot be read: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ import shutil
 import sys
 import threading
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,7 @@ def archive_of(root: Path) -> bytes:
 
 def finished(
     address: str, run: Callable[[Any], Any], cases: Sequence[Any], report: Callable[[str], None]
-) -> Iterator[tuple[str, Any]]:
+) -> Generator[tuple[str, Any], None, None]:
     """Run cases on the cluster of the scheduler at `address`, and yield key and result of each case.
 
     If a worker dies, other workers run its cases. The function `report` shows a line of text about the

@@ -202,9 +202,12 @@ def fly(
         missing = [case for case in cases if case.key not in done]
         if missing:
             bar = Progress(len(cases), len(cases) - len(missing)) if progress else None
-            results = (
-                _on_cluster(dask, campaign, missing, bar) if dask else _here(workers, campaign, missing, out)
-            )
+            if dask and importlib.util.find_spec("distributed") is None:
+                raise UsageError("--dask needs distributed: pip install 'knightcube-flight[dask]'")
+            report = bar.note if bar is not None else lambda _: None
+            results = _here(workers, campaign, missing, out)
+            if dask:
+                results = cluster.finished(dask, campaign.run, missing, report)
             with closing(results):
                 for key, result in results:
                     done[key] = result
@@ -402,11 +405,3 @@ def _clear(link: Path) -> None:
         if folder.name.startswith(_SCRATCH):
             shutil.rmtree(folder, ignore_errors=True)
         link.unlink()
-
-
-def _on_cluster(address: str, campaign: Campaign, cases: Sequence[Case], bar: Progress | None) -> Results:
-    """Run cases on a cluster, and yield each result when its case ends."""
-    if importlib.util.find_spec("distributed") is None:
-        raise UsageError("--dask needs distributed: pip install 'knightcube-flight[dask]'")
-    report = bar.note if bar is not None else lambda _: None
-    yield from cluster.finished(address, campaign.run, cases, report)

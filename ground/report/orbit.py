@@ -390,13 +390,17 @@ def star_camera(run: Run, config: OrbitConfig) -> Object | None:
     first = np.searchsorted(measured, instants)
     gave = np.searchsorted(measured, ends) > first
     free = slow & clear
+    longest = gap = 0.0
+    for at, end, without in zip(instants, ends, free & ~gave, strict=True):
+        gap = gap + float(end - at) if without else 0.0
+        longest = max(longest, gap)
     return {
         "instants": len(instants),
         "slow": int(slow.sum()),
         "unobstructed": int(free.sum()),
         "measured": int((free & gave).sum()),
         "share": float(np.mean(gave[free])) if free.any() else math.nan,
-        "longest_gap_s": _longest_gap(instants, ends, free, gave),
+        "longest_gap_s": longest,
     }
 
 
@@ -456,12 +460,3 @@ def _measured_at(run: Run) -> FloatArray:
     fixed = set(stars["sequence"][np.isfinite(stars["quaternion"][:, 0])].tolist())
     attitudes = np.array([sequence in fixed for sequence in streaks["sequence"].tolist()], dtype=bool)
     return np.sort(starts[rates | attitudes])
-
-
-def _longest_gap(instants: FloatArray, ends: FloatArray, free: BoolArray, gave: BoolArray) -> float:
-    """Return the longest total time, s, of consecutive unobstructed instants without a measurement."""
-    longest = gap = 0.0
-    for at, end, wanted in zip(instants, ends, free & ~gave, strict=True):
-        gap = gap + float(end - at) if wanted else 0.0
-        longest = max(longest, gap)
-    return longest

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from flight.link.modes import STEERING
-from flight.link.telemetry.packets import PacketArray
 from ground.report.signals import ThreadMotion, seconds
 from ground.telemetry import Run, text_of
 from knightcube.astro.arrays import FloatArray
@@ -188,7 +187,11 @@ def judged_steps(
         end = float(times[-1] + np.max(np.diff(times))) if len(times) > 1 else max(log_end, float(times[-1]))
     release = float(np.interp(times[0], attitude.time, attitude.q2))
     listed = commanded_steps(targets["index"].tolist(), times, targets["q2"].astype(float), release, end)
-    listed = flown_steps(listed, attitude.time, attitude.q2, _step_ends(run["mode"]))
+    modes = run["mode"]
+    by_command = np.array([text_of(row["trigger"]).startswith("commanded") for row in modes], dtype=bool)
+    steering = np.isin(modes["mode"], [int(mode) for mode in STEERING])
+    # A commanded mode, or a mode without attitude control, ends a step.
+    listed = flown_steps(listed, attitude.time, attitude.q2, seconds(modes)[by_command | ~steering])
     sample = 3.0 * float(np.median(np.diff(attitude.time)))
     steps: list[tuple[StepCommand, StepResponse | None]] = []
     for command in listed:
@@ -202,13 +205,6 @@ def judged_steps(
             notes += [f"step {command.index}: {remark}" for remark in _remarks(found)]
         steps.append((command, found))
     return steps
-
-
-def _step_ends(packets: PacketArray) -> FloatArray:
-    """Return the times (n,), s, at which a commanded mode, or a mode without attitude control, began."""
-    by_command = np.array([text_of(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
-    steering = np.isin(packets["mode"], [int(mode) for mode in STEERING])
-    return seconds(packets)[by_command | ~steering]
 
 
 def _remarks(found: StepResponse | None) -> list[str]:
