@@ -176,11 +176,7 @@ def derived(satellite: Satellite, julian_date: float) -> Derived:
 
 
 def _worst_pressure(perigee: float) -> float:
-    """Return the largest sum of drag and solar pressure (Pa) on a face in an orbit.
-
-    The argument `perigee` is the distance of the perigee from the Earth's centre, m. The air is densest at
-    the perigee.
-    """
+    """Return the largest drag and solar pressure (Pa) at the `perigee` (m from the Earth's centre)."""
     place, sun = np.array([[perigee, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
     density = math.exp(float(log_density(place, sun, 0.0)[0]))
     return 0.5 * _DRAG_COEFFICIENT * density * GRAVITATIONAL_PARAMETER / perigee + 2.0 * _SUN_PRESSURE
@@ -474,10 +470,7 @@ class Apsides:
 
 
 def _read_altitude(text: str) -> float | Apsides:
-    """Return an altitude in km, or the orbit between two altitudes such as 450x900.
-
-    Raises ValueError with the permitted values.
-    """
+    """Return an altitude in km, or the orbit between two altitudes such as 450x900. Raises ValueError."""
     mean = number(*_ALTITUDES, "km, or the altitudes of perigee and apogee such as 450x900")
     ends = text.lower().split("x")
     if len(ends) != 2:

@@ -299,10 +299,7 @@ def diagnose_axes(turns: Turns) -> AxesFound:
 
 
 def _common(found: dict[str, FloatArray]) -> FloatArray | None:
-    """Return the common axes of all sensors, or None if the axes differ.
-
-    The sign of the magnetometer's axes is not compared.
-    """
+    """Return the common axes of all sensors, except the magnetometer's sign, or None if they differ."""
     if "gyro" not in found:
         return None
     first = found["gyro"]
@@ -621,10 +618,7 @@ def _usual_size(response: FloatArray, expected: FloatArray) -> float:
 
 
 def _joined(response: FloatArray, expected: FloatArray, live: BoolArray) -> dict[int, int]:
-    """Return the pairs (j, k) of coils for which command j produces the fields of both coils.
-
-    Command k then produces no field, or the same field as command j.
-    """
+    """Return the pairs (j, k) of coils for which command j produces the fields of both coils."""
     found, size = {}, np.linalg.norm(response, axis=1)
     for j in np.flatnonzero(live).tolist():
         for k in range(len(response)):

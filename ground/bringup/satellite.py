@@ -252,10 +252,7 @@ def step_strings(session: Session) -> Outcome:
 
 
 def _currents(session: Session, strings: SolarStrings, normal: FloatArray) -> FloatArray:
-    """Return the currents (n,), A, while a lamp shines onto the panel with the outward `normal` (3,).
-
-    Raises StepSkipped if no reading arrives.
-    """
+    """Return the currents (n,), A, in the light of a lamp along `normal` (3,). Raises StepSkipped."""
     if session.hand is not None:
         session.hand.light(normal)
     begun_ns = session.rig.clock.now_ns()

@@ -249,10 +249,7 @@ def _opened(out: Path) -> Iterator[IO[str]]:
 
 
 def _resume(label: Parameters, out: Path, file: IO[str]) -> dict[str, Result]:
-    """Return the results in the opened file by key, and remove a last line that was written incompletely.
-
-    Raises UsageError if the folder contains a campaign with another `label`.
-    """
+    """Return the results by key, and remove an incomplete last line. Raises UsageError for another label."""
     label_path = out / "campaign.json"
     if label_path.exists():
         found = json.loads(label_path.read_text(encoding="utf-8"))

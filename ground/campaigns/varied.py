@@ -149,10 +149,7 @@ def _case(
 
 
 def _numbers_at(values: dict[str, Any], one: Variation) -> list[tuple[Any, Any, str]]:
-    """Return container, index in the container, and full key of each number to draw at random.
-
-    Raises UsageError.
-    """
+    """Return container, index and full key of each number to draw at random. Raises UsageError."""
     steps = [int(step) if step.isdigit() else step for step in re.findall(r"\w+", one.key)]
     holder: Any = values
     for depth, step in enumerate(steps[:-1]):

@@ -234,10 +234,7 @@ def artefact(kind: str, path: Path) -> bytes:
 
 
 def _two_lines(data: bytes, path: Path) -> bytes:
-    """Return the two-line elements in a file of two lines, or in the section `elements` of a YAML file.
-
-    Raises UsageError if the file has no two lines of 69 characters.
-    """
+    """Return the two-line elements in a text file or in a YAML file's `elements`. Raises UsageError."""
     lines = [line.rstrip() for line in data.decode(errors="replace").splitlines() if line.strip()]
     if [len(line) for line in lines] == [69, 69]:
         return data

@@ -408,10 +408,7 @@ def _change(text: str) -> tuple[str, float]:
 
 
 def _parameters_in(path: Path) -> dict[str, float]:
-    """Return the parameter table that a YAML file contains.
-
-    Raises ConfigError for an invalid table, and UsageError for an unreadable file.
-    """
+    """Return the parameter table in a YAML file. Raises ConfigError and UsageError."""
     document = read_document(read_text(path), str(path))
     values: dict[str, float] = {}
     for section, entries in document.values.items():
@@ -564,10 +561,7 @@ class _FileWork:
         return {"text": f"completed: {directive}"}
 
     def _turn(self, name: str) -> None:
-        """Transfer for a moment.
-
-        Raises FlightError after a signal or a long silence; received data is kept.
-        """
+        """Transfer for a moment. Raises FlightError after a signal or a long silence."""
         if select.select([self._terminal], [], [], _TURN_S)[0]:
             self._session.take(self._terminal.take(), time.monotonic_ns())
         now_ns = time.monotonic_ns()

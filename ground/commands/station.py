@@ -323,10 +323,7 @@ def _print(text: str) -> None:
 
 
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
-    """Return the console that the options describe.
-
-    The exit stack `stack` closes the resources of the console.
-    """
+    """Return the console that the options describe; `stack` closes its resources."""
     from ground.console.commanding import CommandForms, LinkFeed, LinkFiles, RunFiles, by_socket, flying  # noqa: PLC0415  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415
@@ -359,10 +356,7 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
 
 
 def _stations(options: argparse.Namespace) -> tuple[str, ...]:
-    """Return the ground stations that the options describe, as texts.
-
-    Raises UsageError for an invalid station.
-    """
+    """Return the ground stations that the options describe, as texts. Raises UsageError."""
     if not options.station and options.stations is None:
         return ()
     from ground.passes import read_stations, station_of  # noqa: PLC0415 - Skyfield is large

@@ -374,10 +374,7 @@ def first_guess(record: Record) -> MotionConstants:
 def _gated(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return the samples `restarts` and all samples whose innovations exceed the gate.
-
-    Raises IdentificationError if there are too many restarts.
-    """
+    """Return `restarts` and the samples whose innovations exceed the gate. Raises IdentificationError."""
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
     if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(
@@ -390,10 +387,7 @@ def _gated(
 def _finished(
     record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int]
 ) -> PlantFit:
-    """Return the fitted constants with their covariance.
-
-    Raises IdentificationError if the gain is uncertain or negative.
-    """
+    """Return the fit with its covariance. Raises IdentificationError if the gain is uncertain or negative."""
     passed = innovations(record, constants, noise, restarts)
     covariance = _inverse(_step(passed, constants)[1])
     whiteness = _whiteness(passed.whitened)

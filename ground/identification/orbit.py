@@ -237,10 +237,7 @@ def _largest(matrix: LearnedQuantity) -> tuple[float, float]:
 
 
 def _inertia_accuracy(found: LearnedDescription) -> tuple[float, float]:
-    """Return the smallest values of `moments` and `axes_deg` that cover the learned inertia's uncertainty.
-
-    The values do not exceed those of the configuration.
-    """
+    """Return the smallest configured `moments` and `axes_deg` that cover the inertia's uncertainty."""
     one, accuracy = found.quantities["inertia"], found.config.craft.accuracy
     inertia = tensor(one.value)
     trace = float(np.trace(inertia))

@@ -166,10 +166,7 @@ def _rate_groups(packets: PacketArray) -> list[Object]:
 
 
 def _cycles(timing: PacketArray, control: PacketArray) -> Object:
-    """Return the numbers of control cycles by outcome, and statistics of their lateness.
-
-    Scheduled cycles without a control packet count as `skipped`.
-    """
+    """Return the numbers of control cycles, logged and skipped, and statistics of their times."""
     slots = control["cycle"].astype(np.int64)
     return {
         "count": len(control),
@@ -254,10 +251,7 @@ def _health(packets: PacketArray) -> Object | None:
 
 
 def _events(packets: PacketArray) -> list[Object]:
-    """Return the events by name in order of first appearance.
-
-    The value `count` includes the events whose packets were suppressed by throttling.
-    """
+    """Return the events by name in order of first appearance, with their numbers including throttled ones."""
     found: dict[str, Object] = {}
     for row, time in zip(packets, signals.seconds(packets), strict=True):
         name, text = text_of(row["name"]), text_of(row["text"])
