@@ -180,8 +180,8 @@ def innovations(
             predictor.note_switch(jump)
     errors, covariances, gradients, taken = zip(*made, strict=True)
     covariance = np.array(covariances).reshape(-1, 2, 2)
-    gradient = np.array(gradients if with_gradient else ()).reshape(-1, 2, len(NAMES))
-    return Innovations(np.array(errors), covariance, gradient, np.array(taken), frozenset(restarted))
+    by = np.array(gradients if with_gradient else ()).reshape(-1, 2, len(NAMES))
+    return Innovations(np.array(errors), covariance, by, np.array(taken), frozenset(restarted))
 
 
 class _Predictor:

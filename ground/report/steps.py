@@ -110,9 +110,10 @@ def flown_steps(
         held = abs(was - command.start) <= SETTLING_BAND * abs(command.target - command.start)
         later = stops[stops > command.time]
         duration = min(command.duration, float(later[0]) - command.time if len(later) else math.inf)
-        start, again = command.start if held else was, any(one.index == command.index for one in flown)
-        changes = {"start": start, "from_target": held and bool(flown), "again": again}
-        flown.append(replace(command, duration=duration, **changes))
+        start, from_target = command.start if held else was, held and bool(flown)
+        again = any(one.index == command.index for one in flown)
+        made = replace(command, start=start, duration=duration, from_target=from_target, again=again)
+        flown.append(made)
     return flown
 
 

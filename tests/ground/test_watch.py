@@ -186,8 +186,13 @@ def test_a_terminal_without_rich_gets_lines_and_the_cure(
     growing: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "rich.live", None)
-    assert station._panel(FlightState(), LogTail(growing)) is None
-    assert "pip install 'knightcube-flight[watch]'" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    options = argparse.Namespace(plain=False, every=10.0)
+    with station._display(options, FlightState(), LogTail(growing)) as refresh:
+        refresh()
+    shown = capsys.readouterr()
+    assert "pip install 'knightcube-flight[watch]'" in shown.err
+    assert shown.out.splitlines()
 
 
 def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
