@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from random import Random
 
@@ -90,6 +91,14 @@ class LinkAttacker:
         counter = max(self.highest[spi] + chance.randint(0, 3), 0)
         body = spi.to_bytes(2, "big") + counter.to_bytes(12, "big") + chance.randbytes(size + 16)
         return close_frame(_header(size) + body)
+
+
+def attackers_frames(count: int) -> list[bytes]:
+    """Return random frames of an attacker: replayed, damaged and forged."""
+    chance = Random(1)
+    with tempfile.TemporaryDirectory() as folder:
+        attacker = LinkAttacker(Path(folder))
+        return [attacker.frame(chance)[1] for _ in range(count)]
 
 
 def _header(size: int) -> bytes:

@@ -1,7 +1,7 @@
 """`python -m tests.studies.bench NAME [arguments]`: runs a benchmark; without a name, lists all of them.
 
-A benchmark is a module of this package with a function `main`. The list is read from the docstrings. Only the
-requested benchmark is imported, so optional packages of other benchmarks may be missing.
+A benchmark is a module of this package whose function `main` is a `command`. The list is read from the
+docstrings. Only the requested benchmark is imported, so optional packages of other benchmarks may be missing.
 """
 
 from __future__ import annotations
@@ -9,27 +9,17 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
-import inspect
-import pkgutil
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-
-_FOLDER = Path(__file__).parent
 
 
 def benches() -> dict[str, str]:
     """Return the name of each benchmark and the first line of its docstring, without importing any."""
     found = {}
-    for module in pkgutil.iter_modules([str(_FOLDER)]):
-        if module.name.startswith("_") or module.ispkg:
-            continue
-        tree = ast.parse((_FOLDER / f"{module.name}.py").read_text(encoding="utf-8"))
-        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
-            # The first line of each docstring also names the command, which the list omits.
-            line = (ast.get_docstring(tree) or "").partition("\n")[0]
-            found[module.name] = line.partition("python -m")[0].rstrip(" :`")
+    for path in sorted(Path(__file__).parent.glob("[a-z]*.py")):
+        text = path.read_text(encoding="utf-8")
+        if "\n@command\ndef main(" in text:
+            found[path.stem] = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0].rstrip(".")
     return found
 
 
@@ -49,26 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.name is None:
         parser.print_help()
         return 0
-    return _run(options.name, options.arguments)
-
-
-def _run(name: str, arguments: list[str]) -> int:
-    """Run a benchmark's `main`, and pass the argument list if it accepts one."""
-    bench = importlib.import_module(f"tests.studies.bench.{name}").main
-    with _command_line(f"python -m tests.studies.bench {name}", arguments):
-        status = bench(arguments) if inspect.signature(bench).parameters else bench()
-    return int(status or 0)
-
-
-@contextmanager
-def _command_line(program: str, arguments: list[str]) -> Iterator[None]:
-    """Set the process's command line, which some `main` functions read and which their help texts show."""
-    before = sys.argv
-    sys.argv = [program, *arguments]
-    try:
-        yield
-    finally:
-        sys.argv = before
+    bench = importlib.import_module(f"tests.studies.bench.{options.name}")
+    return int(bench.main(options.arguments))
 
 
 if __name__ == "__main__":

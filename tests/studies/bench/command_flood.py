@@ -1,4 +1,4 @@
-"""The command socket under a flood: `python -m tests.studies.bench command_flood [--seconds S]`.
+"""The command socket under a flood.
 
 The step demonstration runs in real time with a UDP command port, in three cases: without a flood, with 20,000
 datagrams a second that are not commands, and with 20,000 a second that begin like commands. An authorised
@@ -8,15 +8,11 @@ of answered pings.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
-import tempfile
 import threading
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -24,6 +20,7 @@ from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from ground.link.commanding import exchange
 from knightcube.errors import FlightError
+from tests.studies.command import command, say, scratch
 from tests.support.flights import CONFIG
 from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
 
@@ -35,23 +32,18 @@ _AFTER_START_S = 5.0
 FLOODS = ("none", "no commands", "begin as commands")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(*, seconds: Annotated[float, "of each flight"] = 60.0) -> int:
     """Run all cases, and print the measured values.
 
     Returns 1 if a ping was lost without a flood or under datagrams that are not commands.
     """
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default %(default)s)"
-    )
-    seconds = parser.parse_args(arguments).seconds
     answered = {}
     for kind in FLOODS:
-        with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-            facts = measure(Path(place), seconds, kind)
+        with scratch() as place:
+            facts = measure(place, seconds, kind)
         answered[kind] = facts["answered"]
-        sys.stdout.write(json.dumps({"flood": kind, **facts}) + "\n")
-        sys.stdout.flush()
+        say(flood=kind, **facts)
     return int(min(answered[kind] for kind in FLOODS[:2]) < PINGS)
 
 
@@ -96,7 +88,3 @@ def _is_answered(port: int, number: int) -> bool:
         return bool(exchange(f"127.0.0.1:{port}", CommandPacker().pack(Ping(number), utc_ns()), _ANSWER_S))
     except FlightError:
         return False
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""Workers that cannot start, in real time: `python -m tests.studies.bench dead_worker [--minutes M]`.
+"""Workers that cannot start, in real time.
 
 The full load of `bench executive` runs, but a module of the workers is missing, so each worker process ends
 at once. The benchmark prints the start attempts and their reports. It also prints three numbers of lost
@@ -9,13 +9,10 @@ two cores.
 
 from __future__ import annotations
 
-import argparse
 import sys
-import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from typing import Annotated
+from unittest.mock import patch
 
 import numpy as np
 
@@ -25,6 +22,7 @@ from ground.telemetry import read_run
 from hal.interfaces.wires import SECOND_NS
 from tests.hal.guardian import live_flight
 from tests.studies.bench.executive import Load, fifo_allowed, fly
+from tests.studies.command import command, scratch
 
 _BREAK = """
 from flight.loop.executive import processes
@@ -35,23 +33,18 @@ WORKERS = ("planner", "vision")
 _BESIDE_S = 1.0
 
 
-def main(arguments: Sequence[str]) -> int:
+@command
+def main(*, minutes: Annotated[float, "of flight"] = 10.0) -> int:
     """Run the flight, and print the counts.
 
     Returns 1 if a cycle was lost or an attempt was not limited and reported.
     """
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0, metavar="M", help="default %(default)s")
-    minutes = parser.parse_args(arguments).minutes
-    with tempfile.TemporaryDirectory() as name, _broken_workers():
-        load = Load(60.0 * minutes, warm_up=0.0)
-        figures = fly(Path(name), load, fifo_allowed()).figures
-        happened = read_run(Path(name) / "run")["event"]
-        codes, texts = happened["code"], happened["text"]
-        died_s = happened["time_ns"][codes == events.WORKER_DIED.code] / SECOND_NS
+    with scratch() as folder, patch.object(live_flight, "FLIGHT", _BREAK + live_flight.FLIGHT):
+        figures = fly(folder, Load(60.0 * minutes, warm_up=0.0), fifo_allowed()).figures
+        happened = read_run(folder / "run")["event"]
+    codes, texts = happened["code"], happened["text"]
+    died_s = happened["time_ns"][codes == events.WORKER_DIED.code] / SECOND_NS
     beside = [at for at in figures["lost_at_s"] if (np.abs(died_s - at) <= _BESIDE_S).any()]
-    kinds = (events.WORKER_DIED, events.WORKER_RESTS, events.WORKER_READY)
-    found = {kind.name: Counter(_workers(texts[codes == kind.code].tolist())) for kind in kinds}
     sys.stdout.write(
         f"{minutes:g} min, {figures['slots']} slots: lost {figures['lost']}, "
         f"beyond the machine's stalls {figures['lost_beyond_machine']}, "
@@ -59,22 +52,11 @@ def main(arguments: Sequence[str]) -> int:
         f"lateness p99 {1e3 * figures['lateness_s']['p99']:.2f} ms, "
         f"execution max {1e3 * figures['execution_s']['max']:.1f} ms\n"
     )
-    for kind, counts in found.items():
-        sys.stdout.write(f"{kind}: {', '.join(f'{name} {counts[name]}' for name in WORKERS)}\n")
-    bounded = all(1 <= found["worker-died"][name] <= BUDGET for name in WORKERS)
+    bounded = True
+    for kind in (events.WORKER_DIED, events.WORKER_RESTS, events.WORKER_READY):
+        # The text of an event begins with the name of its worker.
+        counts = Counter(text.decode().partition(":")[0] for text in texts[codes == kind.code].tolist())
+        sys.stdout.write(f"{kind.name}: {', '.join(f'{name} {counts[name]}' for name in WORKERS)}\n")
+        if kind is events.WORKER_DIED:
+            bounded = all(1 <= counts[name] <= BUDGET for name in WORKERS)
     return int(not bounded or bool(beside))
-
-
-def _workers(texts: Sequence[bytes]) -> list[str]:
-    """Return the worker that each event text names first."""
-    return [text.decode().partition(":")[0] for text in texts]
-
-
-@contextmanager
-def _broken_workers() -> Iterator[None]:
-    whole = live_flight.FLIGHT
-    live_flight.FLIGHT = _BREAK + whole
-    try:
-        yield
-    finally:
-        live_flight.FLIGHT = whole

@@ -1,4 +1,4 @@
-"""The 40 Hz loop under full load: `python -m tests.studies.bench executive [--minutes M] [--orbit] [--busy]`.
+"""The 40 Hz loop under full load.
 
 The step demonstration flies in real time on emulated devices in separate processes. Planner and vision work
 without pause, and the guardian watches. With `--orbit` the satellite of `config/orbit.yaml` flies instead. It
@@ -15,7 +15,6 @@ slope of memory needs flights of 16 minutes or longer.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import json
 import os
@@ -24,18 +23,20 @@ import select
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
+from typing import Annotated, Any, Literal
 
 import yaml
 
+from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import ROOT, LiveFlight
+from tests.studies.command import Json, command, say, scratch
 from tests.support import process_watch
 from tests.support.executive_figures import (
     ASKED,
@@ -66,6 +67,7 @@ AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.
 All tasks can work at once.
 """
 
+_PATIENCE_S = 240.0  # longest time until the flight is ready
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
 _KEPT_BUSY = "from tests.studies.bench.busy_jobs import keep_busy; keep_busy()"
 _NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"
@@ -104,62 +106,46 @@ class Load:
     busy: bool = False
 
 
-def main(arguments: Sequence[str]) -> int:
+@command
+def main(
+    *,
+    minutes: Annotated[float, "of each flight"] = 10.0,
+    camera_period: Annotated[float, "s"] = Load.camera_period,
+    replan_period: Annotated[float, "s"] = Load.replan_period,
+    warm_up: Annotated[float | None, "s not in the figures (default 60, or a fifth of a flight)"] = None,
+    scheduling: Annotated[Literal["fifo", "ordinary", "both"], "of the flight"] = "both",
+    orbit: Annotated[bool, "fly the satellite, not the step demonstration"] = False,
+    busy: Annotated[bool, "no worker is ever idle"] = False,
+    out: Annotated[Path | None, "folder for executive.json and lateness.png"] = None,
+    json: Json = False,
+) -> int:
     """Run the benchmark, and print required and measured values. Returns 1 if a requirement is not met."""
-    load, options = _load(arguments)
+    duration = 60.0 * minutes
+    if not 3.0 <= duration < 1e6:
+        raise UsageError(f"--minutes {minutes:g}: a flight takes 0.05 minutes at least")
+    warm_up = min(60.0, 0.2 * duration) if warm_up is None else warm_up
+    if not 0.0 <= warm_up < duration:
+        raise UsageError(f"--warm-up {warm_up:g}: must be shorter than the flight of {duration:g} s")
+    for name, period in (("camera", camera_period), ("replan", replan_period)):
+        if not 0.0 < period < 10.0:
+            raise UsageError(f"--{name}-period {period:g}: must lie between 0 and 10 s")
+    load = Load(duration, camera_period, replan_period, warm_up, orbit=orbit, busy=busy)
     flights: dict[str, Figures] = {}
     grids: dict[str, Grid] = {}
-    with _compiled():
-        for name in _schedulings(options.scheduling):
-            with tempfile.TemporaryDirectory() as folder:
-                flown = fly(Path(folder), load, name == "fifo")
+    with compiled():
+        for name in _schedulings(scheduling):
+            with scratch() as folder:
+                flown = fly(folder, load, name == "fifo")
             flights[name] = flown.figures
             grids |= {f"flight, {name}": flown.flight, f"bare loop, {name}": flown.machine}
-    if options.out is not None:
-        _write(options.out, load, flights, grids)
-    if options.json:
-        sys.stdout.write(json.dumps({"load": asdict(load), "asked": ASKED, "flights": flights}) + "\n")
+    facts = {"load": asdict(load), "asked": ASKED, "flights": flights}
+    if out is not None:
+        _write(out, facts, grids)
+    if json:
+        say(**facts)
     else:
         sys.stdout.write("\n".join(table(figures, name) for name, figures in flights.items()))
     return int(any(misses(figures) for figures in flights.values()))
-
-
-def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
-    """Return the load and all options of a command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--minutes", type=float, default=10.0, metavar="M", help="of each flight (default 10)"
-    )
-    parser.add_argument(
-        "--camera-period", type=float, default=Load.camera_period, metavar="S", help="default %(default)s"
-    )
-    parser.add_argument(
-        "--replan-period", type=float, default=Load.replan_period, metavar="S", help="default %(default)s"
-    )
-    parser.add_argument(
-        "--warm-up", type=float, metavar="S", help="not in the figures (default 60, or a fifth of a flight)"
-    )
-    parser.add_argument(
-        "--scheduling", choices=["fifo", "ordinary", "both"], default="both", help="default %(default)s"
-    )
-    parser.add_argument("--orbit", action="store_true", help="fly the satellite, not the step demonstration")
-    parser.add_argument("--busy", action="store_true", help="no worker is ever idle")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write executive.json and lateness.png")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args(arguments)
-    duration = 60.0 * options.minutes
-    if not 3.0 <= duration < 1e6:
-        parser.error(f"--minutes {options.minutes:g}: a flight takes 0.05 minutes at least")
-    warm_up = min(60.0, 0.2 * duration) if options.warm_up is None else options.warm_up
-    if not 0.0 <= warm_up < duration:
-        parser.error(f"--warm-up {warm_up:g}: must be shorter than the flight of {duration:g} s")
-    for name, period in (("camera", options.camera_period), ("replan", options.replan_period)):
-        if not 0.0 < period < 10.0:
-            parser.error(f"--{name}-period {period:g}: must lie between 0 and 10 s")
-    periods = options.camera_period, options.replan_period
-    return Load(duration, *periods, warm_up, orbit=options.orbit, busy=options.busy), options
 
 
 def _schedulings(wanted: str) -> list[str]:
@@ -170,11 +156,10 @@ def _schedulings(wanted: str) -> list[str]:
     return ["ordinary"]
 
 
-def _write(folder: Path, load: Load, flights: dict[str, Figures], grids: dict[str, Grid]) -> None:
+def _write(folder: Path, facts: dict[str, object], grids: dict[str, Grid]) -> None:
     """Write the measured values, and the histogram if matplotlib is installed."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"load": asdict(load), "asked": ASKED, "flights": flights}, indent=2)
-    (folder / "executive.json").write_text(text + "\n", encoding="utf-8")
+    (folder / "executive.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     try:
         draw(grids, folder / "lateness.png")
     except ModuleNotFoundError:
@@ -213,11 +198,11 @@ def full_load(load: Load) -> str:
 
 
 @contextmanager
-def _compiled() -> Iterator[None]:
+def compiled() -> Iterator[None]:
     """Make Python use compiled modules, as after an installation, whatever the shell's environment is."""
-    with tempfile.TemporaryDirectory() as folder:
+    with scratch() as folder:
         before = {name: os.environ.pop(name, None) for name in (_NO_BYTECODE, _BYTECODE)}
-        os.environ[_BYTECODE] = folder
+        os.environ[_BYTECODE] = str(folder)
         try:
             modules = ", ".join((*_IMPORTED, *(role for role in _ROLES if ":" not in role)))
             subprocess.run([sys.executable, "-c", f"import {modules}"], cwd=ROOT, check=True)
@@ -229,24 +214,33 @@ def _compiled() -> Iterator[None]:
 
 def fly(folder: Path, load: Load, fifo: bool) -> Flown:
     """Run the flight once in `folder` beside the bare loop, and return the measured values."""
+    return watched_flight(
+        folder, full_load(load), load, PRIORITY if fifo else 0, lambda _, *words: _started(fifo, load, *words)
+    )
+
+
+def watched_flight(
+    folder: Path, text: str, load: Load, priority: int, start: Callable[..., LiveFlight]
+) -> Flown:
+    """Run a flight with the configuration `text` beside the bare loop, and return the measured values.
+
+    `start` receives an exit stack and the arguments of a `LiveFlight`.
+    """
     config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
     facts = devices / "facts.json"
-    config.write_text(full_load(load), encoding="utf-8")
+    config.write_text(text, encoding="utf-8")
     devices.mkdir()
     with ExitStack() as stack:
-        stack.enter_context(
-            answering(
-                "tests.studies.bench.bare_loop", str(PERIOD_NS), str(PRIORITY if fifo else 0), str(wakes)
-            )
-        )
+        bare = "tests.studies.bench.bare_loop", str(PERIOD_NS), str(priority), str(wakes)
+        stack.enter_context(answering(*bare))
         # The devices exist before the flight process starts, as on a board.
         outputs = "--folder", str(devices), "--facts", str(facts)
         stack.enter_context(answering("sim_hal", "serve", str(config), *outputs))
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         notifications.bind(str(folder / "notify"))
-        flight = _started(folder, config, notifications, load, facts, fifo)
+        flight = start(stack, folder, config, notifications, load.duration, "--devices", str(facts))
         stack.callback(flight.end)
-        ready_ns = flight.wait_for("READY=1")
+        ready_ns = flight.wait_for("READY=1", _PATIENCE_S)
         busy = process_watch.look({"control": flight.process.pid}).processor["control"]
         utc_offset_ns = time.time_ns() - time.monotonic_ns()
         watched = _watch(flight, notifications, load)
@@ -284,9 +278,7 @@ def members(flight: LiveFlight) -> dict[str, int]:
     return found
 
 
-def _started(
-    folder: Path, config: Path, notifications: socket.socket, load: Load, facts: Path, fifo: bool
-) -> LiveFlight:
+def _started(fifo: bool, load: Load, *words: Any) -> LiveFlight:
     """Start the flight on its devices, without the right to SCHED_FIFO if `fifo` is false."""
     started: list[LiveFlight] = []
 
@@ -294,7 +286,6 @@ def _started(
         if not fifo:
             # Only this thread and its child processes lose the capability CAP_SYS_NICE.
             ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
-        words = folder, config, notifications, load.duration, "--devices", str(facts)
         started.append(LiveFlight(*words, before=_KEPT_BUSY if load.busy else ""))
         if not fifo:
             resource.prlimit(started[0].process.pid, resource.RLIMIT_RTPRIO, (0, 0))

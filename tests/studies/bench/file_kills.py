@@ -1,4 +1,4 @@
-"""File transfer with killed processes: `python -m tests.studies.bench file_kills [--kills N] [--seed S]`.
+"""File transfer with killed processes.
 
 The link process and the ground's `flight files` run as separate processes on loopback. In each of N
 transfers, alternately downlink and uplink, each process receives one SIGKILL at a random time and is
@@ -8,23 +8,20 @@ both ends.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from ground.link.terminal import make_keys
-from tests.support.flights import CONFIG
+from tests.studies.command import Seed, command, say, scratch
 from tests.support.flooded_flight import free_port
+from tests.support.linked_board import write_linked_config
 from tests.support.linked_flight import service
 
 _RATE = 1.5e5
@@ -33,27 +30,23 @@ _START_S, _LATEST_S = 1.0, 3.0
 _PATIENCE_S = 120.0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    kills: Annotated[int, "of each side"] = 20,
+    megabytes: Annotated[float, "of the file"] = 1.0,
+    seed: Seed = 1,
+) -> int:
     """Run and print all transfers. Returns 0 if all files arrived complete and all transfers were closed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=20, metavar="N", help="of each side (default 20)")
-    parser.add_argument("--megabytes", type=float, default=1.0, metavar="M", help="of the file (default 1)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S")
-    options = parser.parse_args(arguments)
-    draw = np.random.default_rng(options.seed)
-    with tempfile.TemporaryDirectory(prefix="knightcube-") as folder:
-        place = Path(folder)
-        bench = _Bench(place, draw.bytes(round(options.megabytes * 1e6)), draw)
-        facts = []
-        for number in range(options.kills):
+    draw, facts = np.random.default_rng(seed), list[dict[str, int]]()
+    with scratch() as place:
+        bench = _Bench(place, draw.bytes(round(megabytes * 1e6)), draw)
+        for number in range(kills):
             facts.append(bench.transfer(number))
-            sys.stdout.write(json.dumps({"transfer": number, **facts[-1]}) + "\n")
-            sys.stdout.flush()
-    whole, closed = (sum(fact[name] for fact in facts) for name in ("whole", "closed"))
-    middle = sum(fact["in_the_middle"] for fact in facts)
-    found = {"transfers": len(facts), "kills": 2 * len(facts), "in_the_middle": middle}
-    sys.stdout.write(json.dumps({**found, "whole": whole, "closed": closed}) + "\n")
-    return int(not len(facts) == whole == closed)
+            say(transfer=number, **facts[-1])
+    sums = {name: sum(fact[name] for fact in facts) for name in ("in_the_middle", "whole", "closed")}
+    say(transfers=len(facts), kills=2 * len(facts), **sums)
+    return int(not len(facts) == sums["whole"] == sums["closed"])
 
 
 class _Bench:
@@ -61,12 +54,8 @@ class _Bench:
 
     def __init__(self, place: Path, data: bytes, draw: np.random.Generator) -> None:
         self._place, self._data, self._draw = place, data, draw
-        satellite, self._keys = make_keys(place / "keys")
         self._address = f"127.0.0.1:{free_port()}"
-        link = {"keys": str(satellite), "udp": self._address, "rate": _RATE}
-        commands = json.dumps({"socket": str(place / "commands")})
-        self._config = place / "flight.yaml"
-        self._config.write_text(f"{CONFIG.read_text()}\ncommands: {commands}\nlink: {json.dumps(link)}\n")
+        self._config = write_linked_config(place, udp=self._address, rate=_RATE)
         self._run = place / "runs" / "run-000001"
         self._run.mkdir(parents=True)
 
@@ -81,8 +70,8 @@ class _Bench:
             (self._run / name).write_bytes(self._data)
             full = f"log/run-000001/{name}"
             words, arrived = ["get", full], ground / "received" / full
-        asked = ["files", "--link", self._address, "--keys", self._keys, "--folder", ground]
-        asked += ["--rate", f"{_RATE:g}", "--timeout", f"{_PATIENCE_S:g}", *words]
+        asked = ["files", "--link", self._address, "--keys", self._place / "keys" / "ground"]
+        asked += ["--folder", ground, "--rate", f"{_RATE:g}", "--timeout", f"{_PATIENCE_S:g}", *words]
         middle = 0
         with ExitStack() as stack:
             link = self._link(stack)
@@ -118,7 +107,3 @@ class _Bench:
         """Return the records of open transfers of both ends."""
         ends = (self._place / "keys" / "files", self._place / "ground")
         return [path.name for end in ends for path in (end / "transfers").glob("*-*.json")]
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""File transfer with losses: `python -m tests.studies.bench files [--megabytes M] [--seed S]`.
+"""File transfer with losses.
 
 Link and ground run in one process on a manual clock with protected frames. Frames are lost at random with the
 same probability in both directions. For each probability and direction, the benchmark reports whether the
@@ -8,20 +8,17 @@ processor time.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
-import sys
-import tempfile
 import time
-from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from flight.link.process.directives import SendFile
 from tests.flight.link.process.filed_ends import FiledEnds
+from tests.studies.command import Seed, command, say, scratch
 
 _LOSSES = (0.0, 0.1, 0.3)
 _RATE = 250_000.0
@@ -29,22 +26,16 @@ _RATE = 250_000.0
 _LONGEST_NS = 7200 * 10**9
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(*, megabytes: Annotated[float, "of the file"] = 10.0, seed: Seed = 1) -> int:
     """Run and print all transfers. Returns 0 if all files arrived complete."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of the file (default 10)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S")
-    options = parser.parse_args(arguments)
     sound = True
-    for loss in _LOSSES:
-        for down in (True, False):
-            with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-                size = round(options.megabytes * 1e6)
-                facts = measure(Path(place), size, loss, options.seed, down=down)
-            sound &= facts["whole"] and facts["closed"]
-            sys.stdout.write(json.dumps(facts) + "\n")
-            sys.stdout.flush()
-    return 0 if sound else 1
+    for loss, down in product(_LOSSES, (True, False)):
+        with scratch() as place:
+            facts = measure(place, round(megabytes * 1e6), loss, seed, down=down)
+        sound &= facts["whole"] and facts["closed"]
+        say(**facts)
+    return int(not sound)
 
 
 def measure(place: Path, size: int, loss: float, seed: int, *, down: bool) -> dict[str, Any]:
@@ -77,7 +68,3 @@ def measure(place: Path, size: int, loss: float, seed: int, *, down: bool) -> di
         "seconds": round((link.clock.now_ns() - begun_ns) * 1e-9, 1),
         "processor_seconds": round(time.process_time() - begun, 1),
     }
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""A user's campaign, killed and resumed: `python -m tests.studies.bench killed_campaign [--dask]`.
+"""A user's campaign, killed and resumed.
 
 The command `knightcube campaign` runs with the same draws undisturbed, and then killed at random times (one
 SIGINT, otherwise SIGKILL) and restarted each time. With `--dask` it also runs on a cluster of two workers,
@@ -8,13 +8,11 @@ the flights that were flown twice, the processes that outlive a campaign, and th
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -22,11 +20,13 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ground.campaigns.runner import show
+from knightcube.errors import UsageError
+from tests.studies.command import Seed, command, scratch
 
 ROOT = Path(__file__).parents[3]
 VARIED = ("plant.inertia=10%", "plant.thread_stiffness=normal 5%", "coils.current_limit=0.1|0.14")
@@ -216,20 +216,19 @@ def _runs(process: int) -> bool:
         return False
 
 
-def main(arguments: Sequence[str]) -> int:
+@command
+def main(
+    *,
+    runs: Annotated[int, "flights of the campaign"] = 500,
+    duration: Annotated[float, "of each flight, s"] = 0.3,
+    kills: Annotated[int, "of the campaign"] = 5,
+    seed: Seed = 1,
+    dask: Annotated[bool, "also on a cluster with a lost worker"] = False,
+) -> int:
     """Print the comparisons. Returns 1 if a campaign is incomplete, differs, or left processes or files."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=500, metavar="N", help="default %(default)s")
-    parser.add_argument("--duration", type=float, default=0.3, metavar="S", help="default %(default)s")
-    parser.add_argument("--kills", type=int, default=5, metavar="N", help="default %(default)s")
-    parser.add_argument(
-        "--seed", type=int, default=1, metavar="N", help="of the moments, default %(default)s"
-    )
-    parser.add_argument("--dask", action="store_true", help="also on a cluster with a lost worker")
-    options = parser.parse_args(arguments)
-    if options.dask and find_spec("distributed") is None:
-        parser.error("--dask needs the package distributed: pip install 'knightcube-flight[dask]'")
-    with tempfile.TemporaryDirectory(prefix="knightcube-") as name:
-        found = killed(Path(name), options.runs, options.duration, options.kills, options.seed, options.dask)
+    if dask and find_spec("distributed") is None:
+        raise UsageError("--dask needs the package distributed: pip install 'knightcube-flight[dask]'")
+    with scratch() as folder:
+        found = killed(folder, runs, duration, kills, seed, dask)
     show({"campaigns": {kind: asdict(one) for kind, one in found.items()}})
-    return 0 if all(one.sound(options.runs) for one in found.values()) else 1
+    return 0 if all(one.sound(runs) for one in found.values()) else 1

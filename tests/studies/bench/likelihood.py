@@ -1,4 +1,4 @@
-"""Likelihood fit relative to the Cramer-Rao bound, and its time: `python -m tests.studies.bench.likelihood`.
+"""Likelihood fit relative to the Cramer-Rao bound, and its time.
 
 The frames show random fields of the real sky through the simulator's default camera (1024 x 1024, 20 deg). A
 ratio is the rms error divided by the bound of the 20 brightest stars, each computed as if it were alone in
@@ -12,9 +12,10 @@ fitted again with all stars of the catalogue, as in flight; the results and time
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
+from itertools import product
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from tests.knightcube.vision.streaks.scenes import (
     Scene,
     real_sky,
 )
+from tests.studies.command import Seed, Table, command
 
 _SEED = 31_415
 _SETTINGS = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
@@ -53,7 +55,7 @@ def estimated(scene: Scene, known_sky: bool) -> MotionResult:
 
 def rate_row(
     theta: float, length: float, exposure: float, frames: int, seed: int, faintest: float, known_sky: bool
-) -> str:
+) -> dict[str, Any]:
     """Return one row of the table of rates."""
     vector, magnitude, nees, places, times = [], [], [], [], []
     for frame in range(frames):
@@ -70,11 +72,17 @@ def rate_row(
         nees.append(float(error @ np.linalg.solve(found.covariance, error)) / 3.0)
         places.extend(_place_errors(found.stars, scene, bound.positions))
     rms = [float(np.sqrt(np.mean(values))) for values in (vector, magnitude, places)]
-    return (
-        f"{np.rad2deg(theta):5.0f} {length:6.0f} {exposure:4.1f} {len(vector):4d}/{frames:<3d}"
-        f" {rms[0]:7.2f} {rms[1]:7.2f} {rms[2]:7.2f} {np.sqrt(np.median(places) / np.log(2.0)):7.2f}"
-        f" {np.mean(nees):6.2f} {np.median(times):7.0f} {np.max(times):7.0f}"
-    )
+    return {
+        "theta": float(np.rad2deg(theta)),
+        "px": length,
+        "s": exposure,
+        "rates": f"{len(vector)}/{frames}",
+        **dict(zip(("vector", "magnitude", "place"), rms, strict=True)),
+        "median_place": float(np.sqrt(np.median(places) / np.log(2.0))),
+        "NEES": float(np.mean(nees)),
+        "median_ms": float(np.median(times)),
+        "largest_ms": float(np.max(times)),
+    }
 
 
 def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[float]:
@@ -97,30 +105,22 @@ def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[f
     return out
 
 
-def main() -> None:
+@command
+def main(
+    *,
+    frames: Annotated[int, "of a row"] = 10,
+    seed: Seed = _SEED,
+    faintest: Annotated[float, "magnitude V of the faintest stars in the sky"] = 8.5,
+    theta: Annotated[tuple[float, ...], "deg"] = (90.0, 45.0, 10.0, 0.0),
+    length: Annotated[tuple[float, ...], "px"] = (51.0, 102.0, 205.0, 512.0),
+    exposure: Annotated[tuple[float, ...], "s"] = (0.2, 1.0),
+    known_sky: Annotated[bool, "identify the stars and fit again"] = False,
+) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=10, help="frames per row (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
-    parser.add_argument(
-        "--faintest", type=float, default=8.5, help="stars in the sky to V (default %(default)s)"
+    sys.stdout.write(
+        f"{frames} frames a row, seed {seed}, stars to V {faintest}; errors over the bound, rms\n"
     )
-    parser.add_argument("--theta", type=float, nargs="+", default=[90.0, 45.0, 10.0, 0.0], help="deg")
-    parser.add_argument("--length", type=float, nargs="+", default=[51.0, 102.0, 205.0, 512.0], help="px")
-    parser.add_argument("--exposure", type=float, nargs="+", default=[0.2, 1.0], help="s")
-    parser.add_argument("--known-sky", action="store_true", help="identify the stars and fit again")
-    options = parser.parse_args()
-    out = sys.stdout
-    out.write(f"{options.frames} frames a row, seed {options.seed}, stars to V {options.faintest}\n")
-    out.write("                         error over the bound, rms     median      CPU ms\n")
-    out.write("theta     px    s   rates  vector magnitude   place   place   NEES  median     max\n")
-    for theta in options.theta:
-        for length in options.length:
-            for exposure in options.exposure:
-                asked = options.frames, options.seed, options.faintest, options.known_sky
-                out.write(rate_row(np.deg2rad(theta), length, exposure, *asked) + "\n")
-                out.flush()
-
-
-if __name__ == "__main__":
-    main()
+    table = Table()
+    for each in product(np.deg2rad(theta).tolist(), length, exposure):
+        table.add(**rate_row(*each, frames, seed, faintest, known_sky))
+    return 0

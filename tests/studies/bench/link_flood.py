@@ -1,4 +1,4 @@
-"""Lateness of the loop while its link is flooded: `python -m tests.studies.bench link_flood [--seconds S]`.
+"""Lateness of the loop while its link is flooded.
 
 The step demonstration flies in real time on its emulated devices beside its link process. It flies first
 without a flood. In the second flight the link receives 10,000 forged frames a second while it plays back the
@@ -8,18 +8,12 @@ the control cycles, the counts of link and ground, and the received part of the 
 
 from __future__ import annotations
 
-import argparse
-import json
 import subprocess
-import sys
-import tempfile
 import threading
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from random import Random
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -31,8 +25,9 @@ from flight.link.telemetry.definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.commanding import FileSession
 from ground.link.terminal import open_terminal
+from tests.studies.command import command, say, scratch
 from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
-from tests.support.link_attacker import LinkAttacker
+from tests.support.link_attacker import attackers_frames
 from tests.support.linked_board import write_linked_config
 
 _FRAMES_A_SECOND = 10_000
@@ -41,18 +36,12 @@ _FILE, _FILE_BYTES = "dump.bin", 50_000_000
 _UP_RATE = 20_000.0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(*, seconds: Annotated[float, "of each flight"] = 60.0) -> int:
     """Run both flights, and print the measured values."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default 60)"
-    )
-    options = parser.parse_args(arguments)
     for name in ("alone", "flooded"):
-        with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-            facts = measure(Path(place), options.seconds, flooded=name == "flooded")
-        sys.stdout.write(json.dumps({"flight": name, **facts}) + "\n")
-        sys.stdout.flush()
+        with scratch() as place:
+            say(flight=name, **measure(place, seconds, flooded=name == "flooded"))
     return 0
 
 
@@ -71,8 +60,8 @@ def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
         stack.callback(ended.set)
         if flooded:
             wait_for(place / "commands")
-            attacker = threading.Thread(target=_flood, args=(port, ended, forged))
-            attacker.start()
+            own = (port, attackers_frames(_KINDS), _FRAMES_A_SECOND, ended, forged)
+            threading.Thread(target=flood, args=own).start()
         counts = _listen(port, place, flight, flooded)
         ended.set()
         assert link.poll() is None, "the link has ended by itself"
@@ -107,16 +96,3 @@ def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool)
     names = ("received", "admitted", "refused_crc", "refused_mac", "refused_repeated", "sent")
     counts = {name: int(row[name]) for name in names}
     return {**counts, "packets_on_ground": packets, "file_bytes": file_bytes}
-
-
-def _flood(port: int, ended: threading.Event, forged: list[int]) -> None:
-    """Send forged and damaged frames until `ended`, and record the number in each burst."""
-    chance = Random(1)
-    with tempfile.TemporaryDirectory() as folder:
-        attacker = LinkAttacker(Path(folder))
-        frames = [attacker.frame(chance)[1] for _ in range(_KINDS)]
-    flood(port, frames, _FRAMES_A_SECOND, ended, forged)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""Link killed between accepting, storing and forwarding commands: `python -m tests.studies.bench link_kills`.
+"""Link killed between accepting, storing and forwarding commands.
 
 In each run, a link process receives the commands of a ground station while an attacker replays all old
 frames. The link process is killed (SIGKILL) before or after one of its calls that write to the disk or to the
@@ -13,18 +13,16 @@ commands that it never received (each kill may cost one), and schedules without 
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import signal
 import socket
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -40,6 +38,7 @@ from flight.link.telemetry.packets import Packer
 from ground.link.terminal import Terminal, TerminalSettings, make_keys
 from tests.flight.link.process.both_ends import SETTINGS, GroundWire, Wire
 from tests.manual_clock import ManualClock
+from tests.studies.command import Seed, command, say, scratch
 
 _AT_ONCE = 3
 _SENDER_POINTS = 5 * _AT_ONCE + 1
@@ -94,25 +93,25 @@ class Findings:
             self.obeyed.update(command.number for command in commands if isinstance(command, Ping))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    kills: Annotated[int, "of the link"] = 1000,
+    seed: Seed = 1,
+    scheduled: Annotated[bool, "kill while scheduled commands fall due"] = False,
+) -> int:
     """Kill the processes and print the counts.
 
     Returns 0 if the flight received no command twice and each kill cost at most one command.
     """
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=1000, metavar="N", help="of the link (default 1000)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S")
-    parser.add_argument("--scheduled", action="store_true", help="kill while scheduled commands fall due")
-    options = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-        measured = measure_scheduled if options.scheduled else measure
-        found = measured(Path(place), options.kills, options.seed)
-    facts = {"kills": found.kills, "commands": len(found.obeyed), "obeyed_twice": found.obeyed_twice}
-    if options.scheduled:
-        facts |= {"scheduled": found.scheduled, "never": found.never, "schedules_lost": found.schedules_lost}
+    with scratch() as place:
+        found = (measure_scheduled if scheduled else measure)(place, kills, seed)
+    facts: dict[str, Any]
+    if scheduled:
+        facts = {"scheduled": found.scheduled, "never": found.never, "schedules_lost": found.schedules_lost}
     else:
-        facts |= {"frames": len(found.seen), "counters_twice": found.counters_twice}
-    sys.stdout.write(json.dumps(facts) + "\n")
+        facts = {"frames": len(found.seen), "counters_twice": found.counters_twice}
+    say(kills=found.kills, commands=len(found.obeyed), obeyed_twice=found.obeyed_twice, **facts)
     twice = found.obeyed_twice + found.counters_twice + found.schedules_lost
     return int(twice > 0 or found.never > found.kills or not found.obeyed)
 
@@ -281,7 +280,3 @@ def _serve(place: Path, frames: list[bytes] | None, turns: int, way: Way) -> Non
     for _ in range(turns):
         station.turn()
         clock.advance(TURN_NS)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,7 +1,5 @@
 """Error of the attitude at mid-exposure of a streaked frame, relative to its lower bound.
 
-Command: `python -m tests.studies bench mid_exposure`.
-
 Row `flight` is the star tracker's result for the first fit, with a rough prior of the pointing. Row `known
 sky` is its result for the second fit, in which the light of undetected stars is subtracted
 (`knightcube.vision.startracker.catalogue_refit`). The rates of both fits are compared with their bound too.
@@ -13,9 +11,7 @@ spread function and attitude are common to all stars.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -32,6 +28,7 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns import streaks as campaign
+from tests.studies.command import Json, Seed, command
 from tests.support.attitude_errors import attitude_error, error_in_pixels
 from tests.support.scenes import FIELD, Scene, noise_floor, slew
 from tests.support.streak_bound import star_information
@@ -206,26 +203,17 @@ def _root_mean_square(values: FloatArray) -> float | None:
     return float(np.sqrt(np.mean(np.square(there)))) if len(there) else None
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    frames: Annotated[int, "for each rotation"] = 20,
+    percent: Annotated[tuple[float, ...], "rotations, % of the field"] = (10.0, 20.0, 35.0, 50.0),
+    faintest: Annotated[float, "magnitude of the faintest star"] = 8.5,
+    exposure: Annotated[float, "s"] = EXPOSURE,
+    seed: Seed = 14_142,
+    json: Json = False,
+) -> int:
     """Print the table, or one JSON object; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies bench mid_exposure", description=__doc__)
-    parser.add_argument(
-        "--frames", type=int, default=20, help="frames for each rotation (default %(default)s)"
-    )
-    parser.add_argument(
-        "--percent", type=float, nargs="+", default=[10.0, 20.0, 35.0, 50.0], help="of the field"
-    )
-    parser.add_argument(
-        "--faintest", type=float, default=8.5, help="magnitude of the faintest star (default %(default)s)"
-    )
-    parser.add_argument("--exposure", type=float, default=EXPOSURE, help="in s (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=14_142, help="default %(default)s")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
-    options = parser.parse_args(arguments)
-    rows = [
-        row
-        for percent in options.percent
-        for row in attitude_rows(percent, options.frames, options.seed, options.faintest, options.exposure)
-    ]
-    show({"seed": options.seed, "exposure": options.exposure, "attitude": rows}, options.json)
+    rows = [row for part in percent for row in attitude_rows(part, frames, seed, faintest, exposure)]
+    show({"seed": seed, "exposure": exposure, "attitude": rows}, json)
     return 0

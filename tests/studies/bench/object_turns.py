@@ -1,4 +1,4 @@
-"""Detection of objects among long streaks, and its time: `python -m tests.studies.bench.object_turns`.
+"""Detection of objects among long streaks, and its time.
 
 The camera of the simulator rotates by 10 to 30 % of its field within 0.5 s about a random axis. A frame has
 no object, or one of the given magnitude that moves by 9 to 87 px relative to the stars, as in the campaign
@@ -8,10 +8,10 @@ time.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from tests.studies.campaigns.rso import (
     Sky,
     ends_error,
 )
+from tests.studies.command import Seed, Table, command
 from tests.support.scenes import FIELD, SAMPLES
 
 _SEED = 27_182
@@ -111,41 +112,48 @@ def looked(
     return Looked(min(hits, default=None), claims, len(found) - min(len(hits), 1), spent)
 
 
-def main() -> None:
+@command
+def main(
+    *,
+    frames: Annotated[int, "of a row"] = 30,
+    seed: Seed = _SEED,
+    percent: Annotated[tuple[float, ...], "rotations, % of the field"] = (10.0, 20.0, 30.0),
+    magnitude: Annotated[tuple[float, ...], "of the object"] = (4.0, 5.0),
+    empty: Annotated[bool, "frames without an object"] = False,
+) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=30, help="frames per row (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
-    parser.add_argument("--percent", type=float, nargs="+", default=[10.0, 20.0, 30.0], help="of the field")
-    parser.add_argument("--magnitude", type=float, nargs="+", default=[4.0, 5.0], help="of the object")
-    parser.add_argument("--empty", action="store_true", help="frames without an object")
-    options = parser.parse_args()
-    camera, out = StarCameraModel(field_of_view=FIELD), sys.stdout
-    out.write(f"{options.frames} frames a row, seed {options.seed}\n")
-    out.write("  %    V   rates  found  others  error px  (error/claim)^2  CPU ms: median  95 %     max\n")
+    camera, table = StarCameraModel(field_of_view=FIELD), Table()
+    sys.stdout.write(f"{frames} frames a row, seed {seed}\n")
     # One search runs untimed, because the first search of a process also loads compiled code.
-    pixels, rate, _ = frame(camera, (options.seed,), options.percent[0], None)
+    pixels, rate, _ = frame(camera, (seed,), percent[0], None)
     looked(camera, pixels, rate, None)
-    for percent in options.percent:
-        for magnitude in [None] if options.empty else options.magnitude:
-            seen = []
-            for number in range(options.frames):
-                seed = (options.seed, round(percent), number)
-                pixels, rate, ends = frame(camera, seed, percent, magnitude)
-                seen.append(looked(camera, pixels, rate, None if magnitude is None else ends))
-            rates = [each for each in seen if each is not None]
-            errors = [each.error for each in rates if each.error is not None]
-            claims = [claim for each in rates for claim in each.claims]
-            spent = np.array([each.spent for each in rates])
-            out.write(
-                f"{percent:3.0f} {'-' if magnitude is None else f'{magnitude:.1f}':>4s} {len(rates):7d}"
-                f" {len(errors):6d} {sum(each.others for each in rates):7d}"
-                f" {np.median(errors) if errors else np.nan:9.2f}"
-                f" {np.mean(claims) if claims else np.nan:16.1f} {np.median(spent):15.0f}"
-                f" {np.percentile(spent, 95.0):5.0f} {spent.max():7.0f}\n"
-            )
-            out.flush()
+    for part in percent:
+        for size in (None,) if empty else magnitude:
+            table.add(**_row(camera, frames, seed, part, size))
+    return 0
 
 
-if __name__ == "__main__":
-    main()
+def _row(
+    camera: StarCameraModel, frames: int, seed: int, percent: float, magnitude: float | None
+) -> dict[str, Any]:
+    """Return the results of frames with one rotation and one magnitude."""
+    found = []
+    for number in range(frames):
+        pixels, rate, ends = frame(camera, (seed, round(percent), number), percent, magnitude)
+        one = looked(camera, pixels, rate, None if magnitude is None else ends)
+        found += [] if one is None else [one]
+    errors = [each.error for each in found if each.error is not None]
+    claims = [claim for each in found for claim in each.claims]
+    spent = np.array([each.spent for each in found])
+    return {
+        "%": percent,
+        "V": "-" if magnitude is None else magnitude,
+        "rates": len(found),
+        "found": len(errors),
+        "others": sum(each.others for each in found),
+        "error_px": float(np.median(errors)) if errors else np.nan,
+        "(error/claim)^2": float(np.mean(claims)) if claims else np.nan,
+        "median_ms": float(np.median(spent)),
+        "95_%_ms": float(np.percentile(spent, 95.0)),
+        "largest_ms": float(spent.max()),
+    }

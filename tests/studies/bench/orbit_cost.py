@@ -1,4 +1,4 @@
-"""Processor time of a flight in lock-step: `python -m tests.studies.bench orbit_cost [--config FILE]`.
+"""Processor time of a flight in lock-step.
 
 The command simulates the first seconds of config/orbit.yaml, from the tip-off to pointing, or of another
 configuration. It reads the processor time of a control cycle and of the workers' jobs from the log. The time
@@ -8,13 +8,11 @@ scaled to those of a standard machine.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import subprocess
 import sys
-import tempfile
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import yaml
@@ -23,6 +21,7 @@ from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import Run, read_run
 from tests.pace import ORDINARY_PACE_S, pace_s
+from tests.studies.command import command, scratch
 
 ROOT = Path(__file__).resolve().parents[3]
 WANTED_CYCLE_MS = 0.6
@@ -35,25 +34,24 @@ runpy.run_module("flight", run_name="__main__", alter_sys=True)
 MODES = (Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT, Mode.TESTBED_DEMO)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    seconds: Annotated[float, "of flight"] = 600.0,
+    config: Annotated[str, "the configuration"] = "config/orbit.yaml",
+) -> int:
     """Print the costs; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench orbit_cost", description=__doc__)
-    parser.add_argument("--seconds", type=float, default=600.0, help="of flight, %(default)s by default")
-    parser.add_argument("--config", default="config/orbit.yaml", help="%(default)s by default")
-    options = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) / "run"
-        config, one = options.config, str(folder.with_name("one"))
-        begun, _ = command_s("run", config, "--duration", "1", "--out", one)
-        flown, slowness = command_s("run", config, "--duration", str(options.seconds), "--out", str(folder))
-        spent = flown - begun
-        text = figures(read_run(folder), slowness)
-    duration = float(yaml.safe_load((ROOT / options.config).read_text(encoding="utf-8"))["duration"])
-    whole = begun + spent * duration / options.seconds
+    with scratch() as folder:
+        begun, _ = command_s("run", config, "--duration", "1", "--out", str(folder / "one"))
+        flown, slowness = command_s("run", config, "--duration", str(seconds), "--out", str(folder / "run"))
+        text = figures(read_run(folder / "run"), slowness)
+    spent = flown - begun
+    duration = float(yaml.safe_load((ROOT / config).read_text(encoding="utf-8"))["duration"])
+    whole = begun + spent * duration / seconds
     sys.stdout.write(
-        f"{text}start {begun:.1f} s, {options.seconds:g} s of flight {spent:.1f} s of an ordinary "
+        f"{text}start {begun:.1f} s, {seconds:g} s of flight {spent:.1f} s of an ordinary "
+        f"core: {whole:.0f} s for {duration:g} s\n"
     )
-    sys.stdout.write(f"core: {whole:.0f} s for {duration:g} s\n")
     return 0
 
 

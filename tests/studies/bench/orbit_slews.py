@@ -1,4 +1,4 @@
-"""Plan slews in orbit, random or recorded: `python -m tests.studies.bench orbit_slews [--recorded]`.
+"""Plan slews in orbit, random or recorded.
 
 The slews are of 30 to 180 deg from rest to rest, in the orbits of the space station and of a Sun-synchronous
 satellite, in the field of WMM2025. A 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2) slews in 80 to 400 s, and a 3U
@@ -11,12 +11,11 @@ exposes along the slew. Times are processor times of this process.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 from unittest.mock import patch
 
 import numpy as np
@@ -37,36 +36,32 @@ from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath, SlewTask
 from knightcube.gnc.guidance.slew_plan import SlewPlan, SlewStatus, plan_task
 from tests.studies.campaigns.orbit_pointing_flight import TORQUE
+from tests.studies.command import Seed, command
 from tests.support.pointing_settings import AXES, WEIGHTS
 from tests.support.random_slews import _DATE, STAR_CAMERA, clearance, slews
-from tests.support.recorded_slews import (
-    FILE,
-    flown,
-    off_degrees,
-    recorded,
-    task_of,
-)
+from tests.support.recorded_slews import FILE, flown, off_degrees, task_of
+from tests.support.recorded_slews import recorded as recorded_slews
 
 Planner = Callable[[SlewTask], SlewPlan]
 PLANNERS: dict[str, Planner] = {"collocation": plan_task, "vmc": slew_vmc.plan_task}
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    runs: Annotated[int, "slews to plan"] = 200,
+    seed: Seed = 1,
+    recorded: Annotated[bool, "those with known optima instead"] = False,
+    cones: Annotated[bool, "of Sun, Earth and Moon, for the star camera"] = False,
+    job: Annotated[bool, "the planner's job as flown, in cones"] = False,
+    planner: Annotated[str, "of slews, not of jobs", tuple(PLANNERS)] = "collocation",
+) -> int:
     """Print the results; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench orbit_slews", description=__doc__)
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--recorded", action="store_true", help="those with known optima instead")
-    parser.add_argument("--cones", action="store_true", help="of Sun, Earth and Moon, for the star camera")
-    parser.add_argument("--job", action="store_true", help="the planner's job as flown, in cones")
-    parser.add_argument("--planner", choices=PLANNERS, default="collocation", help="of slews, not of jobs")
-    options = parser.parse_args(arguments)
-    if options.job:
-        return _jobs(options.runs, options.seed)
-    planner = PLANNERS[options.planner]
-    if options.recorded:
-        return _recorded(planner)
-    return _random(options.runs, options.seed, options.cones, planner)
+    if job:
+        return _jobs(runs, seed)
+    if recorded:
+        return _recorded(PLANNERS[planner])
+    return _random(runs, seed, cones, PLANNERS[planner])
 
 
 def _recorded(planner: Planner) -> int:
@@ -76,7 +71,7 @@ def _recorded(planner: Planner) -> int:
         return 1
     sys.stdout.write(f"{'slew':28} of the optimum  peak   off, deg  processor, s\n")
     ratios = []
-    for case in recorded()["problems"]:
+    for case in recorded_slews()["problems"]:
         least = case["kind"] == "time"
         task = task_of(case, case["T"], time_cost=MINIMUM_TIME if least else None)
         begin = time.process_time()
@@ -112,9 +107,7 @@ def _random(runs: int, seed: int, with_cones: bool, planner: Planner) -> int:
             nearest = min(nearest, clearance(task, found[-1]))
     stretched = sum(plan.status is SlewStatus.STRETCHED for plan in found)
     sys.stdout.write(f"{len(found)} of {runs} planned, {stretched} of them stretched, {failed} failed\n")
-    sys.stdout.write(f"{np.median(taken):.2f} s in the median, {max(taken):.2f} s at most\n")
-    late = sum(spent > 1.5 for spent in taken)
-    sys.stdout.write(f"{late} took more than 1.5 s; the first, from cold, {taken[0]:.2f} s\n")
+    sys.stdout.write(f"{_times(taken)}\n")
     if np.isfinite(nearest):
         sys.stdout.write(f"nearest to a cone: {np.degrees(nearest):.3f} deg outside\n")
     return 0
@@ -139,13 +132,16 @@ def _jobs(runs: int, seed: int) -> int:
             planned += pointing_job.new_table(job).slew is not None
             whole.append(time.process_time() - begin)
     sys.stdout.write(f"{planned} of {runs} jobs gave a slew\n")
-    for what, taken in (("whole jobs", whole), ("of these the slew", plans)):
-        late = sum(spent > 1.5 for spent in taken)
-        sys.stdout.write(
-            f"{what}: {np.median(taken):.2f} s in the median, {max(taken):.2f} s at most, {late} "
-        )
-        sys.stdout.write(f"over 1.5 s; the first, from cold, {taken[0]:.2f} s\n")
+    sys.stdout.write(f"whole jobs: {_times(whole)}\nof these the slew: {_times(plans)}\n")
     return 0
+
+
+def _times(taken: Sequence[float]) -> str:
+    late = sum(spent > 1.5 for spent in taken)
+    return (
+        f"{np.median(taken):.2f} s in the median, {max(taken):.2f} s at most, {late} over 1.5 s; "
+        f"the first, from cold, {taken[0]:.2f} s"
+    )
 
 
 def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:

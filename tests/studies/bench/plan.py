@@ -1,4 +1,4 @@
-"""Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N]`.
+"""Measure the planner against the optimum.
 
 The slews are random over the testbed's range, with thread stiffness, disturbance and moving end points
 (tests.support.step_problems). The durations of the first set are 1.1 to 2.5 times the shortest feasible one.
@@ -9,16 +9,15 @@ checked at 4001 points of the path.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from knightcube.errors import PlanningError
+from knightcube.errors import PlanningError, UsageError
 from knightcube.gnc.guidance.vmc import PlanStatus
+from tests.studies.command import Json, Seed, command, say
 from tests.support.collocation_oracle import solve
 from tests.support.step_problems import STEPS, THESIS, Problem, feasible_problems, largest_ratio
 
@@ -85,32 +84,20 @@ def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
     return {"cold_evaluations": float(np.mean(cold)), "warm_evaluations": float(np.mean(warm))}
 
 
-def main(arguments: list[str]) -> int:
+@command
+def main(*, runs: Annotated[int, "of feasible durations"] = 500, seed: Seed = 1, json: Json = False) -> int:
     """Print the results."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench plan", description=__doc__)
-    parser.add_argument("--runs", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
-    options = parser.parse_args(arguments)
-    if options.runs < 1:
-        parser.error("--runs must be at least 1")
+    if runs < 1:
+        raise UsageError("--runs must be at least 1")
     THESIS.planned()  # fills the caches, as the first plan of a worker does
     STEPS[0].planned()
-    feasible = feasible_problems(options.runs, options.seed, FEASIBLE)
-    short = feasible_problems(max(1, options.runs // 5), options.seed + 1, TOO_SHORT)
-    figures = {
-        "seed": options.seed,
-        "feasible": measure(feasible) | warm_gain(feasible[:100]),
-        "too_short": measure(short),
-    }
-    if options.json:
-        sys.stdout.write(json.dumps(figures) + "\n")
+    feasible = feasible_problems(runs, seed, FEASIBLE)
+    short = feasible_problems(max(1, runs // 5), seed + 1, TOO_SHORT)
+    figures = {"feasible": measure(feasible) | warm_gain(feasible[:100]), "too_short": measure(short)}
+    if json:
+        say(seed=seed, **figures)
         return 0
-    for name in ("feasible", "too_short"):
+    for name, found in figures.items():
         sys.stdout.write(f"{name.replace('_', ' ')} horizons\n")
-        sys.stdout.writelines(f"  {key:28s} {value:.6g}\n" for key, value in figures[name].items())
+        sys.stdout.writelines(f"  {key:28s} {value:.6g}\n" for key, value in found.items())
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

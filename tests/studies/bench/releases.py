@@ -1,4 +1,4 @@
-"""Updates of real releases over the link: `python -m tests.studies.bench releases`.
+"""Updates of real releases over the link.
 
 The releases are built from the sources of this repository with pip, virtual environments and the packages of
 this Python environment. Only systemd and the radio are replaced by test doubles. `deploy/install.sh` installs
@@ -11,8 +11,6 @@ configuration ends at once, so the board returns to the previous release.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import re
 import shutil
@@ -20,10 +18,8 @@ import signal
 import subprocess
 import sys
 import sysconfig
-import tempfile
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import closing
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -35,6 +31,7 @@ from tests.deploy.boards import FakeBoard
 from tests.deploy.renewed_board import RenewedBoard
 from tests.deploy.renewed_ends import SOCKET, RenewedEnds, linked_text
 from tests.deploy.scripts import DEPLOY, ROOT, script
+from tests.studies.command import command, say, scratch
 
 KIND = KINDS.index("release")
 FLIGHT_S, KILLED_AFTER_S = 2.0, 12.0
@@ -136,16 +133,15 @@ class Rehearsal:
         self.ends = RenewedEnds(self.board, 1)
         self.steps: list[dict[str, object]] = []
         self.board.step()
-        self._note(f"install.sh installs {__version__}")
+        self.note(f"install.sh installs {__version__}")
 
-    def _note(self, step: str, **facts: object) -> None:
+    def note(self, step: str, **facts: object) -> None:
         """Start the flight, and print a step of the benchmark."""
         seconds = round(time.monotonic() - self._begun, 1)
         flown = self.ends.flown_release()
         row = {"step": step, "flies": flown, "answers": self.ends.answers(), "s": seconds, **facts}
         self.steps.append(row)
-        sys.stdout.write(json.dumps(row) + "\n")
-        sys.stdout.flush()
+        say(**row)
         self._begun = time.monotonic()
 
     def activate(self, version: str, number: int, added: str = "", killed: bool = False) -> None:
@@ -160,14 +156,14 @@ class Rehearsal:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         self.advance()
-        self._note(f"{version} is activated", bundle_bytes=bundle.stat().st_size, killed=killed)
+        self.note(f"{version} is activated", bundle_bytes=bundle.stat().st_size, killed=killed)
 
     def command(self, directive: Confirm | Withdraw, step: str) -> None:
         """Send a command about the release, and record the version in use after it."""
         self.ends.ask(directive)
         self.ends.turn(1.5)
         self.advance()
-        self._note(step)
+        self.note(step)
 
     def advance(self, seconds: float = 10.0) -> None:
         """Run a step of the privileged program, restart flight and link, and make the link report."""
@@ -176,30 +172,24 @@ class Rehearsal:
         self.ends.turn(1.5)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main() -> int:
     """Renew the releases. Returns 0 if the expected release is in use after each step."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.parse_args(arguments)
     minor, _, patch = __version__.rpartition(".")
     second, third = (f"{minor}.{int(patch) + number}" for number in (1, 2))
-    with tempfile.TemporaryDirectory(prefix="knightcube-") as folder, ExitStack() as stack:
-        rehearsal = Rehearsal(Path(folder))
-        stack.callback(rehearsal.ends.close)
-        rehearsal.activate(second, 1, killed=True)
-        rehearsal.command(Confirm(KIND), f"{second} is confirmed")
-        rehearsal.command(Withdraw(KIND), f"{second} is withdrawn")
-        rehearsal.command(Withdraw(KIND), f"{__version__} is withdrawn")
-        rehearsal.activate(third, 2, _UNFLYABLE)
-        rehearsal.advance()
-        rehearsal._note(f"{third} has ended its trial")
-        texts = [
-            report.text for report in rehearsal.ends.reports() if report.name in {"activate", "withdraw"}
-        ]
+    with scratch() as folder:
+        rehearsal = Rehearsal(folder)
+        with closing(rehearsal.ends):
+            rehearsal.activate(second, 1, killed=True)
+            rehearsal.command(Confirm(KIND), f"{second} is confirmed")
+            rehearsal.command(Withdraw(KIND), f"{second} is withdrawn")
+            rehearsal.command(Withdraw(KIND), f"{__version__} is withdrawn")
+            rehearsal.activate(third, 2, _UNFLYABLE)
+            rehearsal.advance()
+            rehearsal.note(f"{third} has ended its trial")
+            reports = rehearsal.ends.reports()
     flown = [step["flies"] for step in rehearsal.steps]
     wanted = [__version__, second, second, __version__, second, "", second]
-    sys.stdout.write(json.dumps({"flown": flown, "wanted": wanted, "reports": texts}) + "\n")
+    texts = [report.text for report in reports if report.name in {"activate", "withdraw"}]
+    say(flown=flown, wanted=wanted, reports=texts)
     return int(flown != wanted or not all(step["answers"] for step in rehearsal.steps))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,4 +1,4 @@
-"""The star tracker on photographs and on simulated frames: `python -m tests.studies.bench sky`.
+"""The star tracker on photographs and on simulated frames.
 
 The photographs are in a folder with a file `truth.json`, which gives right ascension and declination of the
 image's centre and the horizontal field of view in degrees. Each photograph is solved with the field known to
@@ -14,15 +14,13 @@ that of each other program: the median of the ratios for each frame size.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -32,7 +30,8 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.images import read_image
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame
 from tests.studies.bench.star_peers import PEERS
-from tests.studies.bench.starid import Answer, peer_answers
+from tests.studies.bench.starid import Answer, PeerPython, Peers, peer_answers
+from tests.studies.command import Json, command, scratch
 from tests.support.photographs import (
     _HIGHEST_DEG,
     _LOWEST_DEG,
@@ -52,11 +51,6 @@ _SEED = 16_018
 _STREAKS_PX = (0.0, 10.0, 20.0, 40.0, 80.0)
 _OBLIQUE, _ACROSS = (30.0, 90.0), (90.0, 90.0)
 _EXPOSURE = 0.1
-
-
-def photographs(folder: Path) -> list[Photograph]:
-    """Return the results of every photograph of a folder that has a truth."""
-    return [photograph(folder, name, values, known) for name, values, known in _shown(folder)]
 
 
 def _shown(folder: Path) -> Iterator[tuple[str, dict[str, float], bool]]:
@@ -116,7 +110,7 @@ class Case:
     job: dict[str, Any]
 
 
-def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
+def peer_cases(photographs: Path, frames: int, folder: Path) -> list[Case]:
     """Return every photograph and simulated frame, written to `folder`."""
     cases: list[Case] = []
 
@@ -127,19 +121,14 @@ def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
             Case(configuration, boresight, {"image": str(path), "field_deg": field, "known_deg": known})
         )
 
-    if (options.photographs / "truth.json").is_file():
-        for name, values, known in _shown(options.photographs):
-            pixels, fov = read_image(options.photographs / name), values["fov"]
+    if (photographs / "truth.json").is_file():
+        for name, values, known in _shown(photographs):
+            pixels, fov = read_image(photographs / name), values["fov"]
             field, error = (fov, FIELD_SHARE * fov) if known else (20.0, 10.0)
-            add(
-                f"photographs, field {'known' if known else 'unknown'}",
-                centre_of(values),
-                pixels,
-                field,
-                error,
-            )
+            configuration = f"photographs, field {'known' if known else 'unknown'}"
+            add(configuration, centre_of(values), pixels, field, error)
     for length in _STREAKS_PX:
-        for frame in range(options.frames):
+        for frame in range(frames):
             scene = scene_of(length, _OBLIQUE, frame)
             boresight = attitude_matrix(scene.attitude)[2]
             add(f"{length:.0f} px, field known", boresight, scene.pixels, NARROW_DEG, _NARROW_KNOWN_DEG)
@@ -147,14 +136,14 @@ def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
 
 
 def peer_rows(
-    options: argparse.Namespace, pictures: Sequence[Photograph]
+    photographs: Path, frames: int, peer_python: str, pictures: Sequence[Photograph]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return the statistics of the other programs by configuration, and the time ratios by frame size."""
     rows, ratios = [], []
-    with tempfile.TemporaryDirectory() as folder:
-        cases = peer_cases(options, Path(folder))
+    with scratch() as folder:
+        cases = peer_cases(photographs, frames, folder)
         for peer in PEERS:
-            said = peer_answers(peer, options.peer_python, [case.job for case in cases])
+            said = peer_answers(peer, peer_python, [case.job for case in cases])
             if said is None:
                 continue
             for configuration in dict.fromkeys(case.configuration for case in cases):
@@ -164,7 +153,7 @@ def peer_rows(
                     if case.configuration == configuration
                 ]
                 rows.append({"peer": peer, "configuration": configuration, **_peer_row(chosen)})
-            ratios += _ratios(peer, options.photographs, pictures, said[0])
+            ratios += _ratios(peer, photographs, pictures, said[0])
     return rows, ratios
 
 
@@ -199,31 +188,26 @@ def _peer_row(chosen: Sequence[tuple[Answer, Case]]) -> dict[str, Any]:
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    frames: Annotated[int, "of each length"] = 20,
+    photographs: Annotated[Path, "folder of the photographs"] = PHOTOGRAPHS,
+    peers: Peers = False,
+    peer_python: PeerPython = sys.executable,
+    json: Json = False,
+) -> int:
     """Measure and print; return exit status 0."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench sky", description=__doc__)
-    parser.add_argument("--frames", type=int, default=20, help="of each length (default %(default)s)")
-    parser.add_argument("--photographs", type=Path, default=PHOTOGRAPHS, metavar="FOLDER")
-    parser.add_argument("--peers", action="store_true", help="cedar-solve and tetra3rs on the same frames")
-    parser.add_argument(
-        "--peer-python", default=sys.executable, metavar="PYTHON", help="that the peers are in"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args(arguments)
     pictures: list[Photograph] = []
-    if (options.photographs / "truth.json").is_file():
-        pictures = photographs(options.photographs)
+    if (photographs / "truth.json").is_file():
+        pictures = [photograph(photographs, *each) for each in _shown(photographs)]
     else:
-        sys.stderr.write(f"{options.photographs}: no truth.json: give --photographs; going on without\n")
-    rows = [row_of(length, _OBLIQUE, options.frames) for length in _STREAKS_PX]
-    rows += [row_of(length, _ACROSS, options.frames) for length in _STREAKS_PX if length]
-    peers, ratios = peer_rows(options, pictures) if options.peers else ([], [])
+        sys.stderr.write(f"{photographs}: no truth.json: give --photographs; going on without\n")
+    rows = [row_of(length, _OBLIQUE, frames) for length in _STREAKS_PX]
+    rows += [row_of(length, _ACROSS, frames) for length in _STREAKS_PX if length]
+    others, ratios = peer_rows(photographs, frames, peer_python, pictures) if peers else ([], [])
     right = sum(one.solved and one.arcsec <= RIGHT_ARCSEC for one in pictures)
     wrong = sum(one.solved for one in pictures) - right
     facts = {"photographs": [asdict(one) for one in pictures], "right": right, "wrong": wrong}
-    show(facts | {"frames": rows, "peers": peers, "ratios": ratios}, options.json)
+    show(facts | {"frames": rows, "peers": others, "ratios": ratios}, json)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Rates from streaks during a slew: `python -m tests.studies.bench slew_frames [--as-they-come]`.
+"""Rates from streaks during a slew.
 
 The 3U of `config/orbit_3u.yaml` is released near rest, holds its attitude and slews by 100 deg in 300 s or
 more. The whole loop runs, with a frame every 5 s. Exposures avoid the coils' steps; with `--as-they-come`,
@@ -7,12 +7,10 @@ they begin at the camera's scheduled times. Each rate is compared with the mean 
 
 from __future__ import annotations
 
-import argparse
 import sys
-import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from flight.loop.facts import Services
 from flight.loop.state import Learned
 from flight.schema.orbit import as_orbit
 from flight.schema.sections import Config
+from tests.studies.command import Seed, command, scratch
 from tests.support.flights import fly
 from tests.support.slew_frames import compared, flight
 
@@ -45,16 +44,14 @@ def _as_they_come(config: Config, services: Services, learned: Mapping[str, Lear
 AS_THEY_COME = BodyKind(ORBIT.plan, _as_they_come)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *, seed: Seed = 1, as_they_come: Annotated[bool, "exposures may meet the coils' steps"] = False
+) -> int:
     """Print the results; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench slew_frames", description=__doc__)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--as-they-come", action="store_true", help="exposures may meet the coils' steps")
-    options = parser.parse_args(arguments)
-    body = f"{__name__}:AS_THEY_COME" if options.as_they_come else "orbit"
-    with tempfile.TemporaryDirectory() as folder:
-        config, world = flight(body, options.seed)
-        count, rated, used, nees = compared(fly(config, Path(folder), section=world))
+    with scratch() as folder:
+        config, world = flight(f"{__name__}:AS_THEY_COME" if as_they_come else "orbit", seed)
+        count, rated, used, nees = compared(fly(config, folder, section=world))
     sys.stdout.write(
         f"{count} frames, {rated} with a rate, {used} used; NEES of an axis: "
         f"mean {np.mean(nees):.2f}, median {np.median(nees):.2f}, largest {np.max(nees):.1f}\n"

@@ -1,4 +1,4 @@
-"""Flight on a board of the 800 MHz class: `python -m tests.studies.bench slow_board [--orbit] [--share S]`.
+"""Flight on a board of the 800 MHz class.
 
 The flight runs in real time on emulated devices, with image processing and planner. It is limited to a
 fraction of one core and 512 MB of memory. The share makes this core as fast as an ARM Cortex-A53 at 800 MHz.
@@ -12,27 +12,24 @@ bench with cgroup v2 on a machine with cgroup v1.
 
 from __future__ import annotations
 
-import argparse
-import json
-import socket
+import os
 import sys
-import tempfile
 import threading
-import time
-from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
 
 from ground.telemetry import Run, read_run
+from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import LiveFlight
 from tests.studies.bench import executive
+from tests.studies.command import Json, command, say, scratch
 from tests.support import process_watch
-from tests.support.executive_figures import PERIOD_NS, Began, Figures, evaluate
-from tests.support.process_watch import MIB, answering
+from tests.support.executive_figures import Figures
+from tests.support.process_watch import MIB
 from tests.support.processor_share import CORTEX_A53, Limits, limited, measure
 
 MEMORY = 512 * 1024 * 1024
@@ -41,7 +38,6 @@ IMU_BAUD = 230_400
 SLOW_AFTER_S, FRAME_AGE_S, TIMEOUT_S = 5.0, 60.0, 60.0
 """Times (s) that a slow board needs: age of a frame, time between frames, and timeout of a job."""
 _WORKERS = ("planner", "vision", "wide")
-_PATIENCE_S = 240.0
 
 
 @dataclass(frozen=True)
@@ -59,29 +55,25 @@ class Wish:
     imu_rate: int
 
 
-def main(arguments: Sequence[str]) -> int:
+@command
+def main(
+    *,
+    minutes: Annotated[float, "of the flight"] = 3.0,
+    orbit: Annotated[bool, "fly the satellite, not the step demonstration"] = False,
+    camera_period: Annotated[float, "s"] = 5.0,
+    replan_period: Annotated[float | None, "s (default 5, in orbit 10, the shortest permitted)"] = None,
+    share: Annotated[float | None, "of a core (default: by the yardstick)"] = None,
+    no_limit: Annotated[bool, "fly with the whole machine, to compare"] = False,
+    imu_rate: Annotated[int, "Hz", (40, 50, 100, 200)] = 200,
+    json: Json = False,
+) -> int:
     """Measure the speed of the core, run the flight, and print the completed and the shed work."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--minutes", type=float, default=3.0, metavar="M", help="default %(default)s")
-    parser.add_argument("--orbit", action="store_true", help="fly the satellite, not the step demonstration")
-    parser.add_argument("--camera-period", type=float, default=5.0, metavar="S", help="default %(default)s")
-    parser.add_argument(
-        "--replan-period", type=float, metavar="S", help="default 5, in orbit 10, the shortest permitted"
-    )
-    limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--share", type=float, metavar="S", help="of a core (default: by the yardstick)")
-    limit.add_argument("--no-limit", action="store_true", help="fly with the whole machine, to compare")
-    parser.add_argument(
-        "--imu-rate", type=int, choices=(40, 50, 100, 200), default=200, help="Hz, default %(default)s"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args(arguments)
-    if not 0.5 <= options.minutes < 1e4:
-        parser.error(f"--minutes {options.minutes:g}: a flight takes half a minute at least")
-    share, printed = options.share, ""
-    if share is None and not options.no_limit:
+    if not 0.5 <= minutes < 1e4:
+        raise UsageError(f"--minutes {minutes:g}: a flight takes half a minute at least")
+    if share is not None and no_limit:
+        raise UsageError("--share: not allowed with --no-limit")
+    printed = ""
+    if share is None and not no_limit:
         here = measure()
         share = here.share(CORTEX_A53)
         printed = (
@@ -89,22 +81,20 @@ def main(arguments: Sequence[str]) -> int:
             f"{CORTEX_A53.mflops:.0f} of {CORTEX_A53.name} ({CORTEX_A53.source})\n"
         )
     if share is not None and not 0.001 <= share <= 1.0:
-        parser.error(f"--share {share:g}: must lie between 0.001 and 1")
-    least = executive.SHORTEST_REPLAN if options.orbit else 5.0
-    replan = options.replan_period or least
-    wish = Wish(60.0 * options.minutes, options.orbit, options.camera_period, replan, share, options.imu_rate)
-    with executive._compiled(), tempfile.TemporaryDirectory() as folder:
-        figures = fly(Path(folder), wish)
-    if options.json:
-        sys.stdout.write(json.dumps({"wish": asdict(wish), "yardstick": printed, **figures}) + "\n")
+        raise UsageError(f"--share {share:g}: must lie between 0.001 and 1")
+    replan = replan_period or (executive.SHORTEST_REPLAN if orbit else 5.0)
+    wish = Wish(60.0 * minutes, orbit, camera_period, replan, share, imu_rate)
+    with executive.compiled(), scratch() as folder:
+        figures = fly(folder, wish)
+    if json:
+        say(wish=asdict(wish), yardstick=printed, **figures)
     else:
         sys.stdout.write(printed + table(wish, figures))
     return int(figures["lost_beyond_machine"] > 0 or figures["memory_refusals"] > 0)
 
 
-def configuration(wish: Wish) -> str:
+def configuration(wish: Wish, load: executive.Load) -> str:
     """Return the configuration, with the times that a slow board needs."""
-    load = executive.Load(wish.duration, wish.camera_period, wish.replan_period, orbit=wish.orbit)
     tree = yaml.safe_load(executive.full_load(load))
     if wish.orbit:
         tree["pointing"]["replan_period"] = wish.replan_period
@@ -121,43 +111,16 @@ def fly(folder: Path, wish: Wish) -> Figures:
 
     Raises OSError if the system refuses the limit.
     """
-    config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
-    facts = devices / "facts.json"
-    config.write_text(configuration(wish), encoding="utf-8")
-    devices.mkdir()
-    with ExitStack() as stack:
-        limits = stack.enter_context(limited(wish.share, MEMORY)) if wish.share is not None else None
-        bare = "tests.studies.bench.bare_loop", str(PERIOD_NS), "0", str(wakes)
-        stack.enter_context(answering(*bare))
-        stack.enter_context(
-            answering("sim_hal", "serve", str(config), "--folder", str(devices), "--facts", str(facts))
-        )
-        if limits is not None:
-            for process in process_watch.below(_own_process()):
-                limits.release(process)
-        notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        notifications.bind(str(folder / "notify"))
-        words = folder, config, notifications, wish.duration, "--devices", str(facts)
-        flight = LiveFlight(*words, before="" if limits is None else limits.line())
-        stack.callback(flight.end)
-        stop = threading.Event()
-        if limits is not None:
-            demoting = threading.Thread(target=_demote, args=(flight, limits, stop), daemon=True)
-            demoting.start()
-            stack.callback(demoting.join)
-        stack.callback(stop.set)
-        ready_ns = flight.wait_for("READY=1", _PATIENCE_S)
-        busy = process_watch.look({"control": flight.process.pid}).processor["control"]
-        offset_ns = time.time_ns() - time.monotonic_ns()
-        load = executive.Load(wish.duration, warm_up=min(30.0, 0.2 * wish.duration), look_period=2.0)
-        watched = executive._watch(flight, notifications, load)
-        error = flight.end()
+    periods = wish.camera_period, wish.replan_period, min(30.0, 0.2 * wish.duration)
+    load = executive.Load(wish.duration, *periods, look_period=2.0, orbit=wish.orbit)
+    with nullcontext() if wish.share is None else limited(wish.share, MEMORY) as limits:
+
+        def start(stack: ExitStack, *words: Any) -> LiveFlight:
+            return LiveFlight(*words) if limits is None else _limited(limits, stack, *words)
+
+        flown = executive.watched_flight(folder, configuration(wish, load), load, 0, start)
         used = None if limits is None else limits.used()
-    if flight.process.returncode != 0:
-        raise RuntimeError(f"the flight ended with status {flight.process.returncode}: {error.strip()}")
-    began = Began(flight.begun_ns, ready_ns, busy, offset_ns)
-    found = evaluate(flight.folder, devices, wakes, began, watched, load.warm_up).figures
-    found |= _shed(read_run(flight.folder), wish.duration)
+    found = flown.figures | _shed(read_run(folder / "run"), wish.duration)
     half = 0.5 * wish.duration
     found |= {"lost_in_second_half": sum(time_s > half for time_s in found["lost_at_s"])}
     found |= {"memory_refusals": 0 if used is None else used.refusals}
@@ -166,10 +129,16 @@ def fly(folder: Path, wish: Wish) -> Figures:
     return found
 
 
-def _own_process() -> int:
-    import os  # noqa: PLC0415
-
-    return os.getpid()
+def _limited(limits: Limits, stack: ExitStack, *words: Any) -> LiveFlight:
+    """Start a flight within the limits, which do not apply to the processes that run before it."""
+    for process in process_watch.below(os.getpid()):
+        limits.release(process)
+    flight, stop = LiveFlight(*words, before=limits.line()), threading.Event()
+    demoting = threading.Thread(target=_demote, args=(flight, limits, stop), daemon=True)
+    demoting.start()
+    stack.callback(demoting.join)
+    stack.callback(stop.set)
+    return flight
 
 
 def _demote(flight: LiveFlight, limits: Limits, stop: threading.Event) -> None:
@@ -209,13 +178,15 @@ def table(wish: Wish, figures: Figures) -> str:
     group = f"; the group's {figures['memory_group_mib']:.0f} MiB" if "throttled" in figures else ""
     throttled = f", throttled in {figures['throttled']:.0%} of the periods" if "throttled" in figures else ""
     limit = "no limit" if wish.share is None else f"{wish.share:.1%} of a core, 512 MB{throttled}"
+
+    def listed(*names: str) -> str:
+        return "; ".join(str(figures[name]) for name in names)
+
     rows: list[tuple[str, Any]] = [
         ("craft; limit", f"{'satellite' if wish.orbit else 'testbed'}; {limit}"),
         (
             "control cycles; lost; lost in the second half; by the bare loop",
-            "; ".join(
-                str(figures[name]) for name in ("slots", "lost", "lost_in_second_half", "lost_by_bare_loop")
-            ),
+            listed("slots", "lost", "lost_in_second_half", "lost_by_bare_loop"),
         ),
         ("lateness, ms", ", ".join(f"{name} {1e3 * value:.2f}" for name, value in late.items())),
         ("duration of a cycle, ms", ", ".join(f"{name} {1e3 * value:.2f}" for name, value in spent.items())),
@@ -226,17 +197,12 @@ def table(wish: Wish, figures: Figures) -> str:
             f"{figures['ready_s']:.1f}; {figures['first_command_s']:.1f}",
         ),
         ("readings of the inertial unit, Hz", f"{figures['imu_hz']:.1f}"),
-        (
-            "frames taken; late; shed",
-            f"{figures['frames']}; {figures['frames_late']}; {figures['frames_shed']}",
-        ),
+        ("frames taken; late; shed", listed("frames", "frames_late", "frames_shed")),
         (
             "plans flown; refused; late; shed",
-            "; ".join(
-                str(figures[name]) for name in ("plans_accepted", "plans_refused", "plans_late", "plans_shed")
-            ),
+            listed("plans_accepted", "plans_refused", "plans_late", "plans_shed"),
         ),
-        ("level of shedding: highest; at the end", f"{figures['level']}; {figures['level_at_end']}"),
+        ("level of shedding: highest; at the end", listed("level", "level_at_end")),
         (
             "jobs",
             "; ".join(

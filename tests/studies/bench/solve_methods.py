@@ -1,4 +1,4 @@
-"""Attitude solvers and centroid methods on the same frames: `python -m tests.studies.bench solve_methods`.
+"""Attitude solvers and centroid methods on the same frames.
 
 The frames show real stars to V 8.5 at rest (1024 x 1024, 12 deg, 0.2 s). With each centroid method the stars
 are identified once. Each attitude solver of `flight solve --attitude` and Delabie's image matching (AIM) then
@@ -9,11 +9,9 @@ per axis), the NEES of three axes divided by three (1 if the covariance is corre
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -28,6 +26,7 @@ from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
 from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings, Method
 from sim_hal.star_camera import StarCameraModel
+from tests.studies.command import Json, Seed, command
 from tests.support.scenes import YEAR, exposed
 
 _SEED = 41_207
@@ -103,17 +102,9 @@ def _row(
     return Row(centroid, attitude, frames, len(turns), across, float(rms[2]), nees, solving, detecting)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(*, frames: Annotated[int, "of each method"] = 60, seed: Seed = _SEED, json: Json = False) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench.solve_methods", description=__doc__)
-    parser.add_argument("--frames", type=int, default=60, help="default %(default)s")
-    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
-    options = parser.parse_args(arguments)
-    rows = [asdict(row) for row in compare(options.frames, options.seed)]
-    show({"frames": options.frames, "seed": options.seed, "rows": rows}, options.json)
+    rows = [asdict(row) for row in compare(frames, seed)]
+    show({"frames": frames, "seed": seed, "rows": rows}, json)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Star identification compared with cedar-solve and tetra3rs: `python -m tests.studies.bench starid`.
+"""Star identification compared with cedar-solve and tetra3rs.
 
 The lists have the twelve configurations of issue 4: 1024 x 1024 pixels, fields of 12 and 20 deg, 0.1 and 0.5
 px of noise, 0, 2 and 5 false stars, and an error of the known field of up to 0.1 deg. Further lists have an
@@ -13,7 +13,6 @@ sigma, the median of a Rayleigh distribution.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -23,7 +22,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from knightcube.vision.startracker.attitude_fit import MatchStatus, refine
 from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import identify
+from tests.studies.command import Json, Seed, command
 from tests.support.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
 
 _SEED = 271_828
@@ -42,6 +42,8 @@ _SHARE = 0.8
 _PEERS_RANDOM = 20
 _RAYLEIGH = 1.1774
 ARCSECONDS = 3600.0 * 180.0 / np.pi
+Peers = Annotated[bool, "also run cedar-solve and tetra3rs"]
+PeerPython = Annotated[str, "Python interpreter that has the other programs"]
 _INSTALL = (
     "give --peer-python the Python of an environment with them: pip install cedar-solve tetra3rs"
     " (cedar-solve wants numpy below 2, so an environment of their own)"
@@ -209,10 +211,10 @@ def cases(count: int, sky: SkyIndex, seed: int) -> dict[str, list[StarList]]:
     return found
 
 
-def measure(options: argparse.Namespace) -> dict[str, Any]:
+def measure(count: int, seed: int, peers: bool, peer_python: str) -> dict[str, Any]:
     """Return all results of the benchmark."""
     sky = default_index()
-    everything = cases(options.lists, sky, options.seed)
+    everything = cases(count, sky, seed)
     # The first call of each numpy function and the first use of each triangle list take extra time.
     our_answers(everything[next(iter(everything))][:20], sky)
     rows = []
@@ -225,13 +227,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         rows.append(row_of("flight", name, ours[name], lists, bounds[name]))
     megabytes = {"flight": memory_of_index()}
     ratios = {}
-    for peer in ("cedar-solve", "tetra3rs") if options.peers else ():
+    for peer in ("cedar-solve", "tetra3rs") if peers else ():
         # Another program may use its whole time limit for a list that shows no part of the sky.
         shown = {
             name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()
         }
         flat = [_told(drawn) for lists in shown.values() for drawn in lists]
-        said = peer_answers(peer, options.peer_python, flat)
+        said = peer_answers(peer, peer_python, flat)
         if said is None:
             continue
         answers, megabytes[peer] = said
@@ -249,7 +251,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         if row["kind"] in known:
             over[row["solver"]] += found
     return {
-        "seed": options.seed,
+        "seed": seed,
         "rows": rows,
         "megabytes": megabytes,
         "over_bound": {solver: float(np.median(found)) for solver, found in over.items() if found},
@@ -267,21 +269,16 @@ def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> di
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    lists: Annotated[int, "of each configuration"] = 200,
+    seed: Seed = _SEED,
+    peers: Peers = False,
+    peer_python: PeerPython = sys.executable,
+    json: Json = False,
+) -> int:
     """Print the tables. Returns 1 if a list was identified wrongly."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--lists", type=int, default=200, help="of each configuration (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
-    parser.add_argument("--peers", action="store_true", help="cedar-solve and tetra3rs on the same lists")
-    parser.add_argument(
-        "--peer-python", default=sys.executable, metavar="PYTHON", help="that the peers are in"
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of the tables")
-    options = parser.parse_args(arguments)
-    figures = measure(options)
-    show(figures, options.json)
-    return 1 if any(row["wrong"] for row in figures["rows"] if row["solver"] == "flight") else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    figures = measure(lists, seed, peers, peer_python)
+    show(figures, json)
+    return int(any(row["wrong"] for row in figures["rows"] if row["solver"] == "flight"))

@@ -1,4 +1,4 @@
-"""Star identification in difficult lists: `python -m tests.studies.bench starid_hard`.
+"""Star identification in difficult lists.
 
 The lists have unknown fields of view, false stars that are all brighter than the true ones, mirrored images,
 assumed fields that are 10 % wrong, or uncalibrated lenses with 2 to 8 % of distortion. Points that show no
@@ -10,12 +10,11 @@ cedar-solve on the same lists.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -26,7 +25,8 @@ from knightcube.vision.startracker.index import GuideStars, SkyIndex
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.bench.star_peers import PEERS
-from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error
+from tests.studies.bench.starid import ARCSECONDS, Answer, PeerPython, peer_answers, pointing_error
+from tests.studies.command import Json, Seed, command
 from tests.support.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
 
 _SEED = 314_159
@@ -173,25 +173,18 @@ def _right(answers: Sequence[Answer], drawn: Sequence[StarList]) -> int:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    lists: Annotated[int, "of each row"] = 100,
+    only: Annotated[str, "rows whose names contain it"] = "",
+    seed: Seed = _SEED,
+    peer: Annotated[str | None, "another program on the same lists", tuple(PEERS)] = None,
+    peer_python: PeerPython = sys.executable,
+    json: Json = False,
+) -> int:
     """Print the table. Returns 1 if a result is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--lists", type=int, default=100, help="of each row (default %(default)s)")
-    parser.add_argument("--only", default="", metavar="WORD", help="rows whose names contain it")
-    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
-    parser.add_argument("--peer", choices=tuple(PEERS), help="another program on the same lists")
-    parser.add_argument("--peer-python", default=sys.executable, metavar="PYTHON", help="that it is in")
-    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
-    options = parser.parse_args(arguments)
     sky = default_index()
-    rows = [
-        measured(name, options.lists, sky, options.seed, options.peer, options.peer_python)
-        for name in hardships()
-        if options.only in name
-    ]
-    show({"rows": rows}, options.json)
+    rows = [measured(name, lists, sky, seed, peer, peer_python) for name in hardships() if only in name]
+    show({"rows": rows}, json)
     return int(any(row["wrong"] for row in rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Commands and lateness under attack by strangers: `python -m tests.studies.bench strangers [--rounds N]`.
+"""Commands and lateness under attack by strangers.
 
 In each round the step demonstration flies twice in real time on its emulated devices beside its link process:
 without and with an attack. The attackers share one core. They send 30,000 datagrams a second from an address
@@ -13,64 +13,55 @@ lateness is more than twice that of the flights without attack (medians over the
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import json
 import multiprocessing
 import os
+import random
 import socket
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from random import Random
 from statistics import median
-from typing import Any
+from typing import Annotated, Any
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
 from ground.link.commanding import failed, obeyed
 from ground.link.terminal import open_terminal
 from knightcube.errors import FlightError
+from tests.studies.command import command, say, scratch
 from tests.support.flooded_flight import lateness, process, wait_for
-from tests.support.link_attacker import LinkAttacker
+from tests.support.link_attacker import attackers_frames
 from tests.support.linked_board import free_ports, write_linked_config
 
 DATAGRAMS, CONNECTIONS, COMMANDS = 30_000, 200, 40
 """Datagrams a second, TCP connections a second, and commands of the operator in each flight."""
 WITHIN = 2.0
-_STRANGER = "127.0.0.2"
+_PEER, _STRANGER = "127.0.0.1", "127.0.0.2"
 _BURST_S = 0.01
 _KINDS = 500
 _START_S, _ANSWER_S, _PAUSE_S = 12.0, 5.0, 1.0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    rounds: Annotated[int, "of two flights"] = 3,
+    commands: Annotated[int, "in each flight"] = COMMANDS,
+    forged: Annotated[int, "forged frames a second from a peer's address"] = 0,
+) -> int:
     """Fly all rounds, print, and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=3, metavar="N", help="of two flights (default 3)")
-    parser.add_argument(
-        "--commands", type=int, default=COMMANDS, metavar="N", help=f"in each flight (default {COMMANDS})"
-    )
-    text = "forged frames a second from a peer's address (default 0)"
-    parser.add_argument("--forged", type=int, default=0, metavar="N", help=text)
-    options = parser.parse_args(arguments)
     p99: dict[str, list[float]] = {"quiet": [], "attacked": []}
     missing = 0
-    for _ in range(options.rounds):
+    for _ in range(rounds):
         for name, late in p99.items():
-            with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-                facts = measure(
-                    Path(place), options.commands, attacked=name == "attacked", forged=options.forged
-                )
+            with scratch() as place:
+                facts = measure(place, commands, attacked=name == "attacked", forged=forged)
             late.append(facts["lateness_ms"]["p99"])
             missing += len(facts["failures"])
-            sys.stdout.write(json.dumps({"flight": name, **facts}) + "\n")
-            sys.stdout.flush()
+            say(flight=name, **facts)
     ratio = median(p99["attacked"]) / median(p99["quiet"])
-    sys.stdout.write(json.dumps({"p99_over_quiet": round(ratio, 2), "commands_missing": missing}) + "\n")
+    say(p99_over_quiet=round(ratio, 2), commands_missing=missing)
     return int(missing > 0 or ratio > WITHIN)
 
 
@@ -78,12 +69,8 @@ def measure(place: Path, commands: int, *, attacked: bool, forged: int = 0) -> d
     """Run one flight. Returns the executed commands, the lateness (ms), and the rates of the attackers."""
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     with ExitStack() as stack:
-        config, run = (
-            write_linked_config(
-                place, udp=f"127.0.0.1:{udp}", tcp=f"127.0.0.1:{tcp}", peers=["127.0.0.1/32"], rate=1e5
-            ),
-            place / "run",
-        )
+        lines = {"udp": f"{_PEER}:{udp}", "tcp": f"{_PEER}:{tcp}", "peers": [f"{_PEER}/32"]}
+        config, run = write_linked_config(place, **lines, rate=1e5), place / "run"
         flight = stack.enter_context(process("run", config, "--realtime", "--out", run))
         wait_for(run / "flight-0001.ccsds")
         link = stack.enter_context(process("link", config, "--log", run))
@@ -104,8 +91,8 @@ def _wait_for_port(tcp: int) -> None:
     """Wait until a link listens on the port. Raises TimeoutError if none does."""
     until = time.monotonic() + 2.0 * _START_S
     while time.monotonic() < until:
-        with contextlib.suppress(OSError):
-            socket.create_connection(("127.0.0.1", tcp)).close()
+        with suppress(OSError):
+            socket.create_connection((_PEER, tcp)).close()
             return
         time.sleep(0.1)
     raise TimeoutError(f"no link listens on port {tcp}")
@@ -114,9 +101,9 @@ def _wait_for_port(tcp: int) -> None:
 def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
     """Send commands alternately by three connections; return number and reason of each unexecuted one."""
     packer, failures = CommandPacker(), list[str]()
-    ways = (f"127.0.0.1:{udp}", f"tcp:127.0.0.1:{tcp}", f"tcp:127.0.0.1:{tcp}")
+    ways = (f"{_PEER}:{udp}", f"tcp:{_PEER}:{tcp}", f"tcp:{_PEER}:{tcp}")
     with ExitStack() as stack:
-        lasting = [stack.enter_context(contextlib.closing(open_terminal(way, keys))) for way in ways[:2]]
+        lasting = [stack.enter_context(closing(open_terminal(way, keys))) for way in ways[:2]]
         for terminal in lasting:  # The gateway and the console also keep such connections open.
             terminal.send(packer.pack(Ping(), utc_ns()))
         for number in range(count):
@@ -125,7 +112,7 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
                     if (turn := number % len(ways)) < len(lasting):
                         terminal = lasting[turn]
                     else:
-                        terminal = fresh.enter_context(contextlib.closing(open_terminal(ways[turn], keys)))
+                        terminal = fresh.enter_context(closing(open_terminal(ways[turn], keys)))
                     counter = terminal.send(packer.pack(Ping(number), utc_ns()))
                     reports = list(terminal.follow(counter, 1, _ANSWER_S))
                     if not obeyed(reports):
@@ -139,15 +126,15 @@ def _command(count: int, udp: int, tcp: int, keys: Path) -> list[str]:
 @contextmanager
 def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[str, float]]]:
     """Run all floods on one core; yield a function that returns their mean rates so far."""
-    context = multiprocessing.get_context("fork")
-    begun = time.monotonic()
+    context, begun = multiprocessing.get_context("fork"), time.monotonic()
     counts = {name: context.Value("Q", 0) for name in ("datagrams", "connections", "forged")}
-    floods = [
-        context.Process(target=_datagrams, args=(udp, counts["datagrams"]), daemon=True),
-        context.Process(target=_connections, args=(tcp, counts["connections"]), daemon=True),
+    attacks: list[tuple[Callable[..., None], tuple[Any, ...]]] = [
+        (_send, (udp, _STRANGER, [bytes(64)], DATAGRAMS, counts["datagrams"])),
+        (_connect, (tcp, counts["connections"])),
     ]
     if forged:
-        floods.append(context.Process(target=_forged, args=(udp, forged, counts["forged"]), daemon=True))
+        attacks.append((_send, (udp, _PEER, attackers_frames(_KINDS), forged, counts["forged"])))
+    floods = [context.Process(target=attack, args=args, daemon=True) for attack, args in attacks]
     for one in floods:
         one.start()
 
@@ -163,45 +150,31 @@ def _strangers(udp: int, tcp: int, forged: int) -> Iterator[Callable[[], dict[st
             one.join()
 
 
-def _datagrams(port: int, count: Any) -> None:
-    """Send datagrams from an address that the link does not accept."""
+def _send(port: int, source: str, datagrams: Sequence[bytes], a_second: int, count: Any) -> None:
+    """Send random ones of the datagrams from the address `source`."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    burst = round(a_second * _BURST_S)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        line.bind((_STRANGER, 0))
-        line.connect(("127.0.0.1", port))
+        line.bind((source, 0))
+        line.connect((_PEER, port))
         for _ in _grid(_BURST_S):
-            for _ in range(round(DATAGRAMS * _BURST_S)):
-                with contextlib.suppress(OSError):
-                    line.send(bytes(64))
-            count.value += round(DATAGRAMS * _BURST_S)
+            for datagram in random.choices(datagrams, k=burst):
+                with suppress(OSError):
+                    line.send(datagram)
+            count.value += burst
 
 
-def _connections(port: int, count: Any) -> None:
+def _connect(port: int, count: Any) -> None:
     """Open connections from an accepted address, and leave each open until the link closes it."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     lines: list[socket.socket] = []
     for _ in _grid(1.0 / CONNECTIONS):
-        with contextlib.suppress(OSError):
-            lines.append(socket.create_connection(("127.0.0.1", port), timeout=1.0))
+        with suppress(OSError):
+            lines.append(socket.create_connection((_PEER, port), timeout=1.0))
             count.value += 1
             lines[-1].sendall(b"GET / HTTP/1.1\r\n\r\n" * 8)
         while len(lines) > CONNECTIONS:
             lines.pop(0).close()
-
-
-def _forged(port: int, a_second: int, count: Any) -> None:
-    """Send frames of an attacker without the key from an accepted address."""
-    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    chance = Random(1)
-    with tempfile.TemporaryDirectory() as folder:
-        attacker = LinkAttacker(Path(folder))
-        frames = [attacker.frame(chance)[1] for _ in range(_KINDS)]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        for _ in _grid(_BURST_S):
-            for _ in range(round(a_second * _BURST_S)):
-                with contextlib.suppress(OSError):
-                    line.sendto(chance.choice(frames), ("127.0.0.1", port))
-            count.value += round(a_second * _BURST_S)
 
 
 def _grid(period: float) -> Iterator[None]:
@@ -211,7 +184,3 @@ def _grid(period: float) -> Iterator[None]:
         yield
         due += period
         time.sleep(max(0.0, due - time.monotonic()))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
