@@ -20,13 +20,8 @@ from flight.app.flight import workers
 from flight.schema import reader as configuration
 from tests.hal.guardian.live_flight import ROOT
 from tests.studies.bench import bare_loop, busy_jobs
-from tests.studies.bench.executive import Load, fly
-from tests.support.executive_figures import (
-    ASKED,
-    PERIOD_NS,
-    misses,
-    table,
-)
+from tests.studies.bench.executive import Load, fly, full_load
+from tests.support.executive_figures import ASKED, PERIOD_NS, misses, table
 
 CALM = 0.05
 """Largest fraction of time for which the control thread waits for a processor on a calm machine."""
@@ -93,6 +88,15 @@ def test_every_worker_of_a_flight_is_kept_busy(name: str, monkeypatch: pytest.Mo
     assert len(made) >= 2
     for busy, worker in zip(made, plain, strict=True):
         assert busy.function is busy_jobs.BUSY[worker.function.__module__]
+
+
+def test_the_executive_flies_testbed_and_satellite_with_workers_that_hardly_rest() -> None:
+    for orbit in (False, True):
+        config = configuration.parse(full_load(Load(600.0, camera_period=0.4, orbit=orbit)))
+        assert config.body == ("orbit" if orbit else "testbed")
+        assert config.camera is not None
+        assert config.camera.period == 0.4
+        assert config.replan_period() == (10.0 if orbit else 0.025)
 
 
 @pytest.mark.slow

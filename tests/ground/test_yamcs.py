@@ -1,6 +1,6 @@
-"""Tests that Yamcs follows and commands a flight through the protected link.
+"""Tests of the configuration for Yamcs, and of mission control through the protected link.
 
-`python -m tests.studies.interop.yamcs FOLDER` flies the commands that need minutes.
+`python -m tests.studies.interop.yamcs FOLDER` compares the archive of Yamcs with the flight log.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from ground.yamcs import (
     write,
 )
 from tests.flight.link.telemetry.samples import plain_contents
-from tests.studies.interop.yamcs import PLANS, fly
 from tests.support.linked_board import free_ports, write_linked_config
 from tests.support.linked_flight import free_port, service
 from tests.support.orbit_elements import POLAR_ORBIT
@@ -213,13 +212,3 @@ def test_mission_control_operates_a_flight_through_the_client_of_yamcs(tmp_path:
         replay = Operator(http, password_in(tmp_path / "replay"))
         logged = read_run(run).flight.counts["health"]
         assert replay.archived("health", logged) == logged
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(bool(missing()), reason=missing() or "-")
-def test_yamcs_archives_and_commands_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The archive has every packet and value, every command completes, and no socket leaves loopback."""
-    sound = fly(tmp_path, PLANS["short"])
-    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert sound, said
-    assert len(said) == 5

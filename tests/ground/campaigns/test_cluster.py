@@ -153,5 +153,5 @@ def test_the_archive_is_the_same_for_the_same_files_and_holds_what_is_imported()
     assert sent == cluster_code.archive_of(root)
     names = set(zipfile.ZipFile(io.BytesIO(sent)).namelist())
     assert {"knightcube/astro/catalogue/hipparcos.npz", "config/step_demo.yaml"} <= names
-    assert {"flight/schema/configurations/step_demo.yaml", "tests/studies/checks/test_cluster.py"} <= names
+    assert {"flight/schema/configurations/step_demo.yaml", "tests/ground/campaigns/test_cluster.py"} <= names
     assert not any("__pycache__" in name for name in names)
