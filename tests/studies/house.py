@@ -1,6 +1,6 @@
 """Sizes of the product's files, classes and functions, and the number of files that each activity uses.
 
-Command: `python -m tests.studies.house [--touched]`. Import-linter checks layers and cycles (pyproject.toml).
+Import-linter checks layers and cycles (pyproject.toml).
 
 With `--touched` the program runs a flight and computes the attitude of an image. It counts the product files
 whose functions are called in one control cycle, at the opening of a flight, and in a star fix. The execution
@@ -11,10 +11,8 @@ lock-step runner runs in the calling thread belongs to a worker and does not cou
 
 from __future__ import annotations
 
-import argparse
 import ast
 import inspect
-import json
 import re
 import sys
 import tempfile
@@ -23,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 from unittest.mock import patch
 
 import numpy as np
@@ -35,6 +33,7 @@ from flight.loop.executive import Cycle, LockStepRunner
 from flight.loop.flight_loop import FlightLoop
 from knightcube import StarTracker
 from sim_hal.star_camera import StarCameraModel
+from tests.studies.command import Json, command, say
 from tests.support.scenes import exposed
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -176,19 +175,18 @@ def measure() -> dict[str, set[str]]:
     return of_flight() | of_star_fix()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *, touched: Annotated[bool, "also count the files that are entered"] = False, json: Json = False
+) -> int:
     """Print sizes and files. Returns 1 if a limit is exceeded."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.house", description=__doc__)
-    parser.add_argument("--touched", action="store_true", help="also count the files that are entered")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args(arguments)
     measured = pieces()
     long = [piece for piece in measured if piece.long]
     files = [piece.lines for piece in measured if piece.kind == "file"]
-    entered = {name: sorted(found) for name, found in (measure() if options.touched else {}).items()}
-    if options.json:
-        facts = {"lines": sum(files), "files": len(files), "long": [asdict(piece) for piece in long]}
-        sys.stdout.write(json.dumps(facts | {"touched": entered}) + "\n")
+    entered = {name: sorted(found) for name, found in (measure() if touched else {}).items()}
+    if json:
+        pieces_long = [asdict(piece) for piece in long]
+        say(lines=sum(files), files=len(files), long=pieces_long, touched=entered)
     else:
         lines = [f"{sum(files)} lines in {len(files)} files, {files[len(files) // 2]} in the median one"]
         lines += ["longer than the limit:", *map(str, long)]

@@ -1,4 +1,4 @@
-"""Fraction of random one-line faults that the fast tests find: `python -m tests.studies mutants`.
+"""Fraction of random one-line faults that the fast tests find.
 
 Each mutant changes one expression on one line of product code and is tested in a temporary copy of the
 repository: the tracked files with their uncommitted changes. The fast tests of the mirrored file run first,
@@ -12,11 +12,9 @@ changed. Known equivalent mutants are listed in `equivalent_mutants.yaml`, each 
 
 from __future__ import annotations
 
-import argparse
 import ast
 import contextlib
 import copy
-import json
 import os
 import random
 import resource
@@ -26,13 +24,18 @@ import sys
 import tarfile
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field
+from json import dumps
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Annotated, Literal
 
 import yaml
+
+from knightcube.errors import UsageError
+from tests.studies.command import Json, Seed, command, say
 
 ROOT = Path(__file__).resolve().parents[2]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.yaml")
@@ -67,10 +70,6 @@ _ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
 }
 
 
-class MutantsError(Exception):
-    """Error for a wrong option, or for a repository that cannot be copied."""
-
-
 @dataclass(frozen=True)
 class Mutant:
     """A change on one line: the bytes `begin` to `end` of the line are replaced by `text`."""
@@ -98,45 +97,45 @@ class Verdict:
     reason: str = ""
 
 
-def main(arguments: Sequence[str] | None = None, root: Path = ROOT) -> int:
+@command
+def main(
+    *,
+    count: Annotated[int, "mutants to draw"] = 200,
+    seed: Seed = 1,
+    only: Annotated[tuple[str, ...], "files or folders; FILE:LINE tries a whole line"] = (),
+    workers: Annotated[Literal[1, 2], "mutants at a time"] = 1,
+    out: Annotated[Path | None, "file of the results (default runs/mutants/seed-S.jsonl)"] = None,
+    json: Json = False,
+) -> int:
     """Draw mutants, test them and print the result. Returns 0, 2 for wrong use, or 130 after Ctrl-C."""
-    options = _parser().parse_args(arguments)
     known = {
         (entry["line"], entry["mutant"]): entry["reason"]
         for entry in yaml.safe_load(EQUIVALENT.read_text(encoding="utf-8")) or ()
     }
-    verdicts: list[Verdict] = []
+    mutants, verdicts, status = draw(ROOT, count, seed, only), list[Verdict](), 0
+    out = out or ROOT / "runs" / "mutants" / f"seed-{seed}.jsonl"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    begun = time.perf_counter()
     try:
-        mutants = draw(root, options.count, options.seed, options.only)
-        out = options.out or root / "runs" / "mutants" / f"seed-{options.seed}.jsonl"
-        out.parent.mkdir(parents=True, exist_ok=True)
-        begun = time.perf_counter()
         with out.open("w", encoding="utf-8") as sink:
-            for verdict in judge(root, mutants, known, options.workers):
+            for verdict in judge(ROOT, mutants, known, workers):
                 verdicts.append(verdict)
-                sink.write(json.dumps(asdict(verdict)) + "\n")
+                sink.write(dumps(asdict(verdict)) + "\n")
                 sink.flush()
-                spent = time.perf_counter() - begun
-                ahead = spent / len(verdicts) * (len(mutants) - len(verdicts))
-                line = (
-                    f"{len(verdicts)}/{len(mutants)} {verdict.result}, {ahead:.0f} s left: {verdict.mutant}"
-                )
-                sys.stderr.write(line + "\n")
-    except MutantsError as error:
-        sys.stderr.write(f"mutants: {error}\n")
-        return 2
+                ahead = (time.perf_counter() - begun) / len(verdicts) * (len(mutants) - len(verdicts))
+                done = f"{len(verdicts)}/{len(mutants)} {verdict.result}, {ahead:.0f} s left"
+                sys.stderr.write(f"{done}: {verdict.mutant}\n")
     except KeyboardInterrupt:
         sys.stderr.write(f"\nstopped after {len(verdicts)} of {len(mutants)} mutants; results are in {out}\n")
-        _report(verdicts, options.json)
-        return 130
-    _report(verdicts, options.json)
-    return 0
+        status = 130
+    _report(verdicts, json)
+    return status
 
 
 def draw(root: Path, count: int, seed: int, only: Sequence[str] = ()) -> list[Mutant]:
     """Return random mutants, at most one for each line of product code.
 
-    `only` names files or folders; FILE:LINE gives every mutant of one line. Raises MutantsError if a path of
+    `only` names files or folders; FILE:LINE gives every mutant of one line. Raises UsageError if a path of
     `only` has no code to change.
     """
     paths = sorted(
@@ -154,7 +153,7 @@ def draw(root: Path, count: int, seed: int, only: Sequence[str] = ()) -> list[Mu
                     if not line or mutant.line == int(line):
                         found.setdefault((path, mutant.line), []).append(mutant)
         if not found and only:
-            raise MutantsError(f"--only {name}: there is no product code that can be changed")
+            raise UsageError(f"--only {name}: there is no product code that can be changed")
         if line:
             whole += [mutant for mutants in found.values() for mutant in mutants]
         else:
@@ -166,146 +165,91 @@ def draw(root: Path, count: int, seed: int, only: Sequence[str] = ()) -> list[Mu
 
 def mutants_of(source: str, path: str) -> list[Mutant]:
     """Return every mutant of a module's source."""
-    finder = _Finder(source, path)
-    finder.visit(ast.parse(source))
-    return finder.found
+    lines, found, nodes = source.splitlines(), list[Mutant](), [ast.parse(source)]
+    while nodes:
+        node = nodes.pop()
+        if _is_fixed(node):
+            continue
+        for part, kind, changed in _changes(node):
+            if part.end_lineno != part.lineno or part.end_col_offset is None:
+                continue  # over several lines
+            text = changed if isinstance(changed, str) else f"({ast.unparse(changed)})"
+            line = lines[part.lineno - 1]
+            raw = line.encode()
+            after = (raw[: part.col_offset] + text.encode() + raw[part.end_col_offset :]).decode()
+            place = (part.lineno, part.col_offset, part.end_col_offset)
+            found.append(Mutant(path, *place, kind, text, line.strip(), after.strip()))
+        nodes += reversed([part for part in _parts(node) if part is not None])
+    return found
 
 
-class _Finder(ast.NodeVisitor):
-    """Visitor that collects the mutants of a syntax tree."""
+def _is_fixed(node: ast.AST) -> bool:
+    """Return whether a node and its parts stay unchanged: imports, messages, types, the main block."""
+    match node:
+        case ast.Import() | ast.ImportFrom() | ast.JoinedStr() | ast.Raise() | ast.keyword(arg="strict"):
+            return True
+        case ast.Assign(col_offset=0, value=ast.BinOp(op=ast.BitOr()) | ast.Subscript()):
+            return True
+        case ast.If():
+            return ast.unparse(node.test) in {"TYPE_CHECKING", "__name__ == '__main__'"}
+    return False
 
-    def __init__(self, source: str, path: str) -> None:
-        self._lines = source.splitlines()
-        self._path = path
-        self.found: list[Mutant] = []
 
-    def _add(self, node: ast.expr | ast.stmt, kind: str, changed: ast.AST | str) -> None:
-        """Add the mutant that replaces `node`, if the node is on a single line."""
-        if node.end_lineno != node.lineno or node.end_col_offset is None:
-            return
-        text = changed if isinstance(changed, str) else f"({ast.unparse(changed)})"
-        line = self._lines[node.lineno - 1]
-        raw = line.encode()
-        after = (raw[: node.col_offset] + text.encode() + raw[node.end_col_offset :]).decode()
-        place = (node.lineno, node.col_offset, node.end_col_offset)
-        self.found.append(Mutant(self._path, *place, kind, text, line.strip(), after.strip()))
+def _parts(node: ast.AST) -> Iterable[ast.AST | None]:
+    """Return the parts of a node that may change: no decorators and annotations."""
+    match node:
+        case ast.FunctionDef() | ast.AsyncFunctionDef():
+            return [*node.args.defaults, *node.args.kw_defaults, *node.body]
+        case ast.ClassDef():
+            return node.body
+        case ast.AnnAssign():
+            return [node.value]
+    return ast.iter_child_nodes(node)
 
-    def _visit_all(self, nodes: Sequence[ast.AST | None]) -> None:
-        for node in nodes:
-            if node is not None:
-                self.visit(node)
 
-    def visit_FunctionDef(self, node: ast.FunctionDef | ast.AsyncFunctionDef) -> None:
-        """Visit defaults and body, not decorators and annotations."""
-        self._visit_all([*node.args.defaults, *node.args.kw_defaults, *node.body])
+def _changes(node: ast.AST) -> Iterator[tuple[ast.expr | ast.stmt, str, ast.AST | str]]:
+    """Yield each change of a node: the changed part, the kind of change, and the new code."""
+    match node:
+        case ast.If(test=test) | ast.While(test=test) | ast.IfExp(test=test):
+            yield from _negated(test)
+        case ast.comprehension(ifs=tests):
+            for test in tests:
+                yield from _negated(test)
+        case ast.Compare():
+            for index, operator in enumerate(node.ops):
+                for other in _COMPARISONS[type(operator)]:
+                    changed = copy.copy(node)
+                    changed.ops = [*node.ops[:index], other(), *node.ops[index + 1 :]]
+                    yield node, "comparison", changed
+        case ast.BinOp() if type(node.op) in _ARITHMETIC:
+            yield node, "operator", ast.BinOp(node.left, _ARITHMETIC[type(node.op)](), node.right)
+        case ast.UnaryOp(op=ast.USub()):
+            yield node, "minus removed", node.operand
+        case ast.BoolOp():
+            other_word = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+            yield node, "boolean operator", ast.BoolOp(other_word, node.values)
+        case ast.Constant(value=bool() | int() | float() as value):
+            yield node, "constant", _other(value)
+        case ast.Return(value=ast.expr() as given) if not isinstance(given, ast.Constant):
+            yield node, "return value", "return None"
+        case ast.Expr(value=ast.Call()):
+            yield node, "call removed", "pass"
 
-    visit_AsyncFunctionDef = visit_FunctionDef
 
-    def visit_ClassDef(self, node: ast.ClassDef) -> None:
-        """Visit the body only."""
-        self._visit_all(node.body)
+def _other(value: float) -> str:
+    """Return another value of the same type; adding 1 ns to 2 s would have no effect."""
+    if isinstance(value, bool):
+        return str(not value)
+    if isinstance(value, int):
+        return str(value + max(1, value // 2))
+    return repr(1.5 * value if value else 1.0)
 
-    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        """Visit the value only."""
-        self._visit_all([node.value])
 
-    def visit_Assign(self, node: ast.Assign) -> None:
-        """Visit an assignment unless it names a type."""
-        value = node.value
-        union = isinstance(value, ast.BinOp) and isinstance(value.op, ast.BitOr)
-        if not (node.col_offset == 0 and (union or isinstance(value, ast.Subscript))):
-            self.generic_visit(node)
-
-    def _skip(self, node: ast.AST) -> None:
-        """Leave a node and its parts unchanged."""
-
-    visit_Import = visit_ImportFrom = visit_JoinedStr = visit_Raise = _skip
-
-    def visit_If(self, node: ast.If) -> None:
-        """Negate the condition; skip imports for types and the main block."""
-        text = ast.unparse(node.test)
-        if text in {"TYPE_CHECKING", "__name__ == '__main__'"}:
-            return
-        self._negate(node.test)
-        self.generic_visit(node)
-
-    def visit_While(self, node: ast.While) -> None:
-        """Negate the condition."""
-        self._negate(node.test)
-        self.generic_visit(node)
-
-    def visit_IfExp(self, node: ast.IfExp) -> None:
-        """Negate the condition."""
-        self._negate(node.test)
-        self.generic_visit(node)
-
-    def visit_comprehension(self, node: ast.comprehension) -> None:
-        """Negate the conditions."""
-        for test in node.ifs:
-            self._negate(test)
-        self.generic_visit(node)
-
-    def _negate(self, test: ast.expr) -> None:
-        if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
-            self._add(test, "not removed", test.operand)
-        elif not isinstance(test, ast.Compare | ast.Constant):
-            self._add(test, "not added", ast.UnaryOp(ast.Not(), test))
-
-    def visit_Compare(self, node: ast.Compare) -> None:
-        """Invert and shift each comparison."""
-        for index, operator in enumerate(node.ops):
-            for other in _COMPARISONS[type(operator)]:
-                changed = copy.copy(node)
-                changed.ops = [*node.ops[:index], other(), *node.ops[index + 1 :]]
-                self._add(node, "comparison", changed)
-        self.generic_visit(node)
-
-    def visit_BinOp(self, node: ast.BinOp) -> None:
-        """Swap the arithmetic operator."""
-        if type(node.op) in _ARITHMETIC:
-            other = _ARITHMETIC[type(node.op)]()
-            self._add(node, "operator", ast.BinOp(node.left, other, node.right))
-        self.generic_visit(node)
-
-    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
-        """Remove a minus sign."""
-        if isinstance(node.op, ast.USub):
-            self._add(node, "minus removed", node.operand)
-        self.generic_visit(node)
-
-    def visit_BoolOp(self, node: ast.BoolOp) -> None:
-        """Swap `and` and `or`."""
-        other = ast.Or() if isinstance(node.op, ast.And) else ast.And()
-        self._add(node, "boolean operator", ast.BoolOp(other, node.values))
-        self.generic_visit(node)
-
-    def visit_Constant(self, node: ast.Constant) -> None:
-        """Change a number or a truth value."""
-        value = node.value
-        if isinstance(value, bool):
-            self._add(node, "constant", str(not value))
-        elif isinstance(value, int):
-            # Adding 1 ns to 2 s would have no effect.
-            self._add(node, "constant", str(value + max(1, value // 2)))
-        elif isinstance(value, float):
-            self._add(node, "constant", repr(1.5 * value if value else 1.0))
-
-    def visit_Return(self, node: ast.Return) -> None:
-        """Return None instead of a value."""
-        if node.value is not None and not isinstance(node.value, ast.Constant):
-            self._add(node, "return value", "return None")
-        self.generic_visit(node)
-
-    def visit_Expr(self, node: ast.Expr) -> None:
-        """Remove a statement that is a call."""
-        if isinstance(node.value, ast.Call):
-            self._add(node, "call removed", "pass")
-        self.generic_visit(node)
-
-    def visit_keyword(self, node: ast.keyword) -> None:
-        """Visit a keyword argument unless it only checks lengths."""
-        if node.arg != "strict":
-            self.generic_visit(node)
+def _negated(test: ast.expr) -> Iterator[tuple[ast.expr, str, ast.AST]]:
+    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
+        yield test, "not removed", test.operand
+    elif not isinstance(test, ast.Compare | ast.Constant):
+        yield test, "not added", ast.UnaryOp(ast.Not(), test)
 
 
 def mirrored_tests(root: Path, path: str) -> list[str]:
@@ -429,7 +373,7 @@ def judge(
     """Yield the result of each mutant when it is ready.
 
     `known` maps the line before and after the change to the reason why the mutant is equivalent. These
-    mutants are not run. Raises MutantsError if git cannot copy the repository.
+    mutants are not run. Raises UsageError if git cannot copy the repository.
     """
     for mutant in mutants:
         if (mutant.before, mutant.after) in known:
@@ -474,7 +418,7 @@ def _copied(root: Path, folder: Path) -> _Copy:
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise MutantsError(f"git {arguments[0]}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}")
+            raise UsageError(f"git {arguments[0]}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}")
         return done.stdout.strip()
 
     archive = folder.with_suffix(".tar")
@@ -504,30 +448,13 @@ def _report(verdicts: Sequence[Verdict], as_json: bool) -> None:
     if as_json:
         facts = {result: len(found) for result, found in by_result.items()}
         survivors = [str(verdict.mutant) for verdict in by_result["survived"]]
-        sys.stdout.write(json.dumps(facts | {"killed_share": share, "survivors": survivors}) + "\n")
+        say(**facts, killed_share=share, survivors=survivors)
         return
     for result in ("survived", "equivalent"):
         for verdict in sorted(by_result[result], key=lambda verdict: str(verdict.mutant)):
             sys.stdout.write(f"{result}: {verdict.mutant}\n")
     counts = ", ".join(f"{len(found)} {result}" for result, found in by_result.items())
     sys.stdout.write(f"{len(verdicts)} mutants: {counts}; {share:.0%} of {judged} killed\n")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m tests.studies mutants", description=__doc__)
-    parser.add_argument("--count", type=int, default=200, metavar="N", help="mutants to draw (default 200)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the draw (default 1)")
-    parser.add_argument(
-        "--only", nargs="+", default=(), metavar="PATH", help="files or folders; FILE:LINE tries a whole line"
-    )
-    parser.add_argument(
-        "--workers", type=int, choices=(1, 2), default=1, help="mutants at a time (default 1)"
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="results (default runs/mutants/seed-S.jsonl)"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
-    return parser
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""`python -m tests.studies.object_picture RUN`: draws an object's pass that a satellite followed, from a log.
+"""Draws an object's pass that a satellite followed, from a log.
 
 The frame is rendered with the attitude that the flight estimated and the object position of its track.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,6 +23,7 @@ from knightcube.vision.camera.images import grey_stretch
 from sim_hal.assembly import StarRenderer
 from sim_hal.settings import SkySection
 from sim_hal.star_camera import SourceTrack
+from tests.studies.command import command
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_object.yaml"
 
@@ -95,14 +96,15 @@ def _at(times: FloatArray, known: FloatArray, quaternions: FloatArray) -> FloatA
     return np.asarray(quaternions[np.clip(np.searchsorted(known, times), 0, len(known) - 1)])
 
 
-def main() -> int:
+@command
+def main(
+    run: Annotated[Path, "folder of a flight of config/orbit_object.yaml"],
+    *,
+    out: Annotated[Path, "the picture"] = Path("docs/pictures/object.png"),
+) -> int:
     """Draw the picture; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="folder of a flight of config/orbit_object.yaml")
-    parser.add_argument("--out", type=Path, default=Path("docs/pictures/object.png"))
-    options = parser.parse_args()
-    draw(read_run(options.run), options.out)
-    sys.stdout.write(f"{options.out}\n")
+    draw(read_run(run), out)
+    sys.stdout.write(f"{out}\n")
     return 0
 
 

@@ -1,14 +1,13 @@
-"""`python -m tests.studies.pictures`: makes the README's pictures from a flight of the demonstration.
+"""Makes the README's pictures from a flight of the demonstration.
 
 The flight is simulated in lock-step with a fixed seed, so the pictures change only when the software does.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -39,6 +38,7 @@ from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import SkySection
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.earth_camera.scenes import random_scene
+from tests.studies.command import command, scratch
 from tests.support import limb_frames
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,15 +54,14 @@ _OF_TESTBED, _IN_ORBIT = ("overview", "paths"), ("spin", "knowledge", "pointing"
 _OF_BATTERY = ("battery",)
 
 
-def main() -> int:
+@command
+def main(*, out: Annotated[Path, "folder of the pictures"] = ROOT / "docs" / "pictures") -> int:
     """Write the pictures and print their names."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.pictures", description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures", metavar="DIR")
-    folder: Path = parser.parse_args().out
+    folder = out
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as place:
+    with scratch() as place:
         for flown, names in ((CONFIG, _OF_TESTBED), (ORBIT, _IN_ORBIT), (POWER, _OF_BATTERY)):
-            run_folder = Path(place) / flown.stem
+            run_folder = place / flown.stem
             fly(RunRequest(flown, run_folder))
             drawn = {path.stem: path for path in draw(read_run(run_folder), run_folder / "figures")}
             for name in names:

@@ -1,4 +1,4 @@
-"""`python -m tests.studies.source_pictures`: draws figures of Sease 2013 with this project's software.
+"""Draws figures of Sease 2013 with this project's software.
 
 Fig. 2.1: the star table over the whole sky.
 
@@ -20,13 +20,12 @@ Fig. 3.6 is a sketch and is not drawn.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -51,6 +50,7 @@ from sim_hal.settings import Simulation
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky
 from tests.studies.campaigns.streaks import PERCENTS, STREAKS_THESIS, THESIS, THETAS_DEG
+from tests.studies.command import command
 from tests.support.flights import fly
 from tests.support.scenes import FIELD, YEAR, slew
 
@@ -68,22 +68,20 @@ NODES = 10
 _ORANGE, _BLUE, _GREEN = "#D55E00", "#0072B2", "#009E73"
 
 
-def main(arguments: list[str] | None = None) -> int:
+@command
+def main(
+    *,
+    out: Annotated[Path, "folder of the pictures"] = Path("runs") / "source_pictures",
+    only: Annotated[str, "only pictures whose name contains it"] = "",
+    runs: Annotated[int, "of `streaks-thesis`"] = 2,
+) -> int:
     """Draw all figures, and print their names."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.source_pictures", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("runs") / "source_pictures", metavar="DIR")
-    parser.add_argument("--only", default="", metavar="TEXT", help="only pictures whose name contains it")
-    parser.add_argument("--runs", type=int, default=2, help="of `streaks-thesis`, default %(default)s")
-    options = parser.parse_args(arguments)
-    folder: Path = options.out
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures = PICTURES | {ACCURACIES: partial(draw_accuracies, folder / "streaks-thesis", options.runs)}
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = PICTURES | {ACCURACIES: partial(draw_accuracies, out / "streaks-thesis", runs)}
     for name, draw in sorted(pictures.items()):
-        if options.only not in name:
-            continue
-        path = folder / f"{name}.png"
-        draw().savefig(path, dpi=100, facecolor="white")
-        sys.stdout.write(f"{path}\n")
+        if only in name:
+            draw().savefig(out / f"{name}.png", dpi=100, facecolor="white")
+            sys.stdout.write(f"{out / name}.png\n")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`python -m tests.studies sources [TABLE]`: tables of the three sources beside the same quantities here.
+"""Tables of the three sources beside the same quantities here.
 
 Without a table the command lists every table and figure of the sources that has data, with the command that
 reproduces it here. The tables that this command measures are printed as Markdown for the results pages.
@@ -6,7 +6,6 @@ reproduces it here. The tables that this command measures are printed as Markdow
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import time
@@ -14,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -42,6 +42,7 @@ from tests.studies.campaigns import lost_in_space, rso_orbits
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky, look
 from tests.studies.campaigns.rso_orbits import corner_rate, mean_errors, rate_error
 from tests.studies.campaigns.streaks import THESIS_BIAS, measured_bias
+from tests.studies.command import Seed, command
 from tests.support.scenes import BRIGHTEST, FIELD
 from tests.support.star_lists import ListKind, draw
 
@@ -210,25 +211,24 @@ def markdown(rows: Rows) -> str:
     return "".join(f"| {' | '.join(line)} |\n".replace("|  |", "| |") for line in lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    table: Annotated[str | None, "the table to measure (default: list all)", sorted(TABLES)] = None,
+    *,
+    runs: Annotated[int | None, "frames or lists of a cell, or times ten orbits"] = None,
+    seed: Seed = 11,
+) -> int:
     """Print a table of a source, or the list of all."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies sources", description=__doc__)
-    parser.add_argument("table", nargs="?", choices=sorted(TABLES))
-    parser.add_argument("--runs", type=int, help="frames or lists of a cell, or times ten orbits")
-    parser.add_argument("--seed", type=int, default=11, help="default %(default)s")
-    options = parser.parse_args(arguments)
-    if options.table is None:
+    if table is None:
         sys.stdout.write(markdown([["table or figure", "study"], *([*row] for row in INDEX)]))
         return 0
-    table = TABLES[options.table]
-    runs = options.runs or table.runs
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    ).stdout.strip()
-    sys.stdout.write(markdown(table.measure(runs, options.seed)))
+    chosen = TABLES[table]
+    runs = runs or chosen.runs
+    sys.stdout.write(markdown(chosen.measure(runs, seed)))
     today = datetime.now().astimezone().date()
-    command = f"sources {options.table} --runs {runs} --seed {options.seed}"
-    sys.stdout.write(f"\n`{command}`, {today}, {commit}\n")
+    git = ["git", "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    sys.stdout.write(f"\n`sources {table} --runs {runs} --seed {seed}`, {today}, {commit}\n")
     return 0
 
 

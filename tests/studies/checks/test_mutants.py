@@ -125,15 +125,16 @@ def test_killed_survived_and_equivalent(
     known.write_text(
         "- {line: return number + 7, mutant: return None, reason: nobody reads it}\n", encoding="utf-8"
     )
+    monkeypatch.setattr(mutants, "ROOT", repository)
     monkeypatch.setattr(mutants, "EQUIVALENT", known)
     monkeypatch.setattr(mutants, "LIMIT_S", 20.0)
     out = tmp_path / "results.jsonl"
-    assert main(["--only", "knightcube/product.py:6", "--out", str(out), "--json"], repository) == 0
+    assert main(["--only", "knightcube/product.py:6", "--out", str(out), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["killed"], facts["survived"], facts["equivalent"]) == (3, 0, 0)
     results = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
     assert {result["reason"] for result in results} == {"tests/knightcube/test_product.py::test_larger"}
-    assert main(["--only", "knightcube/product.py:10", "--out", str(out)], repository) == 0
+    assert main(["--only", "knightcube/product.py:10", "--out", str(out)]) == 0
     text = capsys.readouterr().out
     assert "survived: knightcube/product.py:10: operator: return number + 7  ->  return (number - 7)" in text
     assert "3 mutants: 0 killed, 2 survived, 1 equivalent; 0% of 2 killed" in text
@@ -160,8 +161,10 @@ def test_draw_depends_on_the_seed_only() -> None:
 
 def test_wrong_path_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     """The error is one line that names the path."""
-    assert main(["--only", "knightcube/none.py"]) == 2
-    assert capsys.readouterr().err.startswith("mutants: --only knightcube/none.py:")
+    with pytest.raises(SystemExit) as stopped:
+        main(["--only", "knightcube/none.py"])
+    assert stopped.value.code == 2
+    assert "error: --only knightcube/none.py:" in capsys.readouterr().err
 
 
 def test_mirrored_tests_come_first() -> None:

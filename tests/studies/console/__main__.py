@@ -1,4 +1,4 @@
-"""`python -m tests.studies.console`: checks in Chromium that the console's page meets its requirements.
+"""Checks in Chromium that the console's page meets its requirements.
 
 The study measures by how much the page lags behind the log, and the memory and processor time of the server
 beside a 40 Hz flight. It checks that a replayed instant shows the same as live, that the browser reports no
@@ -8,24 +8,23 @@ of three sizes and in both themes, the page must not scroll sideways, and axe-co
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
 import os
 import re
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 from ground.console.server import PAGE
 from ground.link.terminal import make_keys
 from ground.watch import LogTail
+from tests.studies.command import Json, command, say, scratch
 from tests.support.browser import Page, audit, missing, opened
 
 CONFIG = Path("config/step_demo.yaml")
@@ -59,27 +58,28 @@ SIZES = ((1600, 1150), (1024, 768), (390, 844))
 """Tested sizes (width, height) of the page, px."""
 
 
-def main() -> int:
+@command
+def main(
+    *,
+    config: Annotated[Path, "to fly"] = CONFIG,
+    seconds: Annotated[float, "of flight"] = 60.0,
+    by_link: Annotated[bool, "telemetry and commands by protected frames"] = False,
+    pictures: Annotated[Path | None, "where to put screenshots"] = None,
+    looks: Annotated[Path | None, "where to put screenshots of all sizes and themes"] = None,
+    json: Json = False,
+) -> int:
     """Measure, print, and save pictures if requested. Returns 1 if a limit is exceeded."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.console", description=__doc__)
-    parser.add_argument("--config", type=Path, default=CONFIG, help=f"to fly (default {CONFIG})")
-    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of flight (default 60)")
-    parser.add_argument("--by-link", action="store_true", help="telemetry and commands by protected frames")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="where to put screenshots")
-    parser.add_argument("--looks", type=Path, metavar="DIR", help="screenshots of all sizes and themes")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args()
     if lacks := missing():
         sys.stderr.write(f"{lacks}\n")
         return 1
-    figures = measure(options.config, options.seconds, options.pictures, options.looks, options.by_link)
-    if options.json:
-        sys.stdout.write(json.dumps(asdict(figures)) + "\n")
+    figures = measure(config, seconds, pictures, looks, by_link)
+    if json:
+        say(**asdict(figures))
     else:
         for name, value in asdict(figures).items():
             asked = f"   (at most {ASKED[name]:g})" if name in ASKED else ""
             sys.stdout.write(f"{name:14} {value}{asked}\n")
-    return 1 if missed(figures, options.by_link) else 0
+    return 1 if missed(figures, by_link) else 0
 
 
 def missed(figures: Figures, by_link: bool) -> list[str]:
@@ -98,8 +98,8 @@ def measure(
     config: Path, seconds: float, pictures: Path | None, looks: Path | None, by_link: bool = False
 ) -> Figures:
     """Run a flight for `seconds` s, and examine the page."""
-    with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-        run, way = Path(place) / "run", _linked if by_link else _flown
+    with scratch() as place:
+        run, way = place / "run", _linked if by_link else _flown
         with way(config, run) as (url, server, source), opened(url) as page:
             begun, spent = time.monotonic(), _processor_s(server)
             lag = _lag(page, LogTail(run), seconds)
@@ -114,7 +114,7 @@ def measure(
             _picture(page, pictures, "replay")
             equal, red = replayed == (live, values), _red(page, source)
             wrong = _looked_at(page, looks)
-            filed = _filed(page, Path(place)) if by_link else ""
+            filed = _filed(page, place) if by_link else ""
             others = (page.complaints, page.strangers, equal, commanded, red, wrong, filed)
             return Figures(_weight_kb(), lag, memory, share, *others)
 

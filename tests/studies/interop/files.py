@@ -1,7 +1,7 @@
 """File transfers between the CFDP service of Yamcs and the satellite, through link and gateway, with losses.
 
-`python -m tests.studies.interop.files FOLDER [--megabytes M] [--loss P ...] [--seed S]` starts link, gateway
-and Yamcs as separate processes, with a relay between link and gateway that loses frames in both directions.
+Link, gateway and Yamcs are separate processes, with a relay between link and gateway that loses frames in
+both directions.
 The satellite is commanded to send one file, and Yamcs uploads another one. The study prints one JSON line for
 each loss
 probability: whether both files arrived complete (SHA-256) and were closed at both ends, and the durations
@@ -12,27 +12,25 @@ required. The study is skipped with a message if Java or the bundle is missing.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from ground.link.terminal import make_keys
 from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, UP_BUCKET, write
+from tests.studies.command import Seed, command, say
 from tests.studies.interop.lossy_relay import lossy_relay
 from tests.studies.interop.yamcs import until
 from tests.support.flooded_flight import free_port as free_udp_port
+from tests.support.linked_board import write_linked_config
 from tests.support.linked_flight import free_port, service
 from tests.support.yamcs_server import Yamcs, missing, serving
 
-_CONFIG = Path(__file__).resolve().parents[3] / "config" / "step_demo.yaml"
 _RATE = 200_000
 _LONGEST_S = 1800.0
 _ASK_S = 10.0
@@ -41,8 +39,8 @@ _NAME = "dump.bin"
 _TRANSFERS = f"/filetransfer/{INSTANCE}/{CFDP}/transfers"
 
 
-def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
-    """Transfer a file in each direction, and return the results."""
+def transferred(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str, Any]]:
+    """Transfer a file in each direction, and yield the results."""
     data = np.random.default_rng(seed).bytes(size)
     (place / "runs" / _RUN).mkdir(parents=True)
     (place / "runs" / _RUN / _NAME).write_bytes(data)
@@ -59,10 +57,10 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
     closed = states == ["COMPLETED", "COMPLETED"] and not left
     sound = down["down_whole"] and up["up_whole"] and closed
     facts = {"loss": loss, "bytes": size, **down, **up, "closed": closed, "sound": sound}
-    return {**facts, "states": states, "open": left}
+    yield {**facts, "states": states, "open": left}
 
 
-def endings(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str, Any]]:
+def ended(place: Path, size: int, loss: float, seed: int) -> Iterator[dict[str, Any]]:
     """Cancel a transfer in each direction from each side, and suspend one; yield the result of each."""
     (place / "runs" / _RUN).mkdir(parents=True)
     (place / "runs" / _RUN / _NAME).write_bytes(np.random.default_rng(seed).bytes(size))
@@ -171,45 +169,35 @@ def _is_download(one: dict[str, Any]) -> bool:
 @contextmanager
 def _opened(place: Path, loss: float, seed: int) -> Iterator[str]:
     """Start link, relay and gateway; yield the gateway's address."""
-    satellite, ground = make_keys(place / "keys")
-    port, gateway = free_udp_port(), f"127.0.0.1:{free_port()}"
-    section = {"keys": str(satellite), "udp": f"127.0.0.1:{port}", "rate": _RATE}
-    config = place / "flight.yaml"
-    commands = json.dumps({"socket": str(place / "commands")})
-    config.write_text(f"{_CONFIG.read_text()}\ncommands: {commands}\nlink: {json.dumps(section)}\n")
-    log = place / "log"
+    udp, gateway, log = f"127.0.0.1:{free_udp_port()}", f"127.0.0.1:{free_port()}", place / "log"
+    config = write_linked_config(place, udp=udp, rate=_RATE)
     with ExitStack() as stack:
         stack.enter_context(service(log, "link open", "link", config, "--log", place / "runs"))
-        way = stack.enter_context(lossy_relay(f"127.0.0.1:{port}", loss, seed))
-        words = ["gateway", "--link", way, "--keys", ground, "--serve", gateway]
+        way = stack.enter_context(lossy_relay(udp, loss, seed))
+        words = ["gateway", "--link", way, "--keys", place / "keys" / "ground", "--serve", gateway]
         stack.enter_context(service(log, "packets on", *words))
         yield gateway
 
 
-def main() -> int:
+@command
+def main(
+    folder: Annotated[Path, "for all that is written; new"],
+    *,
+    megabytes: Annotated[float, "of each file"] = 10.0,
+    loss: Annotated[tuple[float, ...], "probabilities of a frame's loss"] = (0.0, 0.1, 0.3),
+    seed: Seed = 1,
+    endings: Annotated[bool, "cancel and suspend transfers instead"] = False,
+) -> int:
     """Transfer files at each loss probability and print the results."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.files", description=__doc__)
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="for all that is written; new")
-    parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of each file")
-    parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.1, 0.3], metavar="P")
-    parser.add_argument("--seed", type=int, default=1, metavar="S")
-    parser.add_argument("--endings", action="store_true", help="cancel and suspend transfers instead")
-    options = parser.parse_args()
     if problem := missing():
         sys.stdout.write(f"SKIPPED: {problem}\n")
         return 0
     sound = True
-    for loss in options.loss:
-        place = options.folder.absolute() / f"loss-{loss:g}"
+    for part in loss:
+        place = folder.absolute() / f"loss-{part:g}"
         place.mkdir(parents=True)
-        size = round(options.megabytes * 1e6)
-        if options.endings:
-            found = endings(place, size, loss, options.seed)
-        else:
-            found = iter([transfer(place, size, loss, options.seed)])
-        for facts in found:
-            sys.stdout.write(json.dumps(facts) + "\n")
-            sys.stdout.flush()
+        for facts in (ended if endings else transferred)(place, round(megabytes * 1e6), part, seed):
+            say(**facts)
             sound &= facts["sound"]
     return 0 if sound else 1
 

@@ -1,10 +1,10 @@
 """Yamcs archives and commands a simulated flight through the authenticated link.
 
-`python -m tests.studies.interop.yamcs FOLDER [--orbit]` flies in real time with link, gateway and Yamcs. It
-prints one JSON line for each check: Yamcs loads the XTCE without a warning; every kind of command completes,
-and a refused one is reported; the archive holds every packet of the flight log, byte for byte; Yamcs decodes
-the same values as this project; no process has a socket beyond loopback. The exit status is 1 if a check
-fails. The study is skipped with a message if Java or the bundle is missing.
+The study flies in real time with link, gateway and Yamcs. It prints one JSON line for each check: Yamcs loads
+the XTCE without a warning; every kind of command completes, and a refused one is reported; the archive holds
+every packet of the flight log, byte for byte; Yamcs decodes the same values as this project; no process has a
+socket beyond loopback. The exit status is 1 if a check fails. The study is skipped with a message if Java or
+the bundle is missing.
 
 The testbed executes all commands except those that point a satellite. With `--orbit` a satellite executes two
 pointing commands, which needs minutes. With `--short`, which CI uses, only the commands that complete in any
@@ -13,15 +13,13 @@ state of the flight are executed.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -39,6 +37,8 @@ from flight.schema.reader import load
 from ground.telemetry import scan
 from ground.xtce import spread
 from ground.yamcs import write
+from knightcube.errors import UsageError
+from tests.studies.command import command, say
 from tests.studies.interop.sockets import beyond_loopback
 from tests.support.linked_flight import LinkedFlight, free_port, linked_flight
 from tests.support.xtce_fields import single_bits
@@ -135,7 +135,12 @@ def fly(place: Path, plan: Plan) -> bool:
             line for line in troubles(server.log.read_text()) if not any(words in line for words in _ENDED)
         ]
         trouble = [line for line in lines if _RACE not in line]
-    _say("without a warning", lines=len(trouble), first=trouble[:3], races_of_yamcs=len(lines) - len(trouble))
+    say(
+        what="without a warning",
+        lines=len(trouble),
+        first=trouble[:3],
+        races_of_yamcs=len(lines) - len(trouble),
+    )
     return all(sound) and not trouble
 
 
@@ -152,7 +157,7 @@ def _command(server: Yamcs, flight: LinkedFlight, plan: Plan) -> bool:
         ends[name] += "" if "NOK" not in stages else " with a stage that failed"
     refused = _followed(server, *_REFUSED, _DEADLINE_S)
     failed = refused.get("CommandComplete_Status") == "NOK"
-    _say("commands", **ends, refused=refused.get("CommandComplete_Message", "not reported"))
+    say(what="commands", **ends, refused=refused.get("CommandComplete_Message", "not reported"))
     return failed and all(end == "OK" for end in ends.values())
 
 
@@ -186,7 +191,7 @@ def _races(server: Yamcs) -> int:
 def _sockets(server: Yamcs, flight: LinkedFlight) -> bool:
     processes = {"yamcs": server.process.pid, **{name: p.pid for name, p in flight.processes.items()}}
     found = {name: beyond_loopback(pid) for name, pid in processes.items()}
-    _say("sockets beyond loopback", **{name: sorted(sockets) for name, sockets in found.items()})
+    say(what="sockets beyond loopback", **{name: sorted(sockets) for name, sockets in found.items()})
     return not any(found.values())
 
 
@@ -197,7 +202,7 @@ def _archive(server: Yamcs, logged: set[bytes]) -> bool:
     missed = len(logged - set(archived))
     strange = len(set(archived) - logged - set(of_the_link))
     counts = {"logged": len(logged), "archived": len(archived), "of_the_link": len(of_the_link)}
-    _say("archive", **counts, missed=missed, strange=strange)
+    say(what="archive", **counts, missed=missed, strange=strange)
     return bool(logged) and missed == strange == 0
 
 
@@ -217,7 +222,7 @@ def _values(server: Yamcs) -> bool:
             fields += len(wanted)
             absent += abs(len(wanted) - len(found))
             different += sum(not alike(*pair) for pair in zip(wanted, found, strict=False))
-    _say("values", fields=fields, different=different, absent=absent)
+    say(what="values", fields=fields, different=different, absent=absent)
     return fields > 0 and different == absent == 0
 
 
@@ -269,26 +274,20 @@ def until(done: Callable[[], bool], seconds: float) -> None:
         time.sleep(0.3)
 
 
-def _say(what: str, **facts: Any) -> None:
-    sys.stdout.write(json.dumps({"what": what, **facts}) + "\n")
-    sys.stdout.flush()
-
-
-def main() -> int:
+@command
+def main(
+    place: Annotated[Path, "a folder that does not exist yet"],
+    *,
+    orbit: Annotated[bool, "fly the satellite instead of the testbed"] = False,
+    short: Annotated[bool, "fly for less than a minute"] = False,
+) -> int:
     """Fly under Yamcs; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.yamcs", description=__doc__)
-    parser.add_argument("place", type=Path, metavar="FOLDER", help="does not exist yet")
-    kind = parser.add_mutually_exclusive_group()
-    for name, words in (
-        ("orbit", "fly the satellite instead of the testbed"),
-        ("short", "fly for less than a minute"),
-    ):
-        kind.add_argument(f"--{name}", dest="plan", action="store_const", const=name, help=words)
-    options = parser.parse_args()
+    if orbit and short:
+        raise UsageError("--short: not allowed with --orbit")
     if problem := missing():
         sys.stderr.write(f"SKIPPED: {problem}\n")
         return 0
-    return 0 if fly(options.place, PLANS[options.plan or "testbed"]) else 1
+    return 0 if fly(place, PLANS["orbit" if orbit else "short" if short else "testbed"]) else 1
 
 
 if __name__ == "__main__":
