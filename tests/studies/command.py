@@ -30,8 +30,8 @@ def command(function: Callable[..., int]) -> Main:
 
     A keyword-only parameter is an option, and any other parameter an argument. The annotation of each is
     `Annotated[TYPE, HELP]`, or `Annotated[TYPE, HELP, CHOICES]`. A `bool` is an option without a value, a
-    `tuple` takes several values, and a `Literal` only its own. A UsageError ends the command with its message
-    and status 2.
+    `tuple` takes several values, and a `Literal` only its own. A UsageError is printed, and the exit
+    status is 2.
     """
 
     def main(arguments: Sequence[str] | None = None) -> int:
@@ -48,7 +48,8 @@ def command(function: Callable[..., int]) -> Main:
         try:
             return function(**vars(parser.parse_args(arguments)))
         except UsageError as error:
-            parser.error(str(error))
+            sys.stderr.write(f"{name.rpartition('.')[2]}: {error}\n")
+            return 2
 
     return main
 
@@ -73,10 +74,9 @@ def _add(
         words["default"] = parameter.default
         shown += "" if parameter.default in (None, "") else " (default %(default)s)"
     if parameter.kind is Parameter.KEYWORD_ONLY:
-        parser.add_argument(option, help=shown, **words)
+        parser.add_argument(option, help=shown, required="default" not in words, **words)
     else:
-        nargs = {} if parameter.default is Parameter.empty else {"nargs": "?"}
-        parser.add_argument(parameter.name, help=shown, **words, **nargs)
+        parser.add_argument(parameter.name, help=shown, nargs="?" if "default" in words else None, **words)
 
 
 def say(**facts: Any) -> None:

@@ -13,12 +13,20 @@ import pytest
 from flight.link.telemetry.definitions import EVENT, IMU, RUN, TARGET
 from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.packets import Packer, compile_layouts
+from knightcube.errors import UsageError
 from tests.studies.same_bytes.__main__ import main, run_all, table
-from tests.studies.same_bytes.answers import ANSWERS_FILE, PICTURES, Answers, ask, photographs
 from tests.studies.same_bytes.checkout import CheckoutError, check_out, resolve
-from tests.studies.same_bytes.comparison import Verdict, compare
-from tests.studies.same_bytes.flights import FLIGHTS, TABLE_FILE, packet_table
-from tests.studies.same_bytes.texts import Texts
+from tests.studies.same_bytes.comparison import Texts, Verdict, compare
+from tests.studies.same_bytes.runs import (
+    ANSWERS_FILE,
+    FLIGHTS,
+    PICTURES,
+    TABLE_FILE,
+    Run,
+    ask,
+    packet_table,
+    photographs,
+)
 
 OLD = (RUN, IMU, TARGET)
 RUN_VALUES: dict[str, object] = {
@@ -230,7 +238,7 @@ def test_renamed_texts_are_applied_in_their_order() -> None:
 
 @pytest.mark.parametrize("pair", [{"old": "a"}, {"old": "a", "new": "b {x}"}, "a"])
 def test_a_wrong_entry_of_the_table_is_refused(pair: dict[str, str]) -> None:
-    with pytest.raises(ValueError, match="renamed text"):
+    with pytest.raises(UsageError, match="renamed text"):
         Texts([pair])
 
 
@@ -300,7 +308,7 @@ def test_the_answers_of_a_checkout_are_recorded(tmp_path: Path) -> None:
     )
     work = tmp_path / "work"
     work.mkdir()
-    ask(checkout, Answers("x", ("plan --to 'a b'", "wrong")), work)
+    ask(checkout, Run("x", ("plan --to 'a b'", "wrong")), work)
     assert json.loads((work / ANSWERS_FILE).read_text()) == {
         "plan --to 'a b'": {"status": 0, "output": ["plan", "--to", "a b", "--json"], "error": []},
         "wrong": {"status": 2, "output": [], "error": ["flight: wrong"]},
@@ -313,7 +321,7 @@ def test_photographs_are_asked_about_where_there_are_any(tmp_path: Path) -> None
     (tmp_path / "sky").mkdir()
     for name in ("a.png", "README.md"):
         (tmp_path / "sky" / name).touch()
-    assert photographs(tmp_path) == Answers("photographs", ("solve photographs/sky/a.png",))
+    assert photographs(tmp_path) == Run("photographs", ("solve photographs/sky/a.png",))
 
 
 def test_a_run_that_fails_in_this_checkout_is_a_difference_and_the_others_are_compared(
@@ -326,7 +334,7 @@ def test_a_run_that_fails_in_this_checkout_is_a_difference_and_the_others_are_co
     monkeypatch.setattr(
         "tests.studies.same_bytes.__main__.check_out", lambda _, folder: shutil.copytree(old, folder)
     )
-    runs = [Answers("plan", ("plan",)), PICTURES]
+    runs = [Run("plan", ("plan",)), PICTURES]
     verdicts = run_all("0" * 40, runs, tmp_path / "keep", tmp_path / "cache", refresh=False)
     assert [verdict.difference is None for verdict in verdicts] == [False, True]
     assert "KeyError: 'lost'" in table("0" * 40, verdicts)
@@ -334,7 +342,7 @@ def test_a_run_that_fails_in_this_checkout_is_a_difference_and_the_others_are_co
 
 def test_the_flights_are_of_testbed_and_orbit() -> None:
     assert len(FLIGHTS) == 10
-    assert {Path(flight.config).stem for flight in FLIGHTS} == {
+    assert {Path(run.flight.split()[0]).stem for run in FLIGHTS} == {
         *("step_demo", "step_thesis", "orbit", "orbit_3u", "orbit_object"),
     }
 

@@ -113,11 +113,14 @@ def test_the_options_of_a_command_are_the_parameters_of_its_function(
     assert given == expected
 
 
-@pytest.mark.parametrize("words", ["--kind three", "--sizes x", "--quick --time 1", "a b"])
-def test_a_wrong_option_and_a_usage_error_end_a_command_with_status_2(
-    words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("words", ["--kind three", "--sizes x", "a b"])
+def test_a_wrong_option_ends_a_command_with_status_2(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
         study(words.split())
     assert stopped.value.code == 2
     assert "error: " in capsys.readouterr().err
+
+
+def test_a_usage_error_is_printed_in_one_line_and_the_status_is_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert study(["--quick", "--time", "1"]) == 2
+    assert capsys.readouterr().err == "test_studies: --time: not with --quick\n"

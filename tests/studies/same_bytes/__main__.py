@@ -1,54 +1,64 @@
-"""Checks that this checkout behaves as REV does: `python -m tests.studies.same_bytes --against REV`.
+"""Checks that this checkout behaves as another revision does.
 
 The study flies ten flights and runs commands in this checkout, with its uncommitted changes, and in a
-temporary checkout of REV, with the same interpreter on the same machine. It compares the flight logs and the
-commands' results.
+temporary checkout of the other revision (REV), with the same interpreter on the same machine. It compares the
+flight logs and the commands' results.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Annotated
 
-from tests.studies.same_bytes.answers import GROUPS, PHOTOGRAPHS, PICTURES, Answers, ask, photographs
+from knightcube.errors import UsageError
+from tests.studies.command import Json, command, say, scratch
 from tests.studies.same_bytes.checkout import CheckoutError, cache_folder, check_out, repository, resolve
-from tests.studies.same_bytes.comparison import Difference, Verdict, compare
-from tests.studies.same_bytes.flights import FLIGHTS, SHORT, Flight, fly
-from tests.studies.same_bytes.texts import Texts
+from tests.studies.same_bytes.comparison import Difference, Texts, Verdict, compare
+from tests.studies.same_bytes.runs import (
+    FLIGHTS,
+    GROUPS,
+    PHOTOGRAPHS,
+    PICTURES,
+    SHORT,
+    Run,
+    perform,
+    photographs,
+)
 
+CACHE = repository() / "runs" / "same_bytes"
 AT_ONCE = 2  # number of runs at the same time
-Run = Flight | Answers
-"""A flight, or a group of commands with results."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@command
+def main(
+    *,
+    against: Annotated[str, "the revision to compare with"],
+    only: Annotated[tuple[str, ...], "names of runs, or `flights` or `answers`"] = (),
+    keep: Annotated[Path | None, "folder that keeps this side's logs and answers"] = None,
+    cache: Annotated[Path, "folder of REV's logs and answers"] = CACHE,
+    refresh: Annotated[bool, "run REV's side again"] = False,
+    json: Json = False,
+) -> int:
     """Run, compare, print. Returns 0 if all results are equal, 1 if not, 2 for wrong use."""
     real = photographs()
     sets: dict[str, tuple[Run, ...]] = {"flights": FLIGHTS, "answers": (*GROUPS, real) if real else GROUPS}
     choices = sets | {run.name: (run,) for run in (*sets["flights"], SHORT, *sets["answers"])}
-    options = _parser(list(choices)).parse_args(arguments)
+    if unknown := set(only) - choices.keys():
+        raise UsageError(f"--only {', '.join(sorted(unknown))}: choose from {', '.join(choices)}")
     if real is None:
         sys.stderr.write(f"same_bytes: no photographs in {PHOTOGRAPHS}: they are left out\n")
-    chosen = dict.fromkeys(run for name in options.only or sets for run in choices[name])
-    try:
-        commit = resolve(options.against)
-        with tempfile.TemporaryDirectory(prefix="same-bytes-") as temporary:
-            keep = Path(temporary) if options.keep is None else options.keep.resolve()
-            verdicts = run_all(commit, list(chosen), keep, options.cache.resolve(), options.refresh)
-    except (CheckoutError, ValueError) as error:
-        sys.stderr.write(f"same_bytes: {error}\n")
-        return 2
-    if options.json:
-        report = {"against": commit, "runs": [verdict.as_json() for verdict in verdicts]}
-        sys.stdout.write(json.dumps(report) + "\n")
+    chosen = dict.fromkeys(run for name in only or sets for run in choices[name])
+    commit = resolve(against)
+    with scratch() as temporary:
+        verdicts = run_all(commit, list(chosen), (keep or temporary).resolve(), cache.resolve(), refresh)
+    if json:
+        say(against=commit, runs=[verdict.as_json() for verdict in verdicts])
     else:
         sys.stdout.write(table(commit, verdicts))
     return int(any(verdict.difference is not None for verdict in verdicts))
@@ -59,15 +69,15 @@ def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: 
 
     The results of this checkout are stored in `keep`.
 
-    Raises CheckoutError if REV's side fails, and ValueError for a wrong table of renamed texts.
+    Raises CheckoutError if REV's side fails, and UsageError for a wrong table of renamed texts.
     """
     texts = Texts.read()
     old = {run: cache_folder(cache, commit, run.name, run.key) for run in (PICTURES, *runs)}
-    needed = dict.fromkeys((PICTURES, *runs) if any(isinstance(run, Answers) for run in runs) else runs)
+    needed = dict.fromkeys(runs if all(run.flight for run in runs) else (PICTURES, *runs))
     missing = [run for run in needed if refresh or not old[run].is_dir()]
     pictures = old[PICTURES]
-    with tempfile.TemporaryDirectory(prefix="same-bytes-old-") as temporary:
-        checkout = Path(temporary) / "checkout"
+    with scratch() as temporary:
+        checkout = temporary / "checkout"
         if missing:
             check_out(commit, checkout)
         if PICTURES in missing:  # the other groups need the pictures
@@ -89,13 +99,7 @@ def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
     work.parent.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()
     try:
-        if isinstance(run, Flight):
-            fly(checkout, run, work)
-        else:
-            work.mkdir()
-            (work / "pictures").symlink_to(pictures)
-            (work / "photographs").symlink_to(PHOTOGRAPHS)
-            ask(checkout, run, work)
+        perform(checkout, run, work, pictures)
     except CheckoutError as error:
         shutil.rmtree(work, ignore_errors=True)
         raise CheckoutError(f"{run.name} in {checkout}: {error}") from error
@@ -136,26 +140,6 @@ def _result(verdict: Verdict) -> str:
         return "equal"
     time = "" if first.time is None else f" at {first.time:.3f} s"
     return f"DIFFERENT: {first.log}, {first.packet}{time}, {first.field}: {first.old} -> {first.new}"
-
-
-def _parser(names: Sequence[str]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.studies.same_bytes",
-        description="Run this checkout and another revision; compare flight logs byte for byte, and answers.",
-    )
-    parser.add_argument("--against", required=True, metavar="REV", help="the revision to compare with")
-    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"of {', '.join(names)}")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep this side's logs and answers there")
-    parser.add_argument(
-        "--cache",
-        type=Path,
-        metavar="DIR",
-        default=repository() / "runs" / "same_bytes",
-        help="REV's logs and answers",
-    )
-    parser.add_argument("--refresh", action="store_true", help="run REV's side again")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    return parser
 
 
 if __name__ == "__main__":

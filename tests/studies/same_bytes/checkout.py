@@ -16,6 +16,8 @@ import tarfile
 from importlib import metadata
 from pathlib import Path
 
+from knightcube.errors import UsageError
+
 _LIMIT = 3600.0  # timeout (s) of one process
 # An editable installation of the project provides modules that a checkout lacks, so its finders are removed.
 _ONLY_HERE = """
@@ -24,7 +26,7 @@ sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(fin
 """
 
 
-class CheckoutError(Exception):
+class CheckoutError(UsageError):
     """Error for a revision that cannot be checked out, or a process in a checkout that failed."""
 
 

@@ -8,12 +8,13 @@ version of the software, and the checksum of the configuration's text, in which 
 
 In the command results, these labels and times of the machine are not compared. Keys that only the new result
 has are counted as added. Texts that differ are accepted if the table of renamed texts converts the old into
-the new text.
+the new text (`renamed_texts.yaml`).
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -22,13 +23,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from flight.link.telemetry.fields import Field, Packet
 from flight.link.telemetry.log import find_segments
-from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, Layout, compile_layouts, to_text
-from tests.studies.same_bytes.answers import ANSWERS_FILE
-from tests.studies.same_bytes.flights import TABLE_FILE
-from tests.studies.same_bytes.texts import Texts
+from flight.link.telemetry.packets import HEADER_BYTES, Layout, compile_layouts, to_text
+from knightcube.errors import UsageError
+from tests.studies.same_bytes.runs import ANSWERS_FILE, TABLE_FILE
 
 STEMS = ("flight", "truth")
 LABELS = {"run": ("utc_ns", "software", "config_crc")}
@@ -39,10 +40,58 @@ UNCOMPARED = frozenset(
         *("elapsed_s", "execution_s", "max_s", "mean_s", "overruns", "processor_s", "seconds", "solved_s"),
     }
 )
+RENAMED = Path(__file__).with_name("renamed_texts.yaml")
+_PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _APID_BITS = 0x7FF
 Table = Mapping[int, Layout]
 _NONE = type("NoSuchValue", (), {"__repr__": lambda _: "missing"})()
 _SHORT = 100  # number of displayed characters of a value
+
+
+class Texts:
+    """Converter of renamed texts."""
+
+    def __init__(self, pairs: Iterable[Mapping[str, str]] = ()) -> None:
+        """Create the table from pairs of `old` and `new`.
+
+        Raises UsageError for a pair with other keys or placeholders.
+        """
+        self._pairs = [_compiled(pair) for pair in pairs]
+
+    @classmethod
+    def read(cls, path: Path = RENAMED) -> Texts:
+        """Return the table of a file. Raises UsageError if it is not a list of pairs."""
+        pairs = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if not isinstance(pairs, list):
+            raise UsageError(f"{path}: not a list of pairs of old and new")
+        return cls(pairs)
+
+    def renamed(self, text: str) -> str:
+        """Return a text of the old revision in the wording of the new one."""
+        for old, new in self._pairs:
+            found = old.fullmatch(text)
+            if found is not None:
+                words = found.groupdict()
+                text = _PLACEHOLDER.sub(lambda place, words=words: words[place[1]], new)  # type: ignore[misc]  # mypy infers no type for a lambda with a default
+        return text
+
+    def cut(self, field: bytes) -> bytes:
+        """Return the bytes of a text field in the wording of the new revision, cut to the field's size."""
+        text = self.renamed(to_text(field)).encode()
+        return text[: len(field) - 1].decode("utf-8", "ignore").encode().ljust(len(field), b"\0")
+
+
+def _compiled(pair: Mapping[str, str]) -> tuple[re.Pattern[str], str]:
+    """Return the pattern of the old text, and the new text."""
+    if not isinstance(pair, dict) or set(pair) != {"old", "new"}:
+        raise UsageError(f"renamed text {pair!r}: a pair has the keys old and new")
+    pieces = _PLACEHOLDER.split(pair["old"])  # texts alternate with placeholder names
+    if set(_PLACEHOLDER.findall(pair["new"])) - set(pieces[1::2]):
+        raise UsageError(f"renamed text {pair['new']!r}: a placeholder is not in the old text")
+    pattern = "".join(
+        f"(?P<{piece}>.*)" if number % 2 else re.escape(piece) for number, piece in enumerate(pieces)
+    )
+    return re.compile(pattern, re.DOTALL), pair["new"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,10 +211,10 @@ def compare_logs(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
                 difference = difference or _one_ended(stem, a, b, old_table, new_table)
                 break
             compared += 1
-            same, longer = _same(a, b, old_table, new_table, texts)
-            extended += longer
-            if not same and difference is None:
-                difference = _explain(stem, a, b, old_table, new_table, texts)
+            if a != b:
+                found, longer = _difference(stem, a, b, old_table, new_table, texts)
+                extended += longer
+                difference = difference or found
     return Verdict(name, compared, dict(added), extended, difference)
 
 
@@ -195,29 +244,42 @@ def _apid(packet: bytes) -> int:
     return int.from_bytes(packet[:2], "big") & _APID_BITS
 
 
-def _same(a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> tuple[bool, bool]:
-    """Return whether two packets are equal except for labels, and whether the new one only adds fields."""
-    if a == b:
-        return True, False
-    first, second = old.get(_apid(a)), new.get(_apid(b))
-    if first is None or second is None or first.packet.apid != second.packet.apid:
-        return False, False
+def _difference(
+    stem: str, a: bytes, b: bytes, old: Table, new: Table, texts: Texts
+) -> tuple[Difference | None, bool]:
+    """Return the difference of two packets, if any, and whether the new definition only adds fields."""
+    first, second, time = old.get(_apid(a)), new.get(_apid(b)), _time(a)
+    if first is None or second is None or _apid(a) != _apid(b):
+        return Difference(stem, _name(a, old), time, "packet", _name(a, old), _name(b, new)), False
     longer = _extends(first, second)
     if len(a) != first.length or len(b) != second.length or not (longer or len(a) == len(b)):
-        return False, False
-    return _core(_renamed(a, b, first, texts), first, longer) == _core(b, first, longer), longer
+        found: tuple[str, str, str] | None = ("length", str(len(a)), str(len(b)))
+    else:
+        found = _different_field(a, b, first, longer, texts)
+    kinds = [_kinds(layout.packet.fields) for layout in (first, second)]
+    if found and kinds[0] != kinds[1] and not longer:
+        names = (" ".join(name for name, _, _ in fields) for fields in kinds)
+        found = ("definition", *names)
+    return (Difference(stem, first.packet.name, time, *found) if found else None), longer
 
 
-def _renamed(a: bytes, b: bytes, layout: Layout, texts: Texts) -> bytes:
-    """Return the old packet with its differing texts in the wording of the new packet."""
-    raw = bytearray(a)
-    for field in layout.packet.fields:
-        begin, size = layout.offsets[field.name], layout.dtype[field.name].itemsize
-        place = slice(begin, begin + size)
-        if field.kind.startswith("S") and field.count == 1 and a[place] != b[place]:
-            text = texts.renamed(to_text(a[place])).encode()
-            raw[place] = text[: size - 1].decode("utf-8", "ignore").encode().ljust(size, b"\0")
-    return bytes(raw)
+def _different_field(
+    a: bytes, b: bytes, layout: Layout, longer: bool, texts: Texts
+) -> tuple[str, str, str] | None:
+    """Return the first field whose value differs, and both values; labels and checksums are not compared.
+
+    If `longer`, the new packet has more fields, and length and version differ too.
+    """
+    one, two = (np.frombuffer(packet, layout.dtype, 1)[0] for packet in (a, b))
+    for name, begin in layout.offsets.items():
+        kind = layout.dtype[name]
+        before, after = (packet[begin : begin + kind.itemsize] for packet in (a, b))
+        if kind.kind == "S" and before != after:
+            before = texts.cut(before)
+        if before != after and name not in LABELS.get(layout.packet.name, ()):
+            return name, *_values(one[name], two[name])
+    header = slice(4 if longer else HEADER_BYTES + 1)
+    return None if a[header] == b[header] else ("header", a[header].hex(), b[header].hex())
 
 
 def _extends(first: Layout, second: Layout) -> bool:
@@ -230,41 +292,6 @@ def _extends(first: Layout, second: Layout) -> bool:
 
 def _kinds(fields: Iterable[Field]) -> list[tuple[str, str, int]]:
     return [(field.name, field.kind, field.count) for field in fields]
-
-
-def _core(packet: bytes, layout: Layout, longer: bool) -> bytes:
-    """Return a packet without checksum and with zeros as labels.
-
-    If `longer`, the packet has new fields at its end. They are omitted, and length and version are zeros too.
-    """
-    raw = bytearray(packet[: layout.length - CRC_BYTES])
-    for label in LABELS.get(layout.packet.name, ()):
-        if label in layout.offsets:
-            begin = layout.offsets[label]
-            raw[begin : begin + layout.dtype[label].itemsize] = bytes(layout.dtype[label].itemsize)
-    if longer:
-        raw[4 : HEADER_BYTES + 1] = bytes(3)
-    return bytes(raw)
-
-
-def _explain(stem: str, a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> Difference:
-    """Return the first field in which two packets differ."""
-    first, second = old.get(_apid(a)), new.get(_apid(b))
-    time = _time(a)
-    if first is None or second is None or first.packet.name != second.packet.name:
-        return Difference(stem, _name(a, old), time, "packet", _name(a, old), _name(b, new))
-    name = first.packet.name
-    kinds = [_kinds(layout.packet.fields) for layout in (first, second)]
-    if kinds[0] != kinds[1] and not _extends(first, second):
-        return Difference(stem, name, time, "definition", _brief(kinds[0]), _brief(kinds[1]))
-    if len(a) != first.length or len(b) != second.length:
-        return Difference(stem, name, time, "length", str(len(a)), str(len(b)))
-    one, two = first.array(_renamed(a, b, first, texts))[0], second.array(b)[0]
-    labels = LABELS.get(name, ())
-    for field in first.offsets:
-        if field not in labels and one[field].tobytes() != two[field].tobytes():
-            return Difference(stem, name, time, field, *_values(one[field], two[field]))
-    return Difference(stem, name, time, "header", a[: HEADER_BYTES + 1].hex(), b[: HEADER_BYTES + 1].hex())
 
 
 def _one_ended(stem: str, a: bytes | None, b: bytes | None, old: Table, new: Table) -> Difference:
@@ -292,7 +319,3 @@ def _values(a: Any, b: Any) -> tuple[str, str]:
     if isinstance(a, bytes):
         return repr(to_text(a)), repr(to_text(b))
     return repr(a.item()), repr(b.item())
-
-
-def _brief(fields: list[tuple[str, str, int]]) -> str:
-    return " ".join(name for name, _, _ in fields)

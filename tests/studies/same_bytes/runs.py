@@ -1,7 +1,7 @@
-"""Records the results of a checkout's commands: star tracker, streaks, horizon, planners, identification.
+"""The flights and commands whose results are compared, and their execution in a checkout of any revision.
 
-The results are those of `python -m flight` commands, which any revision has even if modules move. Both
-revisions process the same pictures: those that the old one rendered, and photographs if there are any.
+All are commands of `python -m flight`, which any revision has even if modules move. Both revisions process
+the same pictures: those that the old one rendered, and photographs if there are any.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
+import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.studies.same_bytes.checkout import repository, run_script
+import yaml
+
+from tests.studies.same_bytes.checkout import repository, run_python, run_script
 
 ANSWERS_FILE = "answers.json"
 PHOTOGRAPHS = repository().parent / "shared/data"
@@ -39,18 +42,90 @@ json.dump(answers, sys.stdout)
 """
 
 
+TABLE_FILE = "packets.json"
+_DUMP_TABLE = """
+import dataclasses, importlib, json, os, sys
+for name in ("flight.link.telemetry.definitions", "flight.telemetry.definitions"):
+    try:
+        table = importlib.import_module(name)
+        break
+    except ModuleNotFoundError:
+        continue
+else:
+    sys.exit("no packet definitions found")
+if not table.__file__.startswith(os.getcwd()):
+    sys.exit(f"{table.__file__} is not of this checkout")
+table = table.PACKETS
+json.dump([dataclasses.asdict(packet) for packet in table], sys.stdout)
+"""
+
+
 @dataclass(frozen=True, slots=True)
-class Answers:
-    """A group of commands that one process runs, each a line as in a shell, without `python -m flight`."""
+class Run:
+    """Commands that one process runs, each a line as in a shell, without `python -m flight`.
+
+    Attributes:
+        flight: arguments of the command `run`, the configuration first, which is run before; or empty.
+        changes: YAML that replaces values of the flight's configuration.
+    """
 
     name: str
-    commands: tuple[str, ...]
+    commands: tuple[str, ...] = ("report . --no-figures",)
+    flight: str = ""
+    changes: str = ""
 
     @property
     def key(self) -> object:
         """List of all values on which the results depend, apart from revision and machine."""
-        return [_ASK, self.commands]
+        return [_ASK, _DUMP_TABLE, self.commands, self.flight, self.changes]
 
+
+_DEMO, _THESIS = "config/step_demo.yaml", "config/step_thesis.yaml"
+
+
+def _demo(name: str, *faults: str, config: str = _DEMO) -> Run:
+    """Return a flight of a minute with faults."""
+    words = [word for fault in faults for word in ("--fault", fault)]
+    return Run(name, flight=shlex.join([config, "--duration", "60", *words]))
+
+
+FLIGHTS: tuple[Run, ...] = (
+    Run("demo", flight=_DEMO),
+    Run("thesis", flight=_THESIS),
+    _demo("imu", "imu: silent @ 20 for 5", "imu: bits @ 32 for 5", "imu: silent @ 46 for 8"),
+    _demo("coils", "coil-x: open @ 12 for 20", "coil-z: shorted @ 40", "bridge-y: a-low @ 50"),
+    _demo(
+        "camera",
+        *("camera: torn @ 9 for 5", "vision: nan @ 19 for 5", "camera: black @ 29 for 5"),
+        *("vision: exception @ 39 for 5", "vision: slow @ 49 for 6"),
+    ),
+    _demo(
+        "planner",
+        *("planner: exception @ 4 for 4", "planner: nan @ 14 for 4", "planner: slow @ 29 for 20"),
+        config=_THESIS,
+    ),
+    _demo(
+        "bus",
+        *("bus: nack @ 12 for 4", "pwm: brown-out @ 25", "monitor: bits @ 30 for 10", "bus: hang @ 48 for 3"),
+    ),
+    # The KnightCube starts at 0.6 deg/s. Its flight has streak rates, detumbling, attitude acquisition, slews
+    # to Sun and nadir that avoid exclusion cones, the Earth in star frames, and Sun and limb in the horizon
+    # cameras. GPS and a camera fail for a time.
+    Run(
+        "orbit",
+        flight="config/orbit.yaml --duration 240"
+        " --fault 'gps: silent @ 60 for 30' --fault 'wide: black (camera=1) @ 100 for 30'",
+        changes="{targets: [{at: 0.0, point: sun}, {at: 120.0, point: nadir, roll_deg: 0.0}],"
+        " simulation: {free_body: {release: {speed: 0.01}}}}",
+    ),
+    # A 3U flies as configured, with a tumble at 10 deg/s, streaks, rates from the magnetometer, Sun and limb.
+    Run("orbit_3u", flight="config/orbit_3u.yaml --duration 60"),
+    # An object passes among the stars, is detected and followed, and its orbit is determined.
+    Run(
+        "orbit_object", ("report . --no-figures", "orbit ."), flight="config/orbit_object.yaml --duration 90"
+    ),
+)
+SHORT = Run("short", flight=f"{_DEMO} --duration 8")  # used only by tests
 
 _NIGHTS = tuple(f"pictures/night-{number}.png" for number in (1, 2, 3, 4))
 _STARS = "solve pictures/stars.png --fov 15"
@@ -59,7 +134,7 @@ _LIMB = "horizon pictures/limb.png --fov 67"
 _SLEW = "plan --at 2026-03-01T12:00:00 --orbit"
 
 # This group renders the pictures of the other groups; the pictures' bytes are compared too.
-PICTURES = Answers(
+PICTURES = Run(
     "pictures",
     (
         "samples --out .",
@@ -67,11 +142,11 @@ PICTURES = Answers(
         "camera --config step_demo --exposure 0.3 --rate 0.05 -0.02 0.01 --out turn.png",
     ),
 )
-GROUPS: tuple[Answers, ...] = (
+GROUPS: tuple[Run, ...] = (
     PICTURES,
     # Star tracker: lost in space by each method of identification, attitude, centroids; index; lens
     # calibration.
-    Answers(
+    Run(
         "stars",
         (
             "solve pictures/stars.png",
@@ -99,7 +174,7 @@ GROUPS: tuple[Answers, ...] = (
         ),
     ),
     # Streaks: rates, with a satellite among the streaks; attitude from streaks; stars that do not move.
-    Answers(
+    Run(
         "streaks",
         (
             _STREAKS,
@@ -115,7 +190,7 @@ GROUPS: tuple[Answers, ...] = (
             "solve pictures/turn.png --camera step_demo --exposure 0.3",
         ),
     ),
-    Answers(  # horizon: nadir with and without the altitude, by each method; a picture without a limb
+    Run(  # horizon: nadir with and without the altitude, by each method; a picture without a limb
         "horizon",
         (
             f"{_LIMB} --altitude 515",
@@ -128,7 +203,7 @@ GROUPS: tuple[Answers, ...] = (
     ),
     # One-axis planner: a duration that is extended, non-zero rates at the ends, minimum supply energy, a cost
     # of time, the thesis's configuration, and an angle out of range.
-    Answers(
+    Run(
         "plan",
         (
             "plan --from 0.4 --to -0.3",
@@ -140,7 +215,7 @@ GROUPS: tuple[Answers, ...] = (
         ),
     ),
     # Three-axis planner: minimum energy, exclusion cones, minimum time, best start, a time that is too short.
-    Answers(
+    Run(
         "slew",
         (
             f"{_SLEW} orbit --from nadir --to sun --within 600",
@@ -151,17 +226,17 @@ GROUPS: tuple[Answers, ...] = (
         ),
     ),
     # Identification of a body's constants from a simulated flight.
-    Answers("identify", ("identify step_demo --duration 60 --run identified",)),
+    Run("identify", ("identify step_demo --duration 60 --run identified",)),
 )
 
 
-def photographs(folder: Path = PHOTOGRAPHS) -> Answers | None:
+def photographs(folder: Path = PHOTOGRAPHS) -> Run | None:
     """Return the commands for the real pictures of sky and limb in a folder, or None if it has none."""
     commands = [f"solve photographs/{name}" for name in _pictures(folder, "sky")]
     commands += [
         f"horizon photographs/{name} --fov 12.8 --altitude 515" for name in _pictures(folder, "limb")
     ]
-    return Answers("photographs", tuple(commands)) if commands else None
+    return Run("photographs", tuple(commands)) if commands else None
 
 
 def _pictures(folder: Path, part: str) -> Iterable[str]:
@@ -170,15 +245,42 @@ def _pictures(folder: Path, part: str) -> Iterable[str]:
     return [f"{part}/{path.name}" for path in paths if path.suffix in {".jpg", ".png", ".tiff"}]
 
 
-def ask(checkout: Path, answers: Answers, folder: Path) -> None:
+def perform(checkout: Path, run: Run, folder: Path, pictures: Path) -> None:
+    """Run flight and commands in a new folder; store logs, the revision's packet table and results there.
+
+    Raises CheckoutError if the flight or a command fails.
+    """
+    if run.flight:
+        _fly(checkout, run, folder)
+        (folder / TABLE_FILE).write_text(packet_table(checkout), encoding="utf-8")
+    else:
+        folder.mkdir()
+        (folder / "pictures").symlink_to(pictures)
+        (folder / "photographs").symlink_to(PHOTOGRAPHS)
+    ask(checkout, run, folder)
+
+
+def _fly(checkout: Path, run: Run, folder: Path) -> None:
+    path, *options = shlex.split(run.flight)
+    config = checkout / path
+    with tempfile.TemporaryDirectory(prefix="same-bytes-") as temporary:
+        if run.changes:
+            values = yaml.safe_load(config.read_text(encoding="utf-8"))
+            config = Path(temporary) / config.name
+            text = yaml.safe_dump(_merged(values, yaml.safe_load(run.changes)))
+            config.write_text(text, encoding="utf-8")
+        run_python(checkout, "-m", "flight", "run", str(config), *options, "--out", str(folder), "--json")
+
+
+def ask(checkout: Path, run: Run, folder: Path) -> None:
     """Run a checkout's commands in `folder`; store results there, with digests of the written PNG files.
 
     Raises CheckoutError if a command raises.
     """
-    commands = [json.dumps(shlex.split(command)) for command in answers.commands]
+    commands = [json.dumps(shlex.split(command)) for command in run.commands]
     raw = json.loads(run_script(checkout, _ASK, str(checkout), *commands, folder=folder))
     found: dict[str, object] = {}
-    for line, command in zip(answers.commands, commands, strict=True):
+    for line, command in zip(run.commands, commands, strict=True):
         status, output, error = raw[command]
         found[line] = {"status": status, "output": _values(output), "error": error.splitlines()}
     for path in sorted(folder.glob("*.png")):
@@ -192,3 +294,15 @@ def _values(output: str) -> Any:
         return json.loads(output)
     except ValueError:
         return output.splitlines()
+
+
+def packet_table(checkout: Path) -> str:
+    """Return a checkout's packet definitions as JSON. Raises CheckoutError if it has none."""
+    return run_script(checkout, _DUMP_TABLE)
+
+
+def _merged(values: Any, changes: Any) -> Any:
+    """Return nested mappings in which values of `changes` replace those of `values`."""
+    if not (isinstance(values, dict) and isinstance(changes, dict)):
+        return changes
+    return values | {name: _merged(values.get(name), change) for name, change in changes.items()}
