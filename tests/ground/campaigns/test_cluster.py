@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 import zipfile
@@ -22,8 +21,9 @@ from ground.campaigns import CampaignError
 from ground.campaigns import cluster as cluster_code
 from ground.campaigns.runner import Campaign, Case, Result, Summary, fly, fly_here
 from knightcube.errors import UsageError
+from tests.support.dask_cluster import cluster
 
-distributed = pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
+pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # ignores warnings of Dask's own libraries
 
@@ -42,42 +42,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
     return Summary("", {"total": sum(result["value"] for result in results), "runs": len(results)})
 
 
-HOST = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
 TOY = Campaign("toy-cluster", "adds draws", cases, draw, summarise, 40)
-
-
-@contextmanager
-def started(folder: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Start `dask ...` as in its documentation, in another folder and without our import paths."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    command = [sys.executable, "-m", "dask", *words]
-    with (folder / "dask.log").open("ab") as log:
-        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-@contextmanager
-def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Start a scheduler and two workers; yield the address and the processes, with the scheduler first."""
-    facts = folder / "scheduler.json"
-    where = ("--scheduler-file", str(facts))
-    worker = ("worker", *where, "--no-nanny", "--nthreads", "1", *HOST)
-    with (
-        started(folder, "scheduler", *where, "--port", "0", *HOST) as scheduler,
-        started(folder, *worker) as first,
-        started(folder, *worker) as second,
-    ):
-        deadline = time.monotonic() + 30.0
-        while not facts.is_file() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        address = json.loads(facts.read_text())["address"]
-        with distributed.Client(address) as client:
-            client.wait_for_workers(2, timeout=30)
-        yield address, [scheduler, first, second]
 
 
 def lines(out: Path) -> int:

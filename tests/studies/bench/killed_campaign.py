@@ -16,7 +16,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +26,7 @@ import numpy as np
 from ground.campaigns.runner import show
 from knightcube.errors import UsageError
 from tests.studies.command import Seed, command, scratch
+from tests.support.dask_cluster import cluster
 
 ROOT = Path(__file__).parents[3]
 VARIED = ("plant.inertia=10%", "plant.thread_stiffness=normal 5%", "coils.current_limit=0.1|0.14")
@@ -156,41 +156,16 @@ def killed(
         interruptions, orphans = interruptions + before, orphans + left
     found = {"killed": part.compare(part.finish(), expected, whole, interruptions, orphans)}
     if dask:
-        with ExitStack() as stack:
-            address, worker = _cluster(folder, stack)
+        with cluster(folder) as (address, (_, _, worker)):
             spread = UserCampaign(folder / "cluster", runs, duration, address)
-            process = stack.enter_context(spread.start())
-            while process.poll() is None and len(spread.lines()) < runs // 3:
-                time.sleep(0.02)
-            lost = process.poll() is None
-            worker.kill()
-            printed = spread.printed(process)
+            with spread.start() as process:
+                while process.poll() is None and len(spread.lines()) < runs // 3:
+                    time.sleep(0.02)
+                lost = process.poll() is None
+                worker.kill()
+                printed = spread.printed(process)
         found["cluster"] = spread.compare(printed, expected, whole, int(lost), 0)
     return found
-
-
-def _cluster(folder: Path, stack: ExitStack) -> tuple[str, subprocess.Popen[bytes]]:
-    """Start a Dask scheduler and two workers; return the address and the second worker."""
-    facts = folder / "scheduler.json"
-    local = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
-    worker = ("worker", "--no-nanny", "--nthreads", "1")
-    log = stack.enter_context((folder / "dask.log").open("wb"))
-
-    def started(*words: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "dask", *words, "--scheduler-file", str(facts), *local]
-        process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
-        stack.callback(process.wait)
-        stack.callback(process.kill)
-        return process
-
-    scheduler = started("scheduler", "--port", "0")
-    while not facts.is_file():
-        if scheduler.poll() is not None:
-            raise RuntimeError(f"no scheduler: {(folder / 'dask.log').read_text(encoding='utf-8')}")
-        time.sleep(0.1)
-    workers = [started(*worker) for _ in range(2)]
-    address: str = json.loads(facts.read_text(encoding="utf-8"))["address"]
-    return address, workers[1]
 
 
 def _children(process: int) -> list[int]:

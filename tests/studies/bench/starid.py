@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,7 +35,15 @@ from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.command import Json, Seed, command
-from tests.support.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
+from tests.support.star_lists import (
+    PIXELS,
+    ListKind,
+    StarList,
+    believed_field,
+    configurations,
+    draw,
+    draw_random,
+)
 
 _SEED = 271_828
 _RIGHT_DEG = 0.05
@@ -103,10 +112,18 @@ def peer_answers(peer: str, python: str, jobs: Sequence[dict[str, Any]]) -> tupl
     return answers, float(said["megabytes"])
 
 
-def _told(drawn: StarList) -> dict[str, Any]:
+def job_of(drawn: StarList, hint: float = 0.0) -> dict[str, Any]:
+    """Return a list in the format of `star_peers`; `hint` is the relative error of a known field of view."""
     kind = drawn.kind
-    field, error = (20.0, 10.0) if kind.known_deg is None else (kind.field_deg, kind.known_deg)
-    return {"pixels": drawn.pixels.tolist(), "size": PIXELS, "field_deg": field, "known_deg": error}
+    if kind.known_deg is None:
+        low, high = kind.searched_deg
+        field, error = 0.5 * (low + high), 0.5 * (high - low)
+    else:
+        field, error = believed_field(kind)[0] * (1.0 + hint), kind.known_deg
+    pixels = drawn.pixels.copy()
+    if kind.mirrored:
+        pixels[:, 0] = PIXELS - 1.0 - pixels[:, 0]
+    return {"pixels": pixels.tolist(), "size": PIXELS, "field_deg": field, "known_deg": error}
 
 
 def _one_core() -> dict[str, str]:
@@ -138,8 +155,9 @@ def pointing_bound(drawn: StarList, sky: SkyIndex) -> float:
 
 def row_of(
     solver: str, kind: str, answers: Sequence[Answer], lists: Sequence[StarList], bounds: Sequence[float]
-) -> dict[str, Any]:
-    """Return the results of one solver on the lists of one kind."""
+) -> tuple[dict[str, Any], list[float]]:
+    """Return the results of one solver on the first lists of one kind, and its errors over the bound."""
+    lists, bounds = lists[: len(answers)], bounds[: len(answers)]
     errors = np.array(
         [np.nan if a.boresight is None else pointing_error(a, d) for a, d in zip(answers, lists, strict=True)]
     )
@@ -149,7 +167,7 @@ def row_of(
     refused = np.isnan(errors)
     ms = np.array([answer.ms for answer in answers])
     ratio = errors[right] / (_RAYLEIGH * np.array(bounds)[right])
-    return {
+    row = {
         "solver": solver,
         "kind": kind,
         "lists": len(lists),
@@ -161,8 +179,8 @@ def row_of(
         "max_ms": float(ms.max()),
         "error_arcsec": float(np.median(errors[right]) * ARCSECONDS) if right.any() else None,
         "over_bound": float(np.median(ratio)) if right.any() else None,
-        "ratios": ratio.tolist(),
     }
+    return row, ratio.tolist()
 
 
 def memory_of_index() -> float:
@@ -217,55 +235,41 @@ def measure(count: int, seed: int, peers: bool, peer_python: str) -> dict[str, A
     everything = cases(count, sky, seed)
     # The first call of each numpy function and the first use of each triangle list take extra time.
     our_answers(everything[next(iter(everything))][:20], sky)
-    rows = []
     bounds = {
         name: [pointing_bound(drawn, sky) if np.sum(drawn.star >= 0) > 2 else float("nan") for drawn in lists]
         for name, lists in everything.items()
     }
-    ours = {name: our_answers(lists, sky) for name, lists in everything.items()}
-    for name, lists in everything.items():
-        rows.append(row_of("flight", name, ours[name], lists, bounds[name]))
+    answers = {"flight": {name: our_answers(lists, sky) for name, lists in everything.items()}}
     megabytes = {"flight": memory_of_index()}
-    ratios = {}
+    # Another program may use its whole time limit for a list that shows no part of the sky.
+    shown = {name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()}
+    jobs = [job_of(drawn) for lists in shown.values() for drawn in lists]
     for peer in ("cedar-solve", "tetra3rs") if peers else ():
-        # Another program may use its whole time limit for a list that shows no part of the sky.
-        shown = {
-            name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()
-        }
-        flat = [_told(drawn) for lists in shown.values() for drawn in lists]
-        said = peer_answers(peer, peer_python, flat)
-        if said is None:
-            continue
-        answers, megabytes[peer] = said
-        begin = 0
-        theirs = {}
-        for name, lists in shown.items():
-            theirs[name] = answers[begin : begin + len(lists)]
-            begin += len(lists)
-            rows.append(row_of(peer, name, theirs[name], lists, bounds[name][: len(lists)]))
-        ratios[peer] = _ratio(ours, theirs)
-    ratios_to_bound = [row.pop("ratios") for row in rows]
-    over: dict[str, list[float]] = {solver: [] for solver in megabytes}
+        if (said := peer_answers(peer, peer_python, jobs)) is not None:
+            given, megabytes[peer] = iter(said[0]), said[1]
+            answers[peer] = {name: list(islice(given, len(lists))) for name, lists in shown.items()}
+    rows = []
+    over: dict[str, list[float]] = {solver: [] for solver in answers}
     known = list(everything)[: len(configurations())]
-    for row, found in zip(rows, ratios_to_bound, strict=True):
-        if row["kind"] in known:
-            over[row["solver"]] += found
+    for solver, own in answers.items():
+        for name, found in own.items():
+            row, ratios = row_of(solver, name, found, everything[name], bounds[name])
+            rows.append(row)
+            over[solver] += ratios if name in known else []
+    ms = {solver: [each.ms for name in known for each in own[name]] for solver, own in answers.items()}
     return {
         "seed": seed,
         "rows": rows,
         "megabytes": megabytes,
         "over_bound": {solver: float(np.median(found)) for solver, found in over.items() if found},
-        "time_over_peer": ratios,
-    }
-
-
-def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> dict[str, float]:
-    """Return the ratio of our time to another program's for known fields: median and 95th percentile."""
-    known = list(ours)[: len(configurations())]
-    mine, other = ([answer.ms for name in known for answer in all_of[name]] for all_of in (ours, theirs))
-    return {
-        "median": float(np.median(mine) / np.median(other)),
-        "p95": float(np.percentile(mine, 95) / np.percentile(other, 95)),
+        "time_over_peer": {
+            peer: {
+                "median": float(np.median(ms["flight"]) / np.median(spent)),
+                "p95": float(np.percentile(ms["flight"], 95) / np.percentile(spent, 95)),
+            }
+            for peer, spent in ms.items()
+            if peer != "flight"
+        },
     }
 
 

@@ -25,9 +25,9 @@ from knightcube.vision.startracker.index import GuideStars, SkyIndex
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.bench.star_peers import PEERS
-from tests.studies.bench.starid import ARCSECONDS, Answer, PeerPython, peer_answers, pointing_error
+from tests.studies.bench.starid import ARCSECONDS, Answer, PeerPython, job_of, peer_answers, pointing_error
 from tests.studies.command import Json, Seed, command
-from tests.support.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
+from tests.support.star_lists import PIXELS, ListKind, StarList, draw, draw_random
 
 _SEED = 314_159
 _RIGHT_DEG = 0.05
@@ -147,22 +147,8 @@ def measured(
     # Another program may use its whole time limit for a list that shows no part of the sky.
     if peer is None or row.strewn:
         return figures
-    jobs = [_job(row, one) for one in drawn]
-    theirs = peer_answers(peer, python, jobs)
+    theirs = peer_answers(peer, python, [job_of(one, row.hint) for one in drawn])
     return figures | ({} if theirs is None else {"peer_right": _right(theirs[0], drawn)})
-
-
-def _job(row: Hardship, drawn: StarList) -> dict[str, Any]:
-    believed, _ = believed_field(drawn.kind)
-    if drawn.kind.known_deg is None:
-        low, high = drawn.kind.searched_deg
-        believed, error = 0.5 * (low + high), 0.5 * (high - low)
-    else:
-        believed, error = believed * (1.0 + row.hint), drawn.kind.known_deg
-    pixels = drawn.pixels.copy()
-    if drawn.kind.mirrored:
-        pixels[:, 0] = PIXELS - 1.0 - pixels[:, 0]
-    return {"pixels": pixels.tolist(), "size": PIXELS, "field_deg": believed, "known_deg": error}
 
 
 def _right(answers: Sequence[Answer], drawn: Sequence[StarList]) -> int:
