@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ from flight.link.telemetry.packets import Packer, compile_layouts
 from knightcube.errors import UsageError
 from tests.studies.same_bytes.__main__ import main, run_all, table
 from tests.studies.same_bytes.checkout import CheckoutError, check_out, resolve
-from tests.studies.same_bytes.comparison import Texts, Verdict, compare
+from tests.studies.same_bytes.comparison import Texts, compare
 from tests.studies.same_bytes.runs import (
     ANSWERS_FILE,
     FLIGHTS,
@@ -30,94 +30,55 @@ from tests.studies.same_bytes.runs import (
 
 OLD = (RUN, IMU, TARGET)
 RUN_VALUES: dict[str, object] = {
-    "config_name": "synthetic",
-    "config_crc": 1,
-    "software": "1.0",
-    "seed": 1,
-    "utc_ns": 5,
-    "simulated": 1,
-    "realtime": 0,
-    "control_period_ns": 25_000_000,
-    "duration": 1.0,
-    "coil_resistance": [23.0, 23.0, 23.0],
-    "supply_voltage": 3.4,
-    "current_limit": 0.148,
+    **{
+        "config_name": "synthetic",
+        "config_crc": 1,
+        "software": "1.0",
+        "seed": 1,
+        "utc_ns": 5,
+        "simulated": 1,
+    },
+    **{"realtime": 0, "control_period_ns": 25_000_000, "duration": 1.0, "current_limit": 0.148},
+    **{"coil_resistance": [23.0, 23.0, 23.0], "supply_voltage": 3.4},
 }
+IMU_VALUES: dict[str, object] = {
+    **{"sample_time_ns": 0, "device_time_ns": 0, "quaternion": [0, 0, 0, 1], "rate": [0, 0, 1e-3]},
+    **{"field": [0] * 3, "acceleration": [0] * 3},
+}
+EVENT_VALUES: dict[str, object] = {"code": 1, "severity": 0, "suppressed": 0, "name": "gap", "text": "x"}
+Log = list[tuple[str, int, dict[str, object]]]
+"""Packets of a log by name, with their times (ns) and values."""
+PACKETS: Log = [
+    ("run", 0, RUN_VALUES),
+    *(("imu", cycle * 25_000_000, IMU_VALUES) for cycle in range(4)),
+    ("target", 75_000_000, {"index": 0, "q2": -0.3, "rate": 0.0}),
+]
 
 
-def imu(time_ns: int) -> dict[str, object]:
-    values: dict[str, object] = {"sample_time_ns": time_ns, "device_time_ns": time_ns}
-    return {
-        **values,
-        "quaternion": [0, 0, 0, 1],
-        "rate": [0, 0, 1e-3],
-        "field": [0] * 3,
-        "acceleration": [0] * 3,
-    }
+def changed(place: int, **values: object) -> Log:
+    """Return the packets with other values of one packet."""
+    name, time_ns, before = PACKETS[place]
+    packets = list(PACKETS)
+    packets[place] = name, time_ns, before | values
+    return packets
 
 
-class Writer:
-    """Writer of a synthetic flight log and its table."""
-
-    def __init__(self, folder: Path, table: tuple[Packet, ...]) -> None:
-        self.folder, self.table = folder, table
-        self._packer = Packer(compile_layouts(table))
-        self._packets: list[bytes] = []
-
-    def add(self, packet: Packet, time_ns: int, values: dict[str, object]) -> None:
-        self._packets.append(self._packer.pack(packet, time_ns, values))
-
-    def close(self) -> Path:
-        self.folder.mkdir(parents=True)
-        (self.folder / "flight-0001.ccsds").write_bytes(b"".join(self._packets))
-        (self.folder / TABLE_FILE).write_text(json.dumps([asdict(packet) for packet in self.table]))
-        return self.folder
-
-
-def old_log(folder: Path) -> Path:
-    writer = Writer(folder, OLD)
-    writer.add(RUN, 0, RUN_VALUES)
-    for cycle in range(4):
-        writer.add(IMU, cycle * 25_000_000, imu(cycle * 25_000_000))
-    writer.add(TARGET, 75_000_000, {"index": 0, "q2": -0.3, "rate": 0.0})
-    return writer.close()
-
-
-def new_log(
-    folder: Path,
-    table: tuple[Packet, ...] = OLD,
-    run: dict[str, object] | None = None,
-    third_rate: float = 1e-3,
-    target: dict[str, object] | None = None,
-    events: int = 0,
-    samples: int = 4,
-) -> Path:
-    writer = Writer(folder, table)
-    by_name = {packet.name: packet for packet in table}
-    writer.add(by_name["run"], 0, RUN_VALUES | (run or {}))
-    for cycle in range(samples):
-        for _ in range(events):
-            values = {"code": 1, "severity": 0, "suppressed": 0, "name": "started", "text": "x"}
-            writer.add(by_name["event"], cycle, values)
-        values = imu(cycle * 25_000_000)
-        writer.add(IMU, cycle * 25_000_000, values | ({"rate": [0, 0, third_rate]} if cycle == 2 else {}))
-    writer.add(by_name["target"], 75_000_000, target or {"index": 0, "q2": -0.3, "rate": 0.0})
-    return writer.close()
-
-
-def verdict(folder: Path, **changes: object) -> Verdict:
-    new = new_log(folder / "new", **changes)  # type: ignore[arg-type]  # names of new_log's own arguments
-    return compare("synthetic", old_log(folder / "old"), new, Texts())
+def written(folder: Path, packets: Log, table: tuple[Packet, ...] = OLD) -> Path:
+    """Write a flight log and its table."""
+    packer, by_name = Packer(compile_layouts(table)), {packet.name: packet for packet in table}
+    folder.mkdir(parents=True)
+    data = [packer.pack(by_name[name], time_ns, values) for name, time_ns, values in packets]
+    (folder / "flight-0001.ccsds").write_bytes(b"".join(data))
+    (folder / TABLE_FILE).write_text(json.dumps([asdict(packet) for packet in table]))
+    return folder
 
 
 def event_logs(folder: Path, old: str, new: str) -> tuple[Path, Path]:
     """Write two logs of one event each, with an old text and a new one."""
-    folders = []
-    for name, text in (("old", old), ("new", new)):
-        writer = Writer(folder / name, (EVENT,))
-        writer.add(EVENT, 0, {"code": 1, "severity": 0, "suppressed": 0, "name": "gap", "text": text})
-        folders.append(writer.close())
-    return folders[0], folders[1]
+    return (
+        written(folder / "old", [("event", 0, EVENT_VALUES | {"text": old})], (EVENT,)),
+        written(folder / "new", [("event", 0, EVENT_VALUES | {"text": new})], (EVENT,)),
+    )
 
 
 def answer_folders(folder: Path, old: object, new: object) -> tuple[Path, Path]:
@@ -136,97 +97,73 @@ def fake_checkout(folder: Path, main: str) -> Path:
     return folder
 
 
-def test_equal_logs_are_equal(tmp_path: Path) -> None:
-    found = verdict(tmp_path)
+APPENDED = Field("hold", "f8", "s", "time to hold")
+LONGER = replace(TARGET, version=TARGET.version + 1, fields=(*TARGET.fields, APPENDED))
+REWORDED = replace(RUN, meaning="other words", fields=tuple(replace(f, meaning="x") for f in RUN.fields))
+
+
+@pytest.mark.parametrize(
+    ("packets", "table", "added", "extended"),
+    [
+        (PACKETS, OLD, {}, 0),
+        ([("event", 0, EVENT_VALUES), *PACKETS, ("event", 9, EVENT_VALUES)], (*OLD, EVENT), {"event": 2}, 0),
+        (changed(0, utc_ns=6, software="2.0", config_crc=2), OLD, {}, 0),
+        (changed(5, hold=3.0), (RUN, IMU, LONGER), {}, 1),
+        (changed(0, utc_ns=9), (REWORDED, IMU, TARGET), {}, 0),
+    ],
+    ids=["equal", "new packets", "labels", "an appended field", "other meanings"],
+)
+def test_logs_are_equal_apart_from_labels_new_packets_and_appended_fields(
+    tmp_path: Path, packets: Log, table: tuple[Packet, ...], added: dict[str, int], extended: int
+) -> None:
+    logs = written(tmp_path / "old", PACKETS), written(tmp_path / "new", packets, table)
+    found = compare("synthetic", *logs, Texts())
     assert found.difference is None
-    assert (found.compared, found.added, found.extended) == (6, {}, 0)
+    assert (found.compared, found.added, found.extended) == (6, added, extended)
 
 
-def test_the_last_bit_of_one_number_is_found(tmp_path: Path) -> None:
-    first = verdict(tmp_path, third_rate=1e-3 + 2.0**-62).difference
+@pytest.mark.parametrize(
+    ("packets", "table", "expected"),
+    [
+        (changed(3, rate=[0, 0, 1e-3 + 2.0**-62]), OLD, ("imu", 0.05, "rate", "[2] 0.001")),
+        ([*PACKETS[:4], PACKETS[5]], OLD, ("imu", 3 * 0.025, "packet", "imu", "target")),
+        (PACKETS[:5], OLD, ("target", 3 * 0.025, "packet", "target", "end of log")),
+        (changed(0, seed=2), OLD, ("run", 0.0, "seed", "1", "2")),
+        (changed(5, q2=-0.31, hold=3.0), (RUN, IMU, LONGER), ("target", 3 * 0.025, "q2", "-0.3", "-0.31")),
+    ],
+    ids=["the last bit of a number", "a missing packet", "an early end", "no label", "a longer packet"],
+)
+def test_the_first_difference_of_logs_is_found(
+    tmp_path: Path, packets: Log, table: tuple[Packet, ...], expected: tuple[object, ...]
+) -> None:
+    logs = written(tmp_path / "old", PACKETS), written(tmp_path / "new", packets, table)
+    first = compare("synthetic", *logs, Texts()).difference
     assert first is not None
-    assert (first.log, first.packet, first.time, first.field) == ("flight", "imu", 0.05, "rate")
-    assert first.old == "[2] 0.001"
+    assert (first.log, *astuple(first)[1 : 1 + len(expected)]) == ("flight", *expected)
     assert first.new != first.old
 
 
-def test_a_missing_packet_is_found(tmp_path: Path) -> None:
-    first = verdict(tmp_path, samples=3).difference
-    assert first is not None
-    assert (first.old, first.new) == ("imu", "target")
+MOVED = Texts([{"old": "camera {n}: no {what}", "new": "no {what} from camera {n}"}])
+LONG = "no frame " + "of the camera " * 12
 
 
-def test_a_log_that_ends_early_is_found(tmp_path: Path) -> None:
-    old, new = old_log(tmp_path / "old"), new_log(tmp_path / "new")
-    log = new / "flight-0001.ccsds"
-    whole = log.read_bytes()
-    log.write_bytes(whole[: -compile_layouts(OLD)["target"].length])
-    first = compare("synthetic", old, new, Texts()).difference
-    assert first is not None
-    assert (first.old, first.new) == ("target", "end of log")
-
-
-def test_packets_that_the_old_table_does_not_have_are_counted_and_left_out(tmp_path: Path) -> None:
-    found = verdict(tmp_path, table=(*OLD, EVENT), events=2)
-    assert found.difference is None
-    assert found.added == {"event": 8}
-    assert found.compared == 6
-
-
-def test_labels_may_differ_and_other_fields_of_run_may_not(tmp_path: Path) -> None:
-    (tmp_path / "labels").mkdir()
-    (tmp_path / "seed").mkdir()
-    labels = {"utc_ns": 6, "software": "2.0", "config_crc": 2}
-    assert verdict(tmp_path / "labels", run=labels).difference is None
-    first = verdict(tmp_path / "seed", run={"seed": 2}).difference
-    assert first is not None
-    assert (first.field, first.old, first.new) == ("seed", "1", "2")
-
-
-def test_an_appended_field_with_a_raised_version_is_left_out(tmp_path: Path) -> None:
-    longer = replace(
-        TARGET, version=TARGET.version + 1, fields=(*TARGET.fields, Field("hold", "f8", "s", "time to hold"))
-    )
-    table = (RUN, IMU, longer)
-    for name, q2 in (("same", -0.3), ("other", -0.31)):
-        (tmp_path / name).mkdir()
-        target = {"index": 0, "q2": q2, "rate": 0.0, "hold": 3.0}
-        found = verdict(tmp_path / name, table=table, target=target)
-        if name == "same":
-            assert (found.difference, found.extended) == (None, 1)
-        else:
-            assert found.difference is not None
-            assert (found.difference.packet, found.difference.field) == ("target", "q2")
-
-
-def test_reworded_meanings_make_no_difference(tmp_path: Path) -> None:
-    reworded = replace(RUN, meaning="other words", fields=tuple(replace(f, meaning="x") for f in RUN.fields))
-    assert verdict(tmp_path, table=(reworded, IMU, TARGET), run={"utc_ns": 9}).difference is None
-
-
-def test_a_renamed_text_that_is_not_in_the_table_is_found(tmp_path: Path) -> None:
-    first = compare(
-        "x", *event_logs(tmp_path, "camera 3: no frame", "no frame from camera 3"), Texts()
-    ).difference
-    assert first is not None
-    assert (first.packet, first.field) == ("event", "text")
-    assert (first.old, first.new) == ("'camera 3: no frame'", "'no frame from camera 3'")
-
-
-def test_the_table_of_renamed_texts_is_applied_to_logs(tmp_path: Path) -> None:
-    texts = Texts([{"old": "camera {n}: no {what}", "new": "no {what} from camera {n}"}])
-    same = event_logs(tmp_path / "same", "camera 3: no frame", "no frame from camera 3")
-    other = event_logs(tmp_path / "other", "camera 3: no frame", "no frame from camera 4")
-    kept = event_logs(tmp_path / "kept", "camera 3: no frame", "camera 3: no frame")
-    assert compare("x", *same, texts).difference is None
-    assert compare("x", *other, texts).difference is not None
-    assert compare("x", *kept, texts).difference is None
-
-
-def test_a_new_text_that_its_field_cuts_is_equal(tmp_path: Path) -> None:
-    long = "no frame " + "of the camera " * 20
-    texts = Texts([{"old": "no frame", "new": long}])
-    assert compare("x", *event_logs(tmp_path, "no frame", long), texts).difference is None
+@pytest.mark.parametrize(
+    ("old", "new", "texts", "equal"),
+    [
+        ("camera 3: no frame", "no frame from camera 3", Texts(), False),
+        ("camera 3: no frame", "no frame from camera 3", MOVED, True),
+        ("camera 3: no frame", "no frame from camera 4", MOVED, False),
+        ("camera 3: no frame", "camera 3: no frame", MOVED, True),
+        ("no frame", LONG, Texts([{"old": "no frame", "new": LONG}]), True),
+    ],
+)
+def test_texts_are_equal_if_the_table_renames_one_to_the_other_also_if_the_field_cuts_it(
+    tmp_path: Path, old: str, new: str, texts: Texts, equal: bool
+) -> None:
+    first = compare("x", *event_logs(tmp_path, old, new), texts).difference
+    assert (first is None) == equal
+    if first is not None:
+        assert (first.packet, first.field, first.old, first.new) == ("event", "text", repr(old), repr(new))
 
 
 def test_renamed_texts_are_applied_in_their_order() -> None:
