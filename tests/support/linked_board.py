@@ -23,12 +23,12 @@ def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
         return [line.getsockname()[1] for line in lines]
 
 
-def write_linked_config(place: Path, **lines: Any) -> Path:
+def write_linked_config(place: Path, base: Path = CONFIG, **lines: Any) -> Path:
     """Create keys in `place`, and write a board's configuration with a link; return its path."""
     make_keys(place / "keys")
     section = {"keys": str(place / "keys" / "satellite"), **lines}
     commands = json.dumps({"socket": str(place / "commands")})
     config = place / "flight.yaml"
-    text = CONFIG.read_text(encoding="utf-8")
+    text = base.read_text(encoding="utf-8")
     config.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(section)}\n", encoding="utf-8")
     return config

@@ -2,8 +2,7 @@
 
 The study measures by how much the page lags behind the log, and the memory and processor time of the server
 beside a 40 Hz flight. It checks that a replayed instant shows the same as live, that the browser reports no
-errors and makes no request beyond loopback, and that the status light turns red when telemetry stops. At each
-of three sizes and in both themes, the page must not scroll sideways, and axe-core must not find a violation.
+errors and makes no request beyond loopback, and that the status light turns red when telemetry stops.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import contextlib
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -22,10 +20,11 @@ from pathlib import Path
 from typing import Annotated
 
 from ground.console.server import PAGE
-from ground.link.terminal import make_keys
 from ground.watch import LogTail
 from tests.studies.command import Json, command, say, scratch
-from tests.support.browser import Page, audit, missing, opened
+from tests.support.browser import Page, missing, opened
+from tests.support.flooded_flight import free_port, process, wait_for
+from tests.support.linked_board import write_linked_config
 
 CONFIG = Path("config/step_demo.yaml")
 
@@ -34,9 +33,8 @@ CONFIG = Path("config/step_demo.yaml")
 class Figures:
     """Measured lag (s), memory (MiB), share of a core, and time (s) from the last telemetry to the red light.
 
-    `weight_kb` is the size of all files of the page. `violations` lists the findings of axe-core and each
-    size at which the page scrolls sideways. `filed` is the page's error when it uploads, lists and downloads
-    a file, or empty.
+    `weight_kb` is the size of all files of the page. `filed` is the page's error when it uploads, lists and
+    downloads a file, or empty.
     """
 
     weight_kb: float
@@ -48,14 +46,11 @@ class Figures:
     replay_equal: bool
     commanded: str
     red_s: float
-    violations: list[str]
     filed: str
 
 
 ASKED = {"weight_kb": 250.0, "lag_s": 0.5, "memory_mib": 120.0, "processor": 0.15, "red_s": 3.0}
 """Required limits: page of 250 kB, lag of 0.5 s, memory of 120 MB, 15 % of a core, red light within 3 s."""
-SIZES = ((1600, 1150), (1024, 768), (390, 844))
-"""Tested sizes (width, height) of the page, px."""
 
 
 @command
@@ -65,14 +60,13 @@ def main(
     seconds: Annotated[float, "of flight"] = 60.0,
     by_link: Annotated[bool, "telemetry and commands by protected frames"] = False,
     pictures: Annotated[Path | None, "where to put screenshots"] = None,
-    looks: Annotated[Path | None, "where to put screenshots of all sizes and themes"] = None,
     json: Json = False,
 ) -> int:
     """Measure, print, and save pictures if requested. Returns 1 if a limit is exceeded."""
     if lacks := missing():
         sys.stderr.write(f"{lacks}\n")
         return 1
-    figures = measure(config, seconds, pictures, looks, by_link)
+    figures = measure(config, seconds, pictures, by_link)
     if json:
         say(**asdict(figures))
     else:
@@ -89,14 +83,12 @@ def missed(figures: Figures, by_link: bool) -> list[str]:
     of the first frame.
     """
     wrong = [name for name, bound in ASKED.items() if not getattr(figures, name) <= bound]
-    wrong += [name for name in ("complaints", "strangers", "violations", "filed") if getattr(figures, name)]
+    wrong += [name for name in ("complaints", "strangers", "filed") if getattr(figures, name)]
     wrong += [] if figures.replay_equal or by_link else ["replay_equal"]
     return wrong + ([] if figures.commanded.startswith("obeyed") else ["commanded"])
 
 
-def measure(
-    config: Path, seconds: float, pictures: Path | None, looks: Path | None, by_link: bool = False
-) -> Figures:
+def measure(config: Path, seconds: float, pictures: Path | None, by_link: bool = False) -> Figures:
     """Run a flight for `seconds` s, and examine the page."""
     with scratch() as place:
         run, way = place / "run", _linked if by_link else _flown
@@ -113,9 +105,8 @@ def measure(
             replayed = page.shown
             _picture(page, pictures, "replay")
             equal, red = replayed == (live, values), _red(page, source)
-            wrong = _looked_at(page, looks)
             filed = _filed(page, place) if by_link else ""
-            others = (page.complaints, page.strangers, equal, commanded, red, wrong, filed)
+            others = (page.complaints, page.strangers, equal, commanded, red, filed)
             return Figures(_weight_kb(), lag, memory, share, *others)
 
 
@@ -142,24 +133,6 @@ def _weight_kb() -> float:
     return 1e-3 * sum(path.stat().st_size for path in PAGE.rglob("*") if path.is_file())
 
 
-def _looked_at(page: Page, folder: Path | None) -> list[str]:
-    """Return the violations at each size and in each theme, and save screenshots."""
-    wrong = []
-    page.page.evaluate("document.getElementById('all').open = false")
-    for theme in ("dark", "light"):
-        page.page.evaluate(f"if (document.documentElement.dataset.theme !== '{theme}') theme.click()")
-        for width, height in SIZES:
-            page.page.set_viewport_size({"width": width, "height": height})
-            page.page.wait_for_timeout(1500)
-            if page.page.evaluate("document.documentElement.scrollWidth > innerWidth"):
-                wrong.append(f"{width} px, {theme}: scrolls sideways")
-            wrong += [f"{width} px, {theme}: {found}" for found in audit(page)]
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-                page.page.screenshot(path=str(folder / f"{width}_{theme}.png"), full_page=True)
-    return wrong
-
-
 @contextlib.contextmanager
 def _flown(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
     """Yield the address and the process of a console that starts a flight, and the process of its flight."""
@@ -172,24 +145,13 @@ def _flown(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
 @contextlib.contextmanager
 def _linked(config: Path, run: Path) -> Iterator[tuple[str, int, int]]:
     """Yield address and process of a console that has only a flight's link, and the link's process."""
-    place, (satellite, ground) = run.parent, make_keys(run.parent / "keys")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    own = place / config.name
-    more = (
-        f"commands: {{socket: {place}/commands}}",
-        f"link: {{keys: {satellite}, udp: '{address}', rate: 100000}}",
-    )
-    own.write_text("\n".join([config.read_text(encoding="utf-8"), *more, ""]), encoding="utf-8")
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(_started("run", own, "--realtime", "--out", run))
-        while not (run / "flight-0001.ccsds").exists():
-            time.sleep(0.1)
-        link = stack.enter_context(_started("link", own, "--log", run))
-        words = ("--link", address, "--keys", ground, "--config", own, "--port", "0")
-        server = stack.enter_context(_started("console", *words))
-        yield _address(server), server.pid, link.pid
+    address, place = f"127.0.0.1:{free_port()}", run.parent
+    own = write_linked_config(place, base=config, udp=address, rate=100_000)
+    with process("run", own, "--realtime", "--out", run):
+        wait_for(run / "flight-0001.ccsds")
+        words = ("--link", address, "--keys", place / "keys" / "ground", "--config", own, "--port", "0")
+        with process("link", own, "--log", run) as link, _started("console", *words) as server:
+            yield _address(server), server.pid, link.pid
 
 
 @contextlib.contextmanager
