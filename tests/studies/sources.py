@@ -19,12 +19,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import SOLVERS
-from knightcube.astro.quaternion import (
-    conjugate,
-    from_rotation_vector,
-    multiply,
-    to_rotation_vector,
-)
+from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from knightcube.reference.corner_streaks import DETECTOR_NAMES
 from knightcube.reference.star_identification import (
     DEFAULT,

@@ -22,15 +22,7 @@ from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.rso import (
-    EXPOSURE,
-    FASTEST,
-    MARGIN_PX,
-    MATCH_PX,
-    SLOWEST,
-    Sky,
-    ends_error,
-)
+from tests.studies.campaigns.rso import EXPOSURE, FASTEST, MARGIN_PX, MATCH_PX, SLOWEST, Sky, ends_error
 from tests.studies.command import Seed, Table, command
 from tests.support.scenes import FIELD, SAMPLES
 

@@ -25,12 +25,7 @@ from knightcube.astro.earth.disturbance import box_areas
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.errors import PlanningError
 from knightcube.gnc.control import pointing_job
-from knightcube.gnc.control.pointing_job import (
-    RESERVE,
-    PointingJob,
-    SlewRequest,
-    slew,
-)
+from knightcube.gnc.control.pointing_job import RESERVE, PointingJob, SlewRequest, slew
 from knightcube.gnc.guidance import slew_vmc
 from knightcube.gnc.guidance.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath, SlewTask

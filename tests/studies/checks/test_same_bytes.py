@@ -280,7 +280,7 @@ def test_a_run_that_fails_in_this_checkout_is_a_difference_and_the_others_are_co
 def test_the_flights_are_of_testbed_and_orbit() -> None:
     assert len(FLIGHTS) == 10
     assert {Path(run.flight.split()[0]).stem for run in FLIGHTS} == {
-        *("step_demo", "step_thesis", "orbit", "orbit_3u", "orbit_object"),
+        *("step_demo", "step_thesis", "orbit", "orbit_3u", "orbit_object")
     }
 
 

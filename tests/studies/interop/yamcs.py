@@ -24,13 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from flight.link.commands import crc_of
-from flight.link.telemetry.definitions import (
-    LINK,
-    PARAMETER_FIELDS,
-    PARAMETER_KEYS,
-    TRANSFER,
-    VERIFICATION,
-)
+from flight.link.telemetry.definitions import LINK, PARAMETER_FIELDS, PARAMETER_KEYS, TRANSFER, VERIFICATION
 from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text, walk
 from flight.schema.reader import load
