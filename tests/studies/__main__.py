@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pkgutil
 import runpy
 import sys
 from pathlib import Path
@@ -12,21 +11,14 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _FOLDER = Path(__file__).parent
-_NOT_STUDIES = {"__main__", "checks"}
 
 
 def names() -> list[str]:
-    """Return the names of the studies: the executable modules and packages of this folder."""
-    return [
-        found.name
-        for found in pkgutil.iter_modules([str(_FOLDER)])
-        if found.name not in _NOT_STUDIES
-        and (not found.ispkg or (_FOLDER / found.name / "__main__.py").exists())
-        and (
-            found.ispkg
-            or '__name__ == "__main__"' in (_FOLDER / f"{found.name}.py").read_text(encoding="utf-8")
-        )
+    """Return the names of the studies: the modules of this folder with a command, and the packages."""
+    modules = [
+        path.stem for path in _FOLDER.glob("*.py") if "\n@command\ndef main(" in path.read_text("utf-8")
     ]
+    return sorted(modules + [path.parent.name for path in _FOLDER.glob("*/__main__.py")])
 
 
 def main() -> int:

@@ -25,7 +25,7 @@ import tarfile
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from json import dumps
 from pathlib import Path
@@ -370,7 +370,7 @@ def _kill_group(process: subprocess.Popen[str]) -> None:
 def judge(
     root: Path, mutants: Sequence[Mutant], known: dict[tuple[str, str], str], workers: int = 1
 ) -> Iterator[Verdict]:
-    """Yield the result of each mutant when it is ready.
+    """Yield the result of each mutant.
 
     `known` maps the line before and after the change to the reason why the mutant is equivalent. These
     mutants are not run. Raises UsageError if git cannot copy the repository.
@@ -378,7 +378,7 @@ def judge(
     for mutant in mutants:
         if (mutant.before, mutant.after) in known:
             yield Verdict(mutant, "equivalent", known[mutant.before, mutant.after])
-    waiting = iter([mutant for mutant in mutants if (mutant.before, mutant.after) not in known])
+    waiting = [mutant for mutant in mutants if (mutant.before, mutant.after) not in known]
     with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as temporary:
         copies = [_copied(root, Path(temporary) / f"copy-{index}") for index in range(workers)]
         free: SimpleQueue[_Copy] = SimpleQueue()
@@ -393,18 +393,8 @@ def judge(
                 free.put(copied)
 
         pool = ThreadPoolExecutor(workers)
-        running: set[Future[Verdict]] = set()
         try:
-            for mutant in waiting:
-                running.add(pool.submit(tested, mutant))
-                if len(running) == workers:
-                    done, running = wait(running, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        yield future.result()
-            while running:
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield future.result()
+            yield from pool.map(tested, waiting)
         finally:
             # The tests run in sessions of their own, so Ctrl-C does not reach them.
             for copied in copies:

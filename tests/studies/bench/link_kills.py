@@ -163,55 +163,41 @@ def measure_scheduled(place: Path, kills: int, seed: int) -> Findings:
 
 
 class Way:
-    """Replacement of the writing calls of a process, which is killed at one of these calls."""
+    """The writing calls of a process, which is killed at one of them."""
 
     def __init__(self, point: int, torn: bool, writer: socket.socket) -> None:
         self._left = point
         self._torn = torn
         self._writer = writer
-        self._pwrite, self._fsync, self._sendto = os.pwrite, os.fsync, socket.socket.sendto
 
     def arm(self) -> None:
-        """Replace the writing calls of this process by those of this object."""
-        os.pwrite, os.fsync = self.pwrite, self.fsync  # type: ignore[assignment]  # of this process alone
-        way = self
+        """Replace the writing calls of this process, so that `call` counts them."""
+        pwrite, fsync, sendto = os.pwrite, os.fsync, socket.socket.sendto
 
-        def sendto(line: socket.socket, data: bytes, address: str) -> int:
-            if way.ends():
-                if way._torn:
-                    way._sendto(line, data, address)
-                way.die()
-            return way._sendto(line, data, address)
+        def written(file: int, data: bytes, offset: int) -> int:
+            part = data[: len(data) // 2] if self._torn else data
+            return self.call(partial(pwrite, file, data, offset), partial(pwrite, file, part, offset))
 
-        socket.socket.sendto = sendto  # type: ignore[method-assign, assignment]  # of this process alone
+        def sent(line: socket.socket, data: bytes, address: str) -> int:
+            send = partial(sendto, line, data, address)
+            return self.call(send, send if self._torn else None)
 
-    def ends(self) -> bool:
-        """Return whether the process is killed at this call."""
+        os.pwrite = written  # type: ignore[assignment]  # of this process alone
+        os.fsync = lambda file: self.call(partial(fsync, file))
+        socket.socket.sendto = sent  # type: ignore[method-assign, assignment]  # of this process alone
+
+    def call(self, whole: Callable[[], Any], last: Callable[[], Any] | None = None) -> Any:
+        """Make a call; if a kill is due, make the call `last` and end the process as kill -9 does."""
         self._left -= 1
-        return self._left < 0
-
-    def die(self) -> None:
-        """End the process as kill -9 does."""
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    def pwrite(self, file: int, data: bytes, offset: int) -> int:
-        """Write the data; or write half or all of them and end the process."""
-        if self.ends():
-            self._pwrite(file, data[: len(data) // 2] if self._torn else data, offset)
-            self.die()
-        return self._pwrite(file, data, offset)
-
-    def fsync(self, file: int) -> None:
-        """Sync the file; if a kill is due, end the process before the sync."""
-        if self.ends():
-            self.die()
-        self._fsync(file)
+        if self._left < 0:
+            if last is not None:
+                last()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return whole()
 
     def put(self, frame: bytes) -> None:
-        """Send a frame over the air; if a kill is due, end the process before the frame is sent."""
-        if self.ends():
-            self.die()
-        self._writer.send(frame)
+        """Send a frame over the air; if a kill is due, the frame is not sent."""
+        self.call(partial(self._writer.send, frame))
 
 
 class _SkyWire(Wire):

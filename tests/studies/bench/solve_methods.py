@@ -10,6 +10,7 @@ per axis), the NEES of three axes divided by three (1 if the covariance is corre
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated
 
@@ -24,7 +25,7 @@ from knightcube.reference.star_identification import match_images
 from knightcube.vision.startracker.detect import detect
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
-from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings, Method
+from knightcube.vision.startracker.survey import CENTROIDS, DetectionSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.command import Json, Seed, command
 from tests.support.scenes import YEAR, exposed
@@ -55,9 +56,9 @@ class Row:
 def compare(frames: int, seed: int) -> list[Row]:
     """Return a row for each centroid method and solver, over the same frames."""
     camera, sky = StarCameraModel(field_of_view=_FIELD), default_index().at(YEAR)
-    turns: dict[tuple[str, str], list[FloatArray]] = {}
-    nees: dict[tuple[str, str], list[float]] = {}
-    spent: dict[tuple[str, str], list[float]] = {}
+    turns: defaultdict[tuple[str, str], list[FloatArray]] = defaultdict(list)
+    nees: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+    spent: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
     for frame in range(frames):
         generator = np.random.default_rng((seed, frame))
         scene = exposed(camera, normalise(generator.normal(size=4)), np.zeros(3), _EXPOSURE, generator)
@@ -65,41 +66,27 @@ def compare(frames: int, seed: int) -> list[Row]:
             detection = DetectionSettings(method=centroid)
             begin = time.process_time()
             found = detect(scene.pixels, detection).stars()
-            spent.setdefault((centroid, ""), []).append(time.process_time() - begin)
+            spent[centroid, ""].append(time.process_time() - begin)
             for attitude in (_IMAGE, *_SOLVERS):
                 settings = replace(SolveSettings(detection=detection), attitude=_SOLVERS.get(attitude))
                 begin = time.process_time()
                 solution = solve_points(found, camera.pinhole, (1.0, 1.0), sky, settings)
-                spent.setdefault((centroid, attitude), []).append(time.process_time() - begin)
-                if solution.fix is None:
-                    continue
-                turn = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(scene.attitudes[0])))
-                turns.setdefault((centroid, attitude), []).append(turn)
-                nees.setdefault((centroid, attitude), []).append(
-                    float(turn @ np.linalg.solve(solution.fix.covariance, turn)) / 3.0
-                )
-    return [
-        _row(
-            centroid,
-            attitude,
-            frames,
-            np.array(turns[centroid, attitude]),
-            float(np.mean(nees[centroid, attitude])),
-            (float(np.median(spent[centroid, attitude])), float(np.median(spent[centroid, ""]))),
-        )
-        for centroid in CENTROIDS
-        for attitude in (_IMAGE, *_SOLVERS)
-        if (centroid, attitude) in turns
-    ]
-
-
-def _row(
-    centroid: Method, attitude: str, frames: int, turns: FloatArray, nees: float, spent: tuple[float, float]
-) -> Row:
-    rms = _ARCSECONDS * np.sqrt(np.mean(turns**2, axis=0))
-    across = float(np.sqrt(0.5 * (rms[0] ** 2 + rms[1] ** 2)))
-    solving, detecting = (1e3 * seconds for seconds in spent)
-    return Row(centroid, attitude, frames, len(turns), across, float(rms[2]), nees, solving, detecting)
+                spent[centroid, attitude].append(time.process_time() - begin)
+                if solution.fix is not None:
+                    turn = to_rotation_vector(
+                        multiply(solution.fix.quaternion, conjugate(scene.attitudes[0]))
+                    )
+                    turns[centroid, attitude].append(turn)
+                    squared = float(turn @ np.linalg.solve(solution.fix.covariance, turn))
+                    nees[centroid, attitude].append(squared / 3.0)
+    rows = []
+    for key in ((centroid, attitude) for centroid in CENTROIDS for attitude in (_IMAGE, *_SOLVERS)):
+        if key in turns:
+            rms = _ARCSECONDS * np.sqrt(np.mean(np.square(turns[key]), axis=0))
+            across, about = float(np.sqrt(0.5 * (rms[0] ** 2 + rms[1] ** 2))), float(rms[2])
+            ms = [1e3 * float(np.median(spent[each])) for each in (key, (key[0], ""))]
+            rows.append(Row(*key, frames, len(turns[key]), across, about, float(np.mean(nees[key])), *ms))
+    return rows
 
 
 @command
