@@ -165,7 +165,8 @@ def draw(root: Path, count: int, seed: int, only: Sequence[str] = ()) -> list[Mu
 
 def mutants_of(source: str, path: str) -> list[Mutant]:
     """Return every mutant of a module's source."""
-    lines, found, nodes = source.splitlines(), list[Mutant](), [ast.parse(source)]
+    lines, found = source.splitlines(), list[Mutant]()
+    nodes: list[ast.AST] = [ast.parse(source)]
     while nodes:
         node = nodes.pop()
         if _is_fixed(node):

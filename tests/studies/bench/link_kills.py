@@ -174,16 +174,16 @@ class Way:
         """Replace the writing calls of this process, so that `call` counts them."""
         pwrite, fsync, sendto = os.pwrite, os.fsync, socket.socket.sendto
 
-        def written(file: int, data: bytes, offset: int) -> int:
+        def written(file: int, data: bytes, offset: int) -> Any:
             part = data[: len(data) // 2] if self._torn else data
             return self.call(partial(pwrite, file, data, offset), partial(pwrite, file, part, offset))
 
-        def sent(line: socket.socket, data: bytes, address: str) -> int:
+        def sent(line: socket.socket, data: bytes, address: str) -> Any:
             send = partial(sendto, line, data, address)
             return self.call(send, send if self._torn else None)
 
         os.pwrite = written  # type: ignore[assignment]  # of this process alone
-        os.fsync = lambda file: self.call(partial(fsync, file))
+        os.fsync = lambda fd: self.call(partial(fsync, fd))
         socket.socket.sendto = sent  # type: ignore[method-assign, assignment]  # of this process alone
 
     def call(self, whole: Callable[[], Any], last: Callable[[], Any] | None = None) -> Any:

@@ -258,8 +258,8 @@ def _difference(
         found = _different_field(a, b, first, longer, texts)
     kinds = [_kinds(layout.packet.fields) for layout in (first, second)]
     if found and kinds[0] != kinds[1] and not longer:
-        names = (" ".join(name for name, _, _ in fields) for fields in kinds)
-        found = ("definition", *names)
+        before, after = (" ".join(name for name, _, _ in fields) for fields in kinds)
+        found = ("definition", before, after)
     return (Difference(stem, first.packet.name, time, *found) if found else None), longer
 
 
