@@ -30,7 +30,7 @@ def pace_s() -> float:
 def warm_call(name: str, call: Callable[[], Result]) -> tuple[Result, float]:
     """Return the result of `call` and its processor time (s), which excludes the loading of code.
 
-    The first call of a `name` in a process loads modules and compiled functions, so it is repeated.
+    The first call of a `name` in a process loads modules and compiled functions, so the call is repeated.
     """
     if name not in _warm:
         _warm.add(name)

@@ -69,7 +69,7 @@ def frames_with_rate(run: Run) -> PacketArray:
 def coil_currents(bus: RemoteI2cBus) -> list[float]:
     """Return the currents (A) of the emulated coils.
 
-    The query is repeated if a busy machine responds late.
+    The query of the emulated devices is repeated if a busy machine responds late.
     """
     for _ in range(100):
         with suppress(TimeoutError):

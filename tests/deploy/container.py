@@ -1,7 +1,7 @@
 """Boots a systemd-nspawn container on an overlay of the machine's files, to test the service.
 
 `boot` runs `python -m tests.deploy.container FOLDER SCENARIO` in a separate mount namespace, so that the
-mounts of this program are not visible to other programs and end with it. The program installs the service by
+mounts are not visible to other programs, and end with the program. The program installs the service by
 `deploy/install.sh` and boots the container. In the container, the unit `scenario` runs the module SCENARIO,
 which writes its observations into FOLDER, and the container is shut down.
 """
@@ -157,7 +157,7 @@ def main(folder: Path, scenario: str) -> None:
 
 
 def _overlay() -> Path:
-    """Mount the machine's files below an overlay in memory, which receives all writes."""
+    """Mount an overlay of the machine's files, whose upper layer in memory receives all writes."""
     _do("mount", "-t", "tmpfs", "tmpfs", "/mnt")
     for name in ("upper", "work", "root"):
         Path("/mnt", name).mkdir()
@@ -173,7 +173,7 @@ def _overlay() -> Path:
         # and nspawn mounts it again.
         Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
         _do("mount", "--bind", str(shown), f"/mnt/root{place}")
-    # nspawn stores files in this folder. They are removed together with the mount.
+    # nspawn stores files in this folder. These files are removed together with the mount.
     _do("mount", "-t", "tmpfs", "tmpfs", "/run/systemd")
     return Path("/mnt/root")
 

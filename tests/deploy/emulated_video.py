@@ -45,7 +45,7 @@ class ServedVideo(IoctlCamera):
         device = camera.device
         assert isinstance(device, V4l2Device)
         folder = Path(device.path).parent
-        folder.resolve().mkdir(exist_ok=True)  # only root may be able to write here: the folder may be a link
+        folder.resolve().mkdir(exist_ok=True)  # only root may write to this folder, which may be a link
         super().__init__(folder, clock.now_ns)
         assert str(self.path) == device.path
         self.sizes = {device.pixel_format: (camera.columns, camera.rows)}
@@ -97,7 +97,7 @@ def plug(path: Path, socket: Path) -> None:
 
 
 def run(words: Sequence[str]) -> int:
-    """Run commands that are separated by "--", and return the exit status of the last one."""
+    """Run commands that are separated by "--", and return the exit status of the last command."""
     first, rest = list(words), []
     if "--" in words:
         at = list(words).index("--")

@@ -61,8 +61,8 @@ class Ground:
             "activate": self.call("renewal activate", kind, bundle, *TRIAL),
         }
         if steps["activate"][0] == 0:
-            # A command is lost if the link restarts for the trial at that time. An operator sends the command
-            # again.
+            # A command that is sent while the link restarts for the trial is lost. An operator sends the
+            # command again.
             for _ in range(6):
                 steps["confirm"] = self.call("renewal confirm", kind, "--timeout", "30")
                 if steps["confirm"][0] == 0:

@@ -196,7 +196,7 @@ class Chips:
 def test_of_the_known_addresses_each_that_acknowledges_is_off_whatever_another_does(
     tools: Tools, note: int, unit: int, refusals: int, left: list[int], status: int
 ) -> None:
-    """A chip may refuse its first bytes; an address without a chip never acknowledges."""
+    """A PWM chip may refuse its first bytes. An address without a chip never acknowledges."""
     chips = Chips(tools.folder)
     assert chips.driving() == list(chips.ADDRESSES)
     if refusals:

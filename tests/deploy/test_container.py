@@ -40,7 +40,7 @@ def test_the_coils_are_at_zero_and_it_comes_back(
     """ExecStopPost zeroes the coils if guardian and flight are killed together.
 
     The watchdog ends a stopped flight. On a busy machine systemd responds later than the guardian, so the
-    limit is 1.5 s instead of 0.5 s.
+    limit of ExecStopPost is 1.5 s instead of 0.5 s.
     """
     facts = seen[act]
     assert facts["zero_after"] is not None

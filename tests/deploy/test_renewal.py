@@ -63,7 +63,7 @@ def test_without_confirmation_the_time_with_power_decides(board: RenewedBoard) -
     before, request = board.flown(), activated(board, hours=1.0)
     board.step(3500.0)
     assert board.flown() == "second"
-    board.now = 0.0  # reboot: the powered time restarts at zero
+    board.now = 0.0  # after a reboot, the powered time restarts at zero
     board.step(60.0)
     assert board.flown() == "second"
     board.step(200.0)

@@ -60,7 +60,7 @@ class _Loads(HTMLParser):
 
 
 def problems_of(site: Path) -> list[str]:
-    """Return the problems of a site, one text per problem."""
+    """Return the problems of a site, with one text per problem."""
     found: list[str] = []
     for page in sorted(site.rglob("*.html")):
         name, text = str(page.relative_to(site)), page.read_text(encoding="utf-8")

@@ -107,7 +107,7 @@ def test_commands_in_a_block_without_a_language_are_found() -> None:
 def test_the_collector_finds_commands_and_their_marks() -> None:
     """Commands are found in plain blocks and in blocks of lists, without comments, prompts and outputs.
 
-    The mark "not run" before the second block, which is in a list, is found with its reason.
+    The mark "not run" before a block in a list is found, together with its reason.
     """
     text = "```sh\nmake a  # why\n# only a remark\nmake b \\\n  c\n```\n\n1. x\n\n"
     text += "    <!-- not run: no need -->\n    ```console\n    $ make d\n    output\n    ```\n"

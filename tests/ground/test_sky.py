@@ -33,7 +33,7 @@ def test_jupiter_and_saturn_meet_on_the_day_of_the_great_conjunction() -> None:
 def test_the_moon_is_before_the_sun_at_an_eclipse() -> None:
     """At an eclipse, Sun and Moon are separated by gamma times the Moon's parallax, which is about 1 deg.
 
-    The separation is that at the Earth's centre.
+    The separation is that seen from the Earth's centre.
     """
     found = directions_of_bodies(_ECLIPSE)
     assert _apart_deg(found["Sun"], found["Moon"]) == pytest.approx(0.343 * 0.998, abs=0.05)
@@ -69,7 +69,7 @@ def _sky(seed: int) -> SkyMap:
 def _stars(sky: SkyMap) -> tuple[FloatArray, FloatArray]:
     """Return right ascension and declination (n, 2), deg, of stars in the picture, and their pixels.
 
-    The camera's projection gives the pixels. The code that makes the header does not use this projection.
+    The pixels are computed by the camera's projection, which the code that makes the header does not use.
     """
     _, directions = catalogue(8.5)
     place = _LENS.project(directions @ attitude_matrix(sky.quaternion).T)

@@ -82,7 +82,7 @@ def test_a_slew_leads_from_nadir_to_the_sun_within_the_limits() -> None:
 def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
     """A slew starts at the best time of its window.
 
-    The time may have any time zone, and is UTC without one.
+    The time may have any time zone. Without a time zone, the time is UTC.
     """
     fixed = plan_slew(**SLEW)
     zone = timezone(timedelta(hours=2))

@@ -28,7 +28,7 @@ SILENT_AT = 3.0
 WITHIN = 0.1
 CYCLE = 0.025
 ZERO = 1e-3
-"""Largest current (A) that is accepted as zero."""
+"""Largest current (A) that is accepted as zero current."""
 
 Break = Callable[[Rigged], None]
 

@@ -67,7 +67,10 @@ def summary(demonstration: Run) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def power(demonstration: Run) -> dict[str, float]:
-    """Return the mean powers (W) over 700 s. Each step then lasts 70 s longer, at the power of its rest."""
+    """Return the mean powers (W) over 700 s.
+
+    In the 700 s, each step lasts 70 s longer than in the tests, at the power of its rest.
+    """
     coils = coil_power(demonstration)
     assert coils is not None
     measured = {
@@ -202,9 +205,9 @@ def test_every_frame_gives_an_attitude_that_the_estimate_takes(demonstration: Ru
 
 @pytest.mark.slow
 def test_the_star_attitudes_are_as_good_as_they_say(demonstration: Run) -> None:
-    """The mean normalised squared errors of star attitudes have an upper bound.
+    """The mean normalised squared error of the star attitudes is below its upper bound.
 
-    The error about the thread, the only axis that rotates, also has a lower bound.
+    The mean normalised squared error about the thread, the only rotation axis, is also above a lower bound.
     """
     error, covariance = star_errors(demonstration)
     about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])
@@ -218,9 +221,9 @@ def test_the_star_attitudes_are_as_good_as_they_say(demonstration: Run) -> None:
 
 @pytest.mark.slow
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
-    """A step within an exposure spoils no frame.
+    """A frame is not spoilt by a step that begins within its exposure.
 
-    During such an exposure, the body is first at rest and then accelerates.
+    During the exposure, the body is first at rest and then accelerates.
     """
     config = demo_config(29.0)
     begun = tuple(

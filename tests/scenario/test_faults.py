@@ -106,7 +106,8 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
     time = run["truth"]["time_ns"] * 1e-9
     error = np.degrees(np.abs(angle - 2 * np.arcsin(-0.3)))
     assert error[(time > 13.0) & (time < 14.0)].max() < 0.1
-    # Without control, the thread rotates the body by k theta / (2 J) t^2 = 0.17 deg in this second.
+    # Without control, the thread would rotate the body by k theta / (2 J) t^2 = 0.17 deg during the fault of
+    # one second.
     assert error[time > 14.0].max() < 0.3
     assert error[time > 18.5].max() < 0.1
 

@@ -119,7 +119,7 @@ def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
     time = truth["time_ns"] * 1e-9
     rate = truth["rate"][:, 1]
     # One coil (0.096 A m^2 in 0.45 mT, driven for 0.6 of the time) reduces the rate by 0.025 rad/s per
-    # second. Two coils reduce the rate 1.4 times faster.
+    # second. Two coils reduce the rate by 1.4 times as much.
     assert rate[time > 10.9].max() < 0.2
     windows = np.interp(np.arange(0.5, 11.0, 0.25), time, rate)
     assert np.diff(windows).max() < 2e-3
@@ -174,7 +174,7 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
     run = fly(config, tmp_path, prepare, section=released(-0.2, 0.0))
     assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
     # In the demonstration, the timeout starts at the end of its path, or after the same time without a path.
-    # In a hold, the timeout starts when the filter discards its estimate.
+    # In the mode HOLD, the timeout starts when the filter discards its estimate.
     since = 10.0 if initial == "testbed-demo" else 4.0 + AttitudeFilter.REJECTIONS_TO_RESTART * CYCLE
     assert entered(run, Mode.SAFE) == pytest.approx(since + BRIEF["hold_patience"], abs=0.1)
     assert "hold-impossible" in event_names(run)

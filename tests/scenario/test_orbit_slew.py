@@ -22,7 +22,7 @@ from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
 BEGIN, SLEW, AFTER, TURN = 8.0, 150.0, 8.0, np.radians([20.0, 20.0, -10.0])
-"""Start and duration (s) of a slew, time (s) of flight after it, and the slew's rotation vector (rad).
+"""Start and duration (s) of a slew, time (s) of flight after the slew, and the slew's rotation vector (rad).
 
 The coils can cause the rotation about x, along the field, only because the field rotates; The rotation
 reaches 0.7 deg/s of the 0.8 deg/s that a path may have.

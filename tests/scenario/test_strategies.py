@@ -49,10 +49,10 @@ def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
 
 
 def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None:
-    """A cost of time determines the goal time, which then stays.
+    """A cost of time determines the goal time, which later plans keep.
 
-    If the cost is doubled, the duration of the slew decreases by the fourth root of two. Later plans keep the
-    first goal time.
+    If the cost is doubled, the duration of the slew decreases by the fourth root of two. The first plan
+    determines the goal time.
     """
     steps = (Step(at=0.0, q2=0.2), Step(at=4.0, q2=0.1))
     horizons = []

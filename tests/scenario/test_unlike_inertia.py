@@ -72,7 +72,7 @@ def test_an_open_coil_is_isolated_in_the_tumble_by_the_supply_current(tmp_path: 
 
 
 def test_a_sign_found_before_a_restart_is_used_from_the_start(tmp_path: Path) -> None:
-    """The sign of a reversed coil that was found before a restart is used from the start.
+    """A coil that was found to be reversed before a restart has the corrected sign from the start.
 
     The stored gain matrix of the coils refers to corrected dipoles, so the correction is stored too.
     """

@@ -147,7 +147,7 @@ def test_a_marker_with_wrong_bits_is_accepted_only_behind_a_codeblock() -> None:
 
 @given(data=st.binary(min_size=7, max_size=7))
 def test_parity_is_the_remainder_by_the_generator_of_the_standard(data: bytes) -> None:
-    """The inverted parity by x^7 + x^6 + x^2 + 1 is followed by a fill bit of 0 (CCSDS 231.0-B-4, 3.3)."""
+    """A fill bit of 0 follows the inverted parity of x^7 + x^6 + x^2 + 1 (CCSDS 231.0-B-4, 3.3)."""
     rest = int.from_bytes(data, "big") << 7
     for bit in reversed(range(7, 63)):
         if rest >> bit & 1:

@@ -114,7 +114,7 @@ def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vau
     third = maker.frame(b"three")
     assert cause(entrance, third[:-1] + bytes([third[-1] ^ 1])) is Refusal.CRC
     assert cause(entrance, close_frame(third[:20] + bytes([third[20] ^ 1]) + third[21:-2])) is Refusal.MAC
-    # The following frames have a wrong SPI, header or spacecraft.
+    # The tested frames have a wrong SPI, header or spacecraft.
     assert cause(entrance, close_frame(third[:6] + b"\2" + third[7:-2])) is Refusal.MAC
     assert cause(entrance, close_frame(third[:6] + b"\7" + third[7:-2])) is Refusal.SPI
     assert cause(entrance, close_frame(third[:2] + bytes([third[2] ^ 4]) + third[3:-2])) is Refusal.MAC

@@ -116,7 +116,7 @@ def test_cleared_evidence_contains_no_earlier_readings() -> None:
 
 
 def test_normal_readings_of_another_coil_do_not_end_a_suspicion() -> None:
-    """Readings of a probe of coil x do not end the suspicion of coil y, because coil y is then undriven."""
+    """Readings of a probe of coil x do not end the suspicion of coil y, which is not driven meanwhile."""
     evidence = Evidence(BOUNDS)
     evidence.add([predict(2 * FULL, np.full((12, 3), FULL), BOUNDS, NEWEST)] * 4)
     evidence.begin_segment()
@@ -213,7 +213,7 @@ def test_an_open_coil_is_tried_again_while_the_body_is_slow(trials: int) -> None
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
     """Currents 13 % below and 10 % above their nominal values cause no suspicion.
 
-    The resistance of copper at 60 degrees C is 15 % off. All three axes have changing commands.
+    At 60 degrees C, the resistance of copper has changed by 15 %. All three axes have changing commands.
     """
     seen = observe(hold(TARGET, noise=0.005, others=0.04), 20.0, gain=(0.87, 1.1, 1.0))
     assert seen.found == []
@@ -414,7 +414,7 @@ def test_a_check_at_rest_does_not_raise_suspicion() -> None:
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
-    """The coils do not rest for longer if the current monitor gives no readings."""
+    """The rest of the coils does not last longer if the current monitor gives no readings."""
     watch = CoilMonitor(CoilMonitorSettings((FULL, FULL, FULL)))
     rested = []
     for cycle in range(160):
@@ -513,7 +513,7 @@ def test_the_motion_overrules_the_current_monitor_unless_a_probe_shows_that_the_
     watch._evidence.add([_alone(1, 0.04 if probed else 0.0)])
     watch._evidence.begin_segment()
     watch._evidence.add([_alone(0, 0.0)])
-    for _ in range(1 if probed else 2):  # in the second round, coil y has been probed too
+    for _ in range(1 if probed else 2):  # in the second round, a probe of coil y has been recorded
         watch._conclude(0, CoilFault.OPEN, 0)
     assert bool(watch.verdicts) is probed
     assert bool(watch.monitor_doubted) is not probed

@@ -36,9 +36,9 @@ def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list
     """Drive coil x by a loop that stalls repeatedly.
 
     The gyro samples of a stall arrive together at the end of the stall. During a stall the driver zeroes the
-    coils and reports the time, or a guardian zeroes them without a report. With `informed`, the loop knows
-    that the currents of that time are unknown. Returns the trusted gains of coil x, and the number of times
-    that an axis was found reversed.
+    coils and reports the time, or a guardian zeroes them without a report. If `informed` is set, the loop
+    knows that the currents during the stall are unknown. Returns the trusted gains of coil x, and the number
+    of times that an axis was found reversed.
     """
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
     response, noise = CoilResponse(settings), np.random.default_rng(3)
@@ -97,7 +97,7 @@ class Orbiting:
         tumble_rate: float = math.inf,
         dipoles: FloatArray | None = None,
     ) -> None:
-        """Use the `dipoles` (3, n) per ampere; by default, those of coils along the body axes."""
+        """Use coils with the `dipoles` (3, n) per ampere, by default along the body axes."""
         self.signs, self.rate = signs, speed * np.array([0.08, -0.1, 0.07])
         self._dipoles = 0.65 * np.eye(3) if dipoles is None else dipoles
         self._allocation = 0.65 * np.linalg.pinv(self._dipoles)
@@ -147,7 +147,7 @@ def _moved(
 ) -> tuple[FloatArray, FloatArray]:
     """Return rate and field (3,) after 25 ms, in body axes.
 
-    Floats take a tenth of the time of numpy arrays.
+    Calculations with floats take a tenth of the time that numpy arrays take.
     """
     (x, y, z), (bx, by, bz) = rate.tolist(), field.tolist()
     (mx, my, mz), (jx, jy, jz) = dipole.tolist(), moments.tolist()
@@ -316,7 +316,7 @@ def test_a_weak_coil_is_used_with_its_gain(axis: int) -> None:
 def test_a_gain_that_misaligned_coils_can_explain_is_not_used(gain: float, found: list[int]) -> None:
     """A gain of 0.48 +- 0.06 is not used, because misaligned coils can explain it.
 
-    In the campaign `unlike-inertia`, a healthy coil of gain 0.8 had this estimate.
+    In the campaign `unlike-inertia`, a healthy coil of gain 0.8 was estimated to have 0.48 +- 0.06.
     """
     response = CoilResponse(ResponseSettings(INERTIAS, 0.65, 2.8e-4))
     response.gain, response.sigma = np.array([1.0, gain, 1.0]), np.full(3, 0.06)

@@ -42,7 +42,7 @@ FULL_COILS = 0.45
 
 
 class Satellite:
-    """A power system, its monitors and its task, with coils that obey the limit, and a mode control."""
+    """A power system with its monitors and task, coils that obey the current limit, and a mode control."""
 
     def __init__(self, charge: float = TRUTH.charge) -> None:
         self.clock = SimClock()

@@ -27,7 +27,7 @@ MS = 1_000_000
 
 
 def worker(name: str, function: Callable[[Any], Any]) -> Worker:
-    # Timeouts (s): a short one for tests of the timeout itself, and a long one because processes start
+    # Timeouts (s): a short timeout for tests of the timeout itself, and a long one because processes start
     # slowly.
     patience = 1500 if function is hang else 20_000
     return Worker(name, function, latency_ns=50 * MS, timeout_ns=patience * MS)

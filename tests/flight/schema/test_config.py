@@ -295,8 +295,8 @@ def test_a_configuration_is_written_in_its_order_and_read_back_the_same() -> Non
 def test_what_a_lens_differs_by_from_a_pinhole_counts_as_unknown_to_the_streaks() -> None:
     """An unknown lens is described by the offset of the optical axis and by the distortion.
 
-    The axis is 3 and 4 px from the image centre. The distortion moves the image corner by 1 % of its distance
-    from the centre.
+    The optical axis is 3 px (x) and 4 px (y) from the image centre. The distortion moves the image corner by
+    1 % of its distance from the centre.
     """
     demo = reader.load(FOLDER / "step_demo.yaml").camera
     assert demo is not None

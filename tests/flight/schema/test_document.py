@@ -288,8 +288,8 @@ def test_a_file_takes_over_mappings_key_by_key_and_replaces_lists_and_scalars(tm
 def test_a_packaged_configuration_is_extended_by_its_name(tmp_path: Path, named: str) -> None:
     top = write(tmp_path, "top.yaml", f"extends: {named}\nname: mine\n")
     assert read(top).values == read(FOLDER / "orbit_3u.yaml").values | {"name": "mine"}
-    # A file in the folder of the extending file has precedence over a packaged file if its full name is
-    # given, but not if the name is given without `.yaml`.
+    # A file in the folder of the extending file has precedence over a packaged file of the same name. A name
+    # without `.yaml` always means the packaged file.
     write(tmp_path, "orbit_3u.yaml", "own: 1\n")
     assert ("own" in read(top).values) == named.endswith(".yaml")
 

@@ -106,7 +106,7 @@ def test_values_of_an_extended_file_and_defaults_can_be_drawn() -> None:
 def test_an_impossible_inertia_is_drawn_again() -> None:
     """A drawn inertia that violates the triangle inequality is drawn again.
 
-    At 60 %, a third of the inertias of a slender body do.
+    With a variation of 60 %, a third of the inertias of a slender body violate the inequality.
     """
     for given in cases(ORBIT, "craft.inertia=60%", runs=8):
         moments = np.sort(yaml.safe_load(given["config"])["craft"]["inertia"][:3])

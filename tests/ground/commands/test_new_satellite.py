@@ -119,7 +119,7 @@ def test_the_star_camera_looks_away_from_the_sun(tmp_path: Path, utc: str, hours
 
 
 def test_the_derived_values_are_those_of_the_shipped_satellites(tmp_path: Path) -> None:
-    """The scaling laws reproduce the values of `orbit` and `orbit_3u`, which were tuned, within 35 %."""
+    """The scaling laws reproduce the tuned values of `orbit` and `orbit_3u` within 35 %."""
     for name, words in {
         "orbit": ("--mass", "0.628", "--size", "0.1x0.1x0.1", "--coil", _coil(0.0959, 0.148, 23.0)),
         "orbit_3u": ("--mass", "4", "--size", "0.3x0.1x0.1", "--coil", _coil(0.2, 0.148, 9.13)),

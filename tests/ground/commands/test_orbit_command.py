@@ -34,7 +34,7 @@ def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
     other = np.array([6.6e6, 1.9e6, 5e5, -914.0, 1.2e3, 7.5e3])
     observer, true = (passes.flown_states(state, times, middle) for state in (own, other))
     way = true[:, :3] - observer[:, :3]
-    # The almanac gives 29.9 km/s for the speed of the Earth at the epoch, near the equinox.
+    # An almanac gives 29.9 km/s for the speed of the Earth at the epoch, near the equinox.
     earth = np.array([0.0, -29.9e3 * np.cos(np.radians(23.44)), -29.9e3 * np.sin(np.radians(23.44))])
     late = np.linalg.norm(way, axis=1, keepdims=True) / passes.LIGHT
     seen = way - late * (true[:, 3:] + earth)

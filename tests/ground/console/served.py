@@ -33,7 +33,7 @@ def asked(
         console.read()
         door = access or Access(lambda token: None)
         server = TestServer(application(console, door), host="127.0.0.1")
-        # The client must also accept cookies from hosts with numeric addresses.
+        # The test client must accept cookies from hosts with numeric addresses.
         async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:
             if access is None:
                 async with client.get("/", params={"token": door.token}) as answer:

@@ -40,7 +40,8 @@ def main() -> int:
         error = motion_error(world, found.constants)
         motion.append((error, found.covariance[:3, :3]))
         plant = absolute(found, prior_of(config), record.field)
-        # The omitted constant of the six is a combination of the first three and the last two constants.
+        # One of the six constants is omitted, because it is a combination of the first three and the last two
+        # constants.
         keep = [0, 1, 2, 4, 5]
         scaled.append((scale_error(world, plant)[keep], plant.covariance[np.ix_(keep, keep)]))
         relative.append(np.abs(error) / world.constants.to_array()[:3])

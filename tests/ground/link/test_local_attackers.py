@@ -210,7 +210,10 @@ def _rest(line: socket.socket) -> bytes:
 
 
 def test_the_operator_is_obeyed(ground: Ground, cookie: str) -> None:
-    """An authorised request is accepted, so the requests of the other tests are refused for their sender."""
+    """An authorised request is accepted.
+
+    So the requests in the other tests are refused because of their sender.
+    """
     with socket.create_connection(("127.0.0.1", ground.gateway), PATIENCE_S) as line:
         line.sendall(token_path(ground.keys, ground.gateway).read_bytes() + SAFE)
         assert len(ground.obeyed(PATIENCE_S)) == 1

@@ -1,4 +1,4 @@
-"""Plots of artificial runs. `drawn_examples.json` contains their descriptions.
+"""Plots of artificial runs. `drawn_examples.json` contains descriptions of the plots.
 
 `python -m tests.ground.report.drawn_examples` writes new descriptions after an intended change of the plots.
 """

@@ -1,7 +1,7 @@
 """Description of a matplotlib figure as plain numbers, for comparison with a recorded description.
 
-Of each text, only its numbers and style are kept, because the wording may change. Of each curve, only five
-points and the mean are kept.
+The description of a text contains only its numbers and its style, because the wording may change. The
+description of a curve contains only five points and the mean.
 """
 
 from __future__ import annotations

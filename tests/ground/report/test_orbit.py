@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 NAN3 = (math.nan,) * 3
 PERIOD_S, SECOND_AIM_S, SLEWED_S, DURATION_S = 10, 1000, 1700, 2000
 OFF_DEG = (3.0, 4.0, 12.0)
-"""Pointing errors (deg) about x, y and z after settling; before settling they are ten times as large."""
+"""Pointing errors (deg) about x, y and z after settling. Before settling, the errors are ten times larger."""
 LIMITS = "requirements: {slow_within: 100.0, knowledge_deg: 0.1, pointing_deg: %s}"
 
 

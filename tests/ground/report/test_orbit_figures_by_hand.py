@@ -84,7 +84,8 @@ def test_detumbling_has_the_rates_of_its_period_and_the_error_of_the_magnetomete
 def test_knowledge_counts_errors_while_fine_and_shortly_after_stars() -> None:
     """Attitude errors count while the attitude is fine, and shortly after star fixes.
 
-    The errors about x are 1 mrad (coarse), 2 and 3 mrad (with stars) and 6 mrad (without). Sigma is 1 mrad.
+    The errors about x are 1 mrad (coarse), 2 and 3 mrad (with star fixes) and 6 mrad (without star fixes).
+    Sigma is 1 mrad.
     """
     levels = [(0.0, 0), (1.0, 1), (2.0, 2), (30.0, 2)]
     sigma = {"angle_sigma": [1e-3] * 3}

@@ -26,7 +26,7 @@ def step_of(command: StepCommand, progress: FloatArray) -> FloatArray:
 def test_a_second_order_step_has_its_textbook_figures(damping: float, frequency: float) -> None:
     """The overshoot of a second-order step is exp(-pi z/sqrt(1 - z^2)).
 
-    The times follow from the exact response.
+    Rise time and settling time follow from the exact response.
     """
     since = np.maximum(TIME - STEP.time, 0.0)
     found = response(TIME, step_of(STEP, second_order(since, damping, frequency)), STEP)

@@ -246,7 +246,7 @@ def test_slots_without_a_control_packet_are_counted(full: Run, tmp_path: Path) -
 
 
 def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
-    """The normalised errors of the estimate and of each streak rate are one, as each error is one sigma."""
+    """The estimate and each streak rate have errors of exactly one sigma, so the normalised error is one."""
     summary = summarise(full)
     assert summary["estimate"]["rate_rms_rad_s"] == pytest.approx(RATE_BIAS, rel=1e-6)
     assert summary["estimate"]["rate_normalised"] == pytest.approx(1.0, rel=1e-6)

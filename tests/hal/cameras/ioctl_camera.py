@@ -1,7 +1,8 @@
 """Test double of the kernel's /dev/videoN: a free-running camera that performs the ioctls of V4L2.
 
 The buffers are in a memfd, which the driver's binding maps. The queue follows the kernel's rules (Linux Media
-userspace API, "Streaming I/O (Memory Mapping)"). Calls in a wrong order fail with the errno of that document.
+userspace API, "Streaming I/O (Memory Mapping)"). Calls in a wrong order fail with the errno that the kernel
+documents.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class IoctlCamera:
         stamps_packets: whether time stamps are those of the first USB packet, as with uvcvideo.
         spoil, shorten: numbers of the frames with an error flag, and of the frames with half their bytes.
         frozen: whether the sequence number stays constant.
-        belies_exposure: whether frames come every `shortest_ns`, independent of the exposure.
+        belies_exposure: whether the interval of frames is always `shortest_ns`, whatever the exposure.
         stopped: whether the camera has stopped sending frames.
         absurd: wrong time stamps of single frames, by frame number.
         raw: content of each frame instead of a pattern, and its number of used bytes.

@@ -25,7 +25,7 @@ UNEQUAL = dataclasses.replace(
 
 
 class Wire:
-    """The devices on the bus, and the emulated bus."""
+    """The emulated bus, and the devices on the bus."""
 
     def __init__(self, clock: Clock, settings: CoilSettings, uncertainty: float, seed: int = 1) -> None:
         self.chip = EmulatedPca9685(PCA, clock.now_ns)

@@ -28,7 +28,7 @@ def test_a_passing_fault_is_retried_and_counted(rig: Rig, fault: str) -> None:
 def test_a_write_that_fails_for_good_ends_at_zero_and_says_why(rig: Rig) -> None:
     """If three attempts of a write fail, the driver writes zero to all coils and reports the error.
 
-    Each attempt fails after ten bytes, so that coil x has its new value and coil y has its old one.
+    Each attempt fails after ten bytes, so that coil x has its new value and coil y still has its old value.
     """
     rig.coils.start()
     rig.command(0.1, 0.1, 0.1)
@@ -65,7 +65,7 @@ def test_a_dead_chip_keeps_its_error_until_it_is_back_and_then_obeys(rig: Rig) -
 def test_a_dead_chip_is_asked_once_a_period_and_with_zero(rig: Rig) -> None:
     """A chip that does not respond is accessed once per period of 50 ms, by one transaction that writes zero.
 
-    On a hung bus, each transaction lasts until its timeout.
+    On a hung bus, each transaction lasts until its timeout, so the number of transactions must be small.
     """
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)

@@ -140,7 +140,7 @@ def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path
 def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_else(
     kernel: IoctlWire, tmp_path: Path
 ) -> None:
-    """Only one flight can open a bus exclusively, and its lock precedes all other accesses.
+    """Only one flight can open a bus exclusively, and the bus is locked before any other access.
 
     Guardian and `check` open the bus without exclusive access, so they are never refused.
     """
@@ -174,9 +174,9 @@ def test_adapters_are_read_from_sysfs(tmp_path: Path) -> None:
 
 
 def test_a_transaction_that_never_ends_does_not_hold_the_others_for_ever(kernel: IoctlWire) -> None:
-    """If a transaction never ends because the adapter ignores its timeout, the next caller gets an error.
+    """If a transaction never ends, the next caller gets an error.
 
-    The bus can still be closed.
+    The adapter ignores its timeout in this case. The bus can still be closed.
     """
     entered, leave = threading.Event(), threading.Event()
 
@@ -208,7 +208,7 @@ def bus(kernel: IoctlWire) -> Iterator[SMBus]:
 
 
 def test_words_are_little_endian_on_the_wire(bus: SMBus) -> None:
-    assert bus.read_word_data(INA, 0x00) == 0x9F39  # Config is 0x399F, and the chip sends the high byte first
+    assert bus.read_word_data(INA, 0x00) == 0x9F39  # the register Config is 0x399F, high byte first
     bus.write_word_data(INA, 0x05, 0x3412)
     assert bus.read_i2c_block_data(INA, 0x05, 2) == [0x12, 0x34]
     assert bus.process_call(INA, 0x05, 0x7856) == 0x7856

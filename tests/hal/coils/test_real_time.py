@@ -1,4 +1,4 @@
-"""Tests in real time with the bus job on its own thread.
+"""Tests in real time. The bus job runs on its own thread.
 
 A command never waits for the bus. A command of zero current always reaches the coils.
 """

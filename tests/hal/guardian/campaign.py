@@ -41,7 +41,7 @@ class Campaign:
 
 
 def hurt_in_every_way(folder: Path) -> Campaign:
-    """Stop and hang the flight process in two ways, kill and stop the guardian, and kill the flight."""
+    """Stop and hang the flight process in two ways, then kill and stop the guardian, then kill the flight."""
     times: list[tuple[str, int, int | None]] = []
     guardians: list[int] = []
     lost_ns: list[int] = []

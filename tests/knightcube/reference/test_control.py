@@ -29,7 +29,7 @@ def test_with_the_plant_known_the_body_follows_the_reference_model() -> None:
 def test_an_unknown_torque_is_learnt_and_the_offset_goes() -> None:
     """By adaptation, the offset of an unknown torque disappears.
 
-    With constant parameters, the same controller keeps most of the offset d / (g l) of 0.23 deg.
+    With constant parameters, the adaptive controller keeps most of the offset d / (g l) of 0.23 deg.
     """
     pushed = replace(BELIEVED, disturbance=4e-3)
     learning, fixed = (

@@ -108,7 +108,7 @@ def test_a_prior_tells_where_to_look() -> None:
 
 
 def test_streaks_of_no_sky_are_refused_and_their_rate_stays() -> None:
-    """Streaks of a mirrored sky are not identified, but they still give their rate."""
+    """Streaks of a mirrored sky are not identified, but the rate of the streaks is still found."""
     streaks = _streaks(_frame(2))
     mirrored = streaks.endpoints * np.array([-1.0, 1.0]) + np.array([NARROW.pinhole.columns - 1.0, 0.0])
     strewn = replace(streaks, endpoints=mirrored)

@@ -355,7 +355,7 @@ def test_a_strip_is_sampled_bilinearly_up_to_its_border() -> None:
 def test_strings_in_one_plane_leave_the_cameras_above_and_below_it_possible() -> None:
     """Strings in one plane do not exclude the cameras above and below this plane.
 
-    Six side panels determine only the azimuth of the Sun. The error of its elevation is not limited.
+    Six side panels determine only the azimuth of the Sun. The error of the Sun's elevation is not limited.
     """
     direction, basis = np.array([1.0, 0.0, 0.0]), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     coarse = CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.diag([1e-4, 1e6]))

@@ -263,7 +263,7 @@ def test_logarithmic_and_linear_frames_saturate_in_the_core_and_nowhere_in_the_d
 def test_a_sun_at_a_right_angle_to_the_boresight_leaves_no_disc(aside: float) -> None:
     """A Sun at 90 deg from the boresight gives no disc in the image.
 
-    Without lens distortion, the coordinates of its image exceed the range of integers.
+    Without lens distortion, the coordinates of the Sun's image exceed the range of integers.
     """
     model = EarthCameraModel.fuga15d(scatter=0.0, k1=-0.05, k2=0.01)
     boresight = np.array([0.0, 1.0, 0.0])

@@ -241,9 +241,9 @@ def test_where_a_line_hits_lies_on_the_ellipsoid_and_on_the_line() -> None:
 
 
 def test_the_sunlit_limb_has_half_its_brightness_at_the_published_height() -> None:
-    """The brightness of the sunlit limb falls to half at the published height.
+    """At the published height, the sunlit limb has half the brightness of the ground's tangent point.
 
-    Along an image column, the brightness is compared with that at the tangent point of the ground.
+    The brightness is compared along an image column.
     """
     scene = limb_scene(600e3, zenith=np.array([0.3, 0.2, 0.9]), sun=np.array([0.5, 0.2, 0.8]))
     narrow = EarthCameraModel.fuga15d(scatter=0.0, blur=0.0, field_of_view=np.radians(8.0))

@@ -1,4 +1,4 @@
-"""Tests of upsets of registers and of a delayed current monitor: effects, and corrections by drivers."""
+"""Tests of register upsets and of a delayed current monitor: their effects, and corrections by drivers."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_the_monitors_calibration_is_used_by_nobody() -> None:
         (75, 0),  # no port
         (75, 9),  # ports that do not exist
         (75, 20),  # rate above the capacity of the line
-        (75, 24),  # an output that is too infrequent for any use
+        (75, 24),  # an output that is too infrequent for any user
         (75, 32),  # output without any group
         (75, 41),  # an output group that the VN-100 does not have
         (75, 52),  # without the attitude

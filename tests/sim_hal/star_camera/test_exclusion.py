@@ -100,7 +100,7 @@ def test_a_buffer_widens_both() -> None:
 def test_the_earth_hides_what_is_behind_it(target: tuple[float, float, float], hidden: bool) -> None:
     """An object is hidden exactly if the line of sight to it passes through the Earth.
 
-    The reference is the point closest to the Earth's centre of 100,000 points of this line.
+    The reference is the smallest distance from the Earth's centre of 100,000 points on the line.
     """
     end = np.array([target])
     way = CAMERA + np.linspace(0.0, 1.0, 100_001)[:, None] * (end - CAMERA)

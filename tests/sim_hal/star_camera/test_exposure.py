@@ -346,9 +346,9 @@ def test_streaks_that_an_edge_cuts_are_exact(start: tuple[float, float]) -> None
 
 
 def test_a_track_under_a_rolling_shutter_is_a_star_under_the_opposite_turn() -> None:
-    """Under a rolling shutter, an object that moves relative to a camera at rest has the image of a star.
+    """Under a rolling shutter, an object that passes a camera at rest has the image of a star.
 
-    The star is in a camera that rotates in the opposite sense.
+    The image is that of a star in a camera that rotates in the opposite sense.
     """
     times, attitudes = _history(np.array([100.0, -120.0, 0.0]) / ROLLING_FOCAL, 23)
     star = at_pixels(ROLLING_MODEL, [40.0, 40.0])
@@ -401,7 +401,7 @@ def test_stars_far_down_streak_later() -> None:
 
 
 def test_a_streak_that_runs_down_after_the_shutter_is_longer_and_brighter_in_all() -> None:
-    """A star that moves down with the shutter is exposed 1 / (1 - 0.08) times longer than a row.
+    """A star that moves down with the shutter is exposed for 1 / (1 - 0.08) times the exposure of a row.
 
     The streak of the star is longer and brighter by the factor 1 / (1 - 0.08). The star moves at 400 px/s,
     and the readout takes 0.2 ms per line.

@@ -234,7 +234,7 @@ def test_wrong_use_is_one_line(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(os, "nice", int)  # this process keeps its priority for the tests that follow
+    monkeypatch.setattr(os, "nice", int)  # the tests that follow need the normal priority of this process
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     keys = f"{lines['place']}/keys/ground"
     assert main([word.format(keys=keys) for word in words]) == 2

@@ -37,7 +37,7 @@ class Seen:
         self.told.append((kind.name, text))
 
     def fly(self, begin: int, end: int, currents: FloatArray | None, noise: float = 1e-9) -> bool:
-        """Run for some seconds with string readings; return whether the last cycle drove the coils."""
+        """Run for some seconds with string readings; return whether the coils were driven in the end."""
         acted = False
         for tenth in range(10 * begin + 1, 10 * end):
             now_ns = tenth * SECOND_NS // 10

@@ -169,7 +169,7 @@ class Flight:
 @pytest.mark.parametrize("age", [1, 6, 14, 30, 60])
 @pytest.mark.parametrize("drag", [" 25000-3", " 50000-3"])
 def test_good_fixes_win_over_old_elements_and_a_jump_of_the_receiver_is_refused(age: int, drag: str) -> None:
-    """Good fixes replace elements that are 1 to 60 days old, and then refute a jump of the receiver by 40 km.
+    """Good fixes replace elements that are 1 to 60 days old, and a jump of 40 km is then refused.
 
     The elements have B* 0, but the satellite has B* 2.5e-4 or 5e-4. Each fix is compared with earlier fixes.
     """

@@ -62,7 +62,7 @@ def around(_: int) -> FilterEnvironment:
 
 
 class Flown:
-    """A simulated body with coils and its filter; each reading follows several Euler steps."""
+    """A simulated body with coils, and its filter. Several Euler steps are integrated before each reading."""
 
     def __init__(
         self, pulses: bool = False, errors: BodyErrors | None = None, slow: SlowStates | None = None

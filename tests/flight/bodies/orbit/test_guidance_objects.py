@@ -115,7 +115,7 @@ def chase(craft: tuple[FloatArray, float], rate: float, begin: float) -> Chase:
     up = strength / np.linalg.norm(strength)
     first = np.cross(up, np.array([0.3, -0.5, 0.8]))
     first /= np.linalg.norm(first)
-    # With the boresight along the field, the coils can rotate the boresight about both perpendicular axes.
+    # If the boresight is along the field, the coils can rotate it about both axes normal to the field.
     rows = np.stack([first, -up, np.cross(first, -up)])
     return Chase(*craft, rate, begin, from_matrix(rows), first)
 

@@ -1,4 +1,4 @@
-"""Tests of the testbed without a gyro: angle from the magnetometer, coil field, and control by covariance."""
+"""Tests of the testbed without a gyro: angle from the magnetometer, field of the coils, and control."""
 
 from __future__ import annotations
 

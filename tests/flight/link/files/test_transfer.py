@@ -190,7 +190,7 @@ def test_what_is_wrong_with_a_file_ends_its_transfer(
 
 
 def test_bytes_beyond_the_end_that_came_before_the_metadata_are_left_out_of_the_file(tmp_path: Path) -> None:
-    """File data beyond the stated size is a file size error, whichever of the two arrives first.
+    """File data beyond the stated file size is an error, even if the data arrive before the size.
 
     CCSDS 727.0-B-5, 4.6.1.2, states this rule.
     """

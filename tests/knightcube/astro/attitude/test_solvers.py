@@ -118,8 +118,8 @@ def test_directions_without_noise_give_the_true_attitude(name: str) -> None:
             true = sight(rng, n, half_field, 1e-5, angle)
             exact = true.reference @ attitude_matrix(true.quaternion).T
             fix = SOLVERS[name](unit(exact), true.reference, true.sigma)
-            # Directions have a rounding error of 1e-16. The error of the rotation about the boresight is this
-            # error divided by the separation.
+            # Directions have a rounding error of 1e-16. The error of the rotation about the boresight is the
+            # rounding error divided by the separation of the stars.
             assert angle_between(fix.quaternion, true.quaternion) < 1e-15 / np.sqrt(_least_eigenvalue(true))
 
 
@@ -128,7 +128,8 @@ def test_directions_without_noise_give_the_true_attitude(name: str) -> None:
 def test_half_a_turn_about_any_axis_is_solved(name: str, axis: tuple[int, int, int]) -> None:
     """Rotations by 180 deg about any axis are solved.
 
-    The axis may be the boresight, or be normal to the boresight, which the rotation then reverses.
+    The axis may be the boresight. If the axis is normal to the boresight, the rotation reverses the
+    boresight.
     """
     q = from_rotation_vector(np.pi * unit(np.array(axis, dtype=float)))
     drawn = np.random.default_rng(63).normal(size=(6, 3)) * [_FIELD, _FIELD, 0.0]

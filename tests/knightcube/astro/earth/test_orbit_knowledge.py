@@ -50,7 +50,7 @@ def test_the_frame_of_sgp4_is_turned_into_the_frame_of_the_stars_as_published() 
     np.testing.assert_allclose(mean_equator_to_celestial(date, -0.4399619) @ teme, celestial, atol=40.0)
     terrestrial = 1e3 * np.array([-1033.4793830, 7901.2952754, 6380.3565958])
     found = celestial_to_terrestrial(date, -0.4399619) @ celestial
-    # In 2004, TT was 64.184 s ahead of UTC, and not 69.184 s as assumed. The difference hardly changes
+    # In 2004, TT was 64.184 s ahead of UTC, and not 69.184 s as assumed. The difference of 5 s hardly changes
     # precession and nutation.
     np.testing.assert_allclose(found, terrestrial, atol=40.0)
 

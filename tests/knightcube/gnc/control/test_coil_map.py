@@ -239,7 +239,7 @@ def test_two_coils_make_the_same_torque_unless_the_failed_axis_is_normal_to_the_
 def test_a_torque_that_would_take_all_the_current_is_discarded(sine: float, kept: bool) -> None:
     """Without coil y, a torque that would take nearly all the current is discarded.
 
-    The sine is that of the angle between the field and the x-z plane.
+    The tested fields are at small angles from the x-z plane, whose sines are given.
     """
     field = 3e-5 * np.array([np.sqrt(1.0 - sine**2), sine, 0.0])
     weak = np.array([0.0, 0.0, 1e-8])

@@ -52,7 +52,7 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
 def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: AngleController) -> None:
     """After a step of 0.1 rad, which is within the coil's limit, the error is below 0.15 deg.
 
-    The gains of the adaptive controller have then adapted to its errors.
+    The adaptive controller has adapted its gains by then.
     """
     rows = fly(controller, replace(THREAD, stiffness=1e-5), held(0.1), 60.0)
     assert largest_error(rows, 0.1, 10.0) < 0.15
@@ -103,7 +103,7 @@ def test_a_name_means_its_controller(name: str) -> None:
 def test_only_the_lq_tracker_feeds_the_estimated_disturbance_forward() -> None:
     """Only the LQ tracker compensates the estimated disturbance, by J / (n A B) = 3.6 A per rad/s^2.
 
-    The factor is the current per acceleration at theta = 0.
+    J / (n A B) is the current per acceleration at theta = 0.
     """
     rest = PathSample(0.0, 0.0, 0.0)
     for name in KINDS:

@@ -216,9 +216,9 @@ def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
 
 
 def test_a_spin_of_a_turn_in_two_seconds_is_braked() -> None:
-    """A spin of half a turn per second is damped. Only the samples within a pause show the rate.
+    """A spin of half a turn per second is damped. The samples within a pause of the coils show the rate.
 
-    The body rotates by 180 deg between two pauses.
+    Samples of different pauses do not show it, because the body rotates by 180 deg between two pauses.
     """
     speeds = fly(np.array([2.0, -2.4, 0.3]), 60.0)
     assert speeds[-1] < 0.95 * speeds[0]

@@ -98,7 +98,10 @@ def test_a_large_error_is_approached_no_faster_than_the_coil_brakes(sign: float)
 
 
 def test_a_disturbance_reduces_the_braking_down_to_a_twentieth_of_the_torque() -> None:
-    """A larger disturbance slows the approach, down to the rate for a twentieth of the torque."""
+    """A larger disturbance slows the approach to the target, down to a minimum rate.
+
+    The minimum is the rate at which a twentieth of the torque can stop the body.
+    """
     tracker, wanted = LqTracker(PLANT, 20.0, 1.0), PathSample(0.5, 0.0, 0.0)
 
     def wish(disturbance: float) -> float:

@@ -227,7 +227,7 @@ def test_on_a_known_body_the_rest_is_the_rest_of_the_running_plan(table: Pointin
 def test_a_rest_that_costs_far_more_heat_is_not_flown(table: PointingTable) -> None:
     """A new plan that needs several times the heat of the current path is not used.
 
-    Near the end of a slew, a correction of 3 deg would need so much heat.
+    Near the end of a slew, a correction of 3 deg would need several times the heat.
     """
     assert table.slew is not None
     since = 0.8 * table.slew.horizon

@@ -342,7 +342,7 @@ def test_an_attitude_that_wraps_round_is_a_small_innovation() -> None:
 def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
     """A cycle takes less than 1 ms of processor time, and a replay of 1.6 s less than 40 ms.
 
-    The expected averages are half of these bounds: 0.5 ms and 20 ms.
+    The expected averages, 0.5 ms and 20 ms, are half of the tested bounds.
     """
     flight = fly(14, 400, suspended)
     filter_ = begin(flight, suspended)

@@ -99,7 +99,7 @@ def test_a_contradicted_estimate_expects_the_error_of_the_start_again() -> None:
 def test_without_stars_the_attitude_is_off_by_what_is_claimed(sigma: float) -> None:
     """After 1,000 s without stars, the attitude error agrees with its covariance.
 
-    The body has five such intervals, with 300 s of star attitudes before each.
+    The body has five intervals without stars, each after 300 s with star attitudes.
     """
     nees, claims, sky = [], [], copy.deepcopy(flown_with_stars(sigma))
     for _ in range(5):

@@ -329,7 +329,7 @@ def test_a_dipole_that_acts_late_in_a_step_rotates_the_body_less() -> None:
 def test_a_dipole_that_changes_within_a_step_acts_in_the_field_of_its_own_time() -> None:
     """A dipole that changes within a step acts in the field at its own time, not in the field at mid-step.
 
-    The field in the axes of a rotating body differs between these times.
+    In the axes of a rotating body, the field at the end of a step differs from the field at mid-step.
     """
     spin, dipole = np.array([0.05, -0.1, 0.08]), np.array([0.09, -0.05, 0.02])
     rates = []

@@ -88,7 +88,7 @@ def test_adrift_the_two_filters_agree_to_rounding() -> None:
 
 
 def test_driven_they_differ_by_what_the_single_axis_leaves_out() -> None:
-    """With driven coils, the covariances of both filters differ by 0.5 %.
+    """With driven coils, the covariances of the three-axis and the single-axis filter differ by 0.5 %.
 
     The single-axis filter ignores in its covariance that the torque changes with the angle.
     """

@@ -85,7 +85,10 @@ def test_the_prey_joins_both_states(
 
 
 def test_coefficients_are_those_of_equations_5_37_and_5_38() -> None:
-    """From 0.4 with 0.01 to -0.3 at rest in 10 s: C2 = [3 (-0.7) - 0.2]/100 and C3 = (-0.01 + 0.46)/300."""
+    """From q2 = 0.4 with the rate 0.01 to -0.3 at rest in 10 s, the coefficients follow from 5.37 and 5.38.
+
+    C2 = [3 (-0.7) - 0.2]/100, and C3 = (-0.01 + 0.46)/300.
+    """
     prey = CubicPrey.between(0.4, 0.01, -0.3, 0.0, 10.0)
     assert (prey.c0, prey.c1) == (0.4, 0.01)
     assert prey.c2 == pytest.approx(-0.023, abs=1e-15)

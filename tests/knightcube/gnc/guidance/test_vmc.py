@@ -94,9 +94,9 @@ def test_the_twenty_known_problems_are_solved_to_their_optimum() -> None:
 def bang_bang_time(problem: Problem) -> float:
     """Return the shortest time (s) without a thread, by full torque in one direction and then in the other.
 
-    The energy determines the angle of the switch, because J w^2/2 changes by the torque constant times I
-    times the change of sin(theta). The time is the integral of d(theta)/w. The substitution theta = end + x^2
-    removes the singularity at each end.
+    The energy determines the angle at which the torque is reversed, because J w^2/2 changes by the torque
+    constant times I times the change of sin(theta). The time is the integral of d(theta)/w. The substitution
+    theta = end + x^2 removes the singularity at each end.
     """
     pull = problem.plant.torque_constant * problem.plant.current_limit / problem.plant.inertia
     start, end = angle_of(problem.start_q2), angle_of(problem.end_q2)

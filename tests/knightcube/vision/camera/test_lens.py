@@ -146,8 +146,8 @@ def test_the_boresight_falls_between_the_middle_pixels() -> None:
 def test_the_field_of_view_ends_at_the_outer_edge_of_the_outermost_pixel() -> None:
     """The field of view ends at the outer edge of the outermost pixel, half the columns from the centre.
 
-    Sease, section 2.4, defines the field of view in this way. Coordinate 0 is the centre of a pixel, whose
-    edge is at -0.5.
+    The definition is that of Sease, section 2.4. Coordinate 0 is the centre of a pixel, whose edge is at
+    -0.5.
     """
     edge = np.radians(10.0)
     points = CAMERA.project(np.array([[np.sin(edge), 0.0, np.cos(edge)], [-np.sin(edge), 0.0, np.cos(edge)]]))
@@ -182,7 +182,7 @@ def test_projection_does_not_depend_on_distance(x: float, y: float, distance: fl
 def test_a_direction_behind_the_camera_has_no_pixel(x: float, y: float) -> None:
     """A direction behind the camera has no pixel, although its opposite projects to a pixel.
 
-    The errata correct section 2.1 of the thesis, in which both directions project to one pixel.
+    The errata correct section 2.1 of the thesis, by which opposite directions project to the same pixel.
     """
     behind = CAMERA.project(-CAMERA.unit_vectors(np.array([[x, y]])))
     assert np.all(np.isnan(behind))

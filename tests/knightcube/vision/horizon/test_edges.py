@@ -60,7 +60,7 @@ def test_an_edge_is_placed_at_its_steepest_point_at_the_scale_that_covers_it(
     assert edges.points[:, 1].tolist() == CENTRES.tolist() == lines.rows.tolist() == lines.columns.tolist()
     assert edges.towards.tolist() == [[1.0, 0.0]] * 8
     assert edges.scale.tolist() == [scale] * 8
-    # The same edge is tested in the vertical direction, with the bright side above.
+    # The edge is also tested in the vertical direction, with the bright side above.
     upright, _ = find_edges(step(130.3, width).T[::-1], FEW)
     assert upright.points[:, 1] == pytest.approx(np.full(8, SIZE - 1 - 130.3), abs=0.02 + 0.01 * width)
     assert upright.towards.tolist() == [[0.0, -1.0]] * 8
@@ -117,9 +117,10 @@ def test_levels_are_those_of_a_dark_and_a_bright_half_and_the_noise_of_the_dark(
 
 @pytest.mark.parametrize(("lit", "found"), [(7, False), (8, True)])
 def test_fewer_than_sixteen_lit_pixels_are_a_star(lit: int, found: bool) -> None:
-    """Fewer than sixteen lit samples are a star. Each pixel is sampled twice: in its row and in its column.
+    """Fewer than sixteen lit samples are taken as a star, not as the Earth.
 
-    Seven pixels thus count as 14 samples, and eight pixels as 16.
+    Each pixel is sampled twice: in its row and in its column. Seven pixels thus count as 14 samples, and
+    eight pixels as 16.
     """
     image = np.random.default_rng(2).normal(10.0, 1.0, (32, 64))
     image[10, 20 : 20 + lit] = 100.0
@@ -148,8 +149,8 @@ def test_pixels_above_three_tenths_of_the_span_are_bright(grey: float, place: fl
 def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, lit: bool) -> None:
     """Pixels within six sigma of the dark pixels are not bright.
 
-    A quarter of the image at 100 sigma determines the brightness span, and 1 % of this span is below the
-    noise.
+    A quarter of the image has a brightness of 100 sigma and determines the brightness span. One per cent of
+    this span is below the noise.
     """
     noise = np.random.default_rng(3).normal(0.0, 1.0, (SIZE, SIZE))
     image = bars(0.0, sigmas, 0.0, 100.0) + noise

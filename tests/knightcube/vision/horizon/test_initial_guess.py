@@ -195,7 +195,7 @@ def test_a_direction_along_nadir_gives_no_rotation(lever: float, known: bool) ->
 def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
     off_deg: float, accepted: bool
 ) -> None:
-    """An exact direction may deviate from a guessed nadir by four times the guess's error of 0.2 deg.
+    """A direction without error may deviate from a guessed nadir by four times 0.2 deg, the guess's error.
 
     In flight, initial guesses of nadir are wrong by up to 0.3 deg.
     """
@@ -206,7 +206,7 @@ def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
         error = side * math.radians(off_deg) * axis
         found = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, 1e-6, error),)))
         assert (found.mismatch <= MOST_MISMATCH) is accepted
-        # With a sensor error of one degree, the same deviation is less than one standard deviation.
+        # With a sensor error of one degree, the tested deviation is less than one standard deviation.
         coarse = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, math.radians(1.0), error),)))
         assert coarse.mismatch == pytest.approx(off_deg / math.hypot(1.0, 0.2), rel=1e-6)
 
@@ -297,9 +297,9 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
 
 @pytest.mark.parametrize("altitude", [250e3, 700e3, 1900e3])
 def test_the_errors_of_the_spherical_model_are_those_of_limbs_of_the_ellipsoid(altitude: float) -> None:
-    """The errors of the spherical model are those of limbs of the ellipsoid, seen from all over a sphere.
+    """The stated errors of the spherical limb model cover its deviations from the limb of the ellipsoid.
 
-    The truth is the circular cone through the limb of the ellipsoid.
+    The positions are all over a sphere, and the truth is the circular cone through the limb of the ellipsoid.
     """
     count = 300
     height = (2.0 * np.arange(count) + 1.0) / count - 1.0

@@ -1,4 +1,4 @@
-"""Tests of the limb model: tangents by another method, gradients, and covariance by many fits."""
+"""Tests of the limb model by another method, finite differences, and the covariance of many fits."""
 
 from __future__ import annotations
 

@@ -513,7 +513,7 @@ def test_a_star_is_explained_as_well_without_an_object_as_with_one() -> None:
 
 
 def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
-    """A segment that another star's streak continues may be the beginning of a star's streak.
+    """A segment is accepted as a part of a star's streak although another star's streak continues it.
 
     Two star streaks on one line overlap by a fifth of their length.
     """
@@ -535,7 +535,7 @@ def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
 def test_a_spot_among_streaks_is_a_short_region_in_its_place() -> None:
     """A spot among streaks is a short region at its true position.
 
-    Spot and region are far from the left and upper borders of the frame.
+    Both the spot and the box of its region are far from the left and upper borders of the frame.
     """
     rng = np.random.default_rng(4)
     image = rng.normal(100.0, 2.0, (200, 300))

@@ -76,7 +76,7 @@ def test_a_point_on_a_star_remains_and_is_measured() -> None:
 def test_a_line_across_a_star_remains_with_its_ends() -> None:
     """After the subtraction of a star, the streak of an object that crosses the star keeps its ends.
 
-    The star covers the middle of the streak, and the ends are located by all of its remaining light.
+    The star covers the middle of the streak, and the ends are located by all remaining light of the streak.
     """
     ends = np.array([[230.2, 226.4], [255.7, 253.1]])
     middle = _CAMERA.pinhole.unit_vectors(np.array([[240.3, 238.7]]))[0]

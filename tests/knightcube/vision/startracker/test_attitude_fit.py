@@ -72,8 +72,8 @@ def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
 def test_the_covariance_and_the_residuals_agree_with_many_fits(free_scale: bool) -> None:
     """The mean chi-squares of 400 fits with 12 stars agree with their degrees of freedom.
 
-    The attitude has 3 degrees of freedom, and the residuals have 21. With the scale, these numbers are 4 and
-    20.
+    The attitude has 3 degrees of freedom, and the residuals have 21. If the scale is fitted too, attitude and
+    scale have 4 degrees of freedom, and the residuals have 20.
     """
     draw = np.random.default_rng(2)
     seen, parameters = directions(12), 4 if free_scale else 3

@@ -101,7 +101,7 @@ def test_a_rotated_sky_has_the_same_triangles() -> None:
     """A rotated sky has the same triangles, despite rounding errors.
 
     A star is a corner only of triangles that are smaller than its range, the distance to a brighter
-    neighbour. Rounding errors of this distance must not change the choice.
+    neighbour. Rounding errors of the range must not change the choice of triangles.
     """
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])

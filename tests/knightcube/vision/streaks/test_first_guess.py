@@ -66,9 +66,10 @@ def test_a_scan_along_the_circles_gives_the_angle_nearest_to_a_prior_first() -> 
 
 @pytest.mark.parametrize("growth", [1.5, -1.5])
 def test_the_asymmetry_of_regions_shows_a_change_of_the_rate(growth: float) -> None:
-    """The asymmetry of the regions shows a change of the rate, relative to the rotation.
+    """The asymmetry of the regions shows whether the rate increases or decreases during the exposure.
 
-    The guessed axis may be opposite to the true axis, so the sign of the change is relative to the rotation.
+    The guessed axis may be opposite to the true axis, so the change has a sign relative to the guessed
+    rotation.
     """
     rotation = turn_of(np.radians(70.0), 120.0, 0.4)
     scene = taken(np.random.default_rng(74), rotation, growth * rotation, 0.5)

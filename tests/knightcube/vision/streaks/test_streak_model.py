@@ -116,8 +116,8 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
 def test_strips_extend_beyond_both_ends_for_any_times() -> None:
     """Strips extend beyond both ends for any times.
 
-    With a rolling shutter, the times of a streak are arbitrary. Both ends have the same number of additional
-    pixels.
+    With a rolling shutter, the times of a streak are arbitrary. The strips have the same number of additional
+    pixels at both ends.
     """
     motion, star = CameraMotion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
     rng = np.random.default_rng(11)
@@ -193,7 +193,7 @@ def test_velocities_with_the_sensitivities_equal_those_of_the_paths(growth: list
 
 
 def test_the_rotation_of_a_changing_rate_equals_many_small_rotations() -> None:
-    """The rotation at a changing rate (Magnus expansion) equals 4,000 rotations at constant rates."""
+    """The rotation at a changing rate (Magnus expansion) equals 4,000 short rotations at constant rates."""
     motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.15, 0.1]))
     vector = np.array([0.02, -0.03, 1.0])
     steps = 4000

@@ -58,9 +58,9 @@ def test_an_exact_camera_has_no_errors() -> None:
 def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
     """A wrong image centre appears as a rotated rate vector.
 
-    A shift by dx is, to first order, a rotation by dx / f about y. Only half of this rotation appears in the
-    rate. The shift also changes the motion field in the image to second order, which cancels the effect on
-    one of the two components of the motion. The factor of one half holds for stars on a square.
+    A shift by dx is, to first order, a rotation by dx / f about y. Only half of the rotation by dx / f
+    appears in the rate. The shift also changes the motion field in the image to second order, which cancels
+    the effect on one of the two components of the motion. The factor of one half holds for stars on a square.
     """
     focal = CAMERA.pinhole.focal_length
     found = _together(*_seeming(replace(EXACT, centre=5.0)))
@@ -107,7 +107,8 @@ def test_a_shutter_counts_as_unstated_unless_line_time_or_accuracy_is_given() ->
 def test_significant_calibration_errors_are_corrected_and_others_widen_the_covariance() -> None:
     """Significant calibration errors are corrected, and other errors increase the covariance.
 
-    A distortion of 1 %, a hundred times the noise, is corrected. An error that may be due to chance is not.
+    A distortion of 1 %, a hundred times the noise, is corrected. An error that may be due to chance is not
+    corrected.
     """
     seeming, information = _seeming(replace(EXACT, distortion=0.01))
     precise = 1e4 * information
