@@ -20,7 +20,6 @@ from flight.schema.devices import (
     Gps,
     InertialUnitSection,
     PowerMonitorSection,
-    Sensor,
     SensorsSection,
     SolarStringsSection,
     axis_matrix,
@@ -289,23 +288,20 @@ def emulate_sensors(emulation: Emulation, unit: SensorsSection) -> tuple[Any, ..
             quantity: axis_matrix(names).T @ to_unit for quantity, names in sensor.measures.items()
         }
         measured = Measurements(emulation.sense, axes, emulation.generator, emulation.now_ns)
-        part = _emulator(sensor, f"{emulation.kind}.sensors[{number}]", measured)
+        key = f"{emulation.kind}.sensors[{number}].emulator"
+        place = SENSOR_PARTS.get(sensor.part, sensor.part)
+        part: Any
+        if sensor.emulator is not None:
+            part = imported(key, sensor.emulator, {}, os.environ)(measured, sensor)
+        elif place in EMULATORS:
+            part = EMULATORS[place](sensor.address or _ADDRESSES.get(place, 0), measured)
+        else:
+            known = ", ".join(SENSOR_PARTS)
+            problem = f"is missing: only {known} have a built-in emulator; name your own by `emulator`"
+            raise ConfigError(key, problem)
         made.append(part)
         if sensor.spi is not None:
             emulation.wires.spi_devices[sensor.spi] = part
         else:
             emulation.wires.i2c(sensor.bus).attach(part)
     return tuple(made)
-
-
-def _emulator(sensor: Sensor, key: str, measured: Measurements) -> Any:
-    place = SENSOR_PARTS.get(sensor.part, sensor.part)
-    if sensor.emulator is not None:
-        return imported(f"{key}.emulator", sensor.emulator, {}, os.environ)(measured, sensor)
-    if place not in EMULATORS:
-        known = ", ".join(SENSOR_PARTS)
-        raise ConfigError(
-            f"{key}.emulator",
-            f"is missing: only {known} have a built-in emulator; name your own by `emulator`",
-        )
-    return EMULATORS[place](sensor.address or _ADDRESSES.get(place, 0), measured)

@@ -370,7 +370,9 @@ class RemoteFrameSource:
             while self._link.pending() or select.select([self._link], [], [], 0.0)[0]:
                 _, kind, result, text = self._link.receive()
                 if kind == "frame":
-                    newest = self._read(result, text)
+                    sequence, start_ns, exposure_ns, shape, dtype = result
+                    pixels = np.fromfile(self._folder / text, dtype=dtype).reshape(shape)
+                    newest = Frame(sequence, start_ns, exposure_ns, self._clock.now_ns(), pixels)
                 elif kind != "done":
                     raise NotResponding("camera", text)
         except OSError as error:
@@ -380,11 +382,6 @@ class RemoteFrameSource:
     def close(self) -> None:
         """Close the connection."""
         self._link.close()
-
-    def _read(self, description: list[Any], name: str) -> Frame:
-        sequence, start_ns, exposure_ns, shape, dtype = description
-        pixels = np.fromfile(self._folder / name, dtype=dtype).reshape(shape)
-        return Frame(sequence, start_ns, exposure_ns, self._clock.now_ns(), pixels)
 
 
 class ServedWires:

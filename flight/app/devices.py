@@ -62,7 +62,7 @@ from hal.drivers.current_monitors import (
 )
 from hal.drivers.gps import EARLIEST_NS, NmeaReceiver, UbloxReceiver
 from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL, MODE1, Pca9685
-from hal.drivers.sensor_unit import CircuitPythonI2c, SensorPart, SensorUnit, SensorUnitSettings
+from hal.drivers.sensor_unit import CircuitPythonI2c, SensorPart, SensorUnit, UnitSettings
 from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.drivers.vn100 import Vn100, Vn100Settings
 from hal.interfaces.devices import (
@@ -355,7 +355,7 @@ def open_sensors(rig: Rig, unit: SensorsSection) -> SensorUnit:
             f"{kind}.sensors", "do not measure the magnetic field: add a sensor that measures `magnetic`"
         )
     known = unit.calibration
-    settings = SensorUnitSettings(
+    settings = UnitSettings(
         mounting=attitude_matrix(np.array(unit.mounting)),
         gyro_matrix=np.array(known.gyro_matrix),
         field_matrix=np.array(known.field_matrix),

@@ -128,10 +128,7 @@ class ServedCamera:
         self._ticker = clock.ticker(f"camera {device.name}", PERIOD_NS, self._serve)
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start one exposure now and abandon an exposure in progress.
-
-        Raises NotResponding while the camera is lost, and OutOfRange for an unsupported exposure time.
-        """
+        """Start one exposure now and abandon an exposure in progress. Raises NotResponding or OutOfRange."""
         self._device.check(exposure_ns)
         with self._lock:
             self._raise_failure()
@@ -139,10 +136,7 @@ class ServedCamera:
         self._ticker.kick()
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, or None without a new frame. Never blocks.
-
-        Raises DeviceError while the camera is lost.
-        """
+        """Return the newest finished frame once, or None. Raises DeviceError while the camera is lost."""
         with self._lock:
             frame, self._frame = self._frame, None
             if frame is None:

@@ -434,11 +434,7 @@ class PwmTorqueCoils:
         self._state_key: tuple[object, ...] = ()
 
     def start(self, patient: bool = False) -> None:
-        """Configure the PWM chip with all outputs off.
-
-        Raises DeviceError if the chip does not answer or refuses a value. If `patient` is true, the failure
-        is reported by `state` instead, and the driver keeps trying.
-        """
+        """Configure the PWM chip; a `patient` driver reports a failure by `state` and keeps trying."""
         with self._wire:
             try:
                 self._outputs.set_up()
@@ -455,10 +451,10 @@ class PwmTorqueCoils:
                 self._ticker = self._clock.ticker(DEVICE, SERVE_PERIOD_NS, self._serve)
 
     def command(self, currents: FloatArray) -> None:
-        """Request the current of each coil (n,), A. Never waits for the bus.
+        """Request the current of each coil (n,), A, as `hal.interfaces.devices.TorqueCoils` describes.
 
-        Larger currents are reduced to the limit. For an array of a wrong shape or a value that is not finite,
-        the coils are set to zero and OutOfRange is raised. Raises Refused before `start` and after `close`.
+        A wrong shape has the effect of a value that is not finite. Raises Refused before `start` and after
+        `close`.
         """
         values = np.asarray(currents, dtype=np.float64)
         problem = self._problem(values)
@@ -484,10 +480,7 @@ class PwmTorqueCoils:
         ticker.kick()
 
     def brake(self, axes: Axes) -> None:
-        """Brake the given bridges: hold both inputs high, whatever currents are commanded.
-
-        Never waits for the bus. Raises Refused before `start` and after `close`.
-        """
+        """Brake the given bridges. Never waits. Raises Refused before `start` and after `close`."""
         with self._mailbox.lock:
             ticker = self._ticker
             if ticker is None or not self._running:
@@ -496,10 +489,7 @@ class PwmTorqueCoils:
         ticker.kick()
 
     def off(self) -> None:
-        """Set all coils to zero now, and return after a successful write or after the last retry.
-
-        Never raises. A pending command is withdrawn, so that the coils stay off until the next command.
-        """
+        """Set all coils to zero now, and withdraw a pending command. Never raises."""
         self._mailbox.withdraw()
         held = self._wire.acquire(timeout=_OFF_PATIENCE)
         try:
@@ -529,10 +519,7 @@ class PwmTorqueCoils:
             return self._state
 
     def close(self) -> None:
-        """Stop the job and set the coils to zero, while the shared bus stays open.
-
-        Calling `close` again has no effect.
-        """
+        """Stop the job and set the coils to zero; the shared bus stays open. A second call has no effect."""
         with self._mailbox.lock:
             was_running, self._running = self._running, False
             ticker, self._ticker = self._ticker, None

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -95,40 +95,46 @@ class SensorPart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SensorUnitSettings:
-    """Settings of an inertial unit of separate sensors.
+class UnitSettings:
+    """Settings of an inertial unit.
 
     Attributes:
         mounting: (3, 3) rotation matrix from unit axes into body axes.
         gyro_matrix: (3, 3) matrix from the rate to the rate that the gyro measures, body axes.
-        field_matrix: (3, 3) matrix from the field to the field that the magnetometer measures, body axes.
+        field_matrix: (3, 3) matrix from the magnetic field to the field that the magnetometer measures,
+            without its bias, body axes.
         field_bias: (3,) bias of the magnetometer, T, body axes.
         rate_hz: samples per second.
-        field_range: largest accepted magnetic field per axis, T.
         rate_range: largest accepted body rate per axis, rad/s.
+        field_range: largest accepted magnetic field per axis, T.
     """
 
     mounting: FloatArray
-    gyro_matrix: FloatArray
-    field_matrix: FloatArray
-    field_bias: FloatArray
+    gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    field_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    field_bias: FloatArray = field(default_factory=lambda: np.zeros(3))
     rate_hz: int
-    field_range: float
     rate_range: float = math.radians(2000.0)
+    field_range: float
+
+    def body_maps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the matrices (3, 3) from measured rate and field to those of the body, and an offset (3,), T.
+
+        The offset, which the bias causes, is subtracted from the field in body axes.
+        """
+        gyro, magnetometer = (
+            np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in (self.gyro_matrix, self.field_matrix)
+        )
+        return gyro @ self.mounting, magnetometer @ self.mounting, magnetometer @ self.field_bias
 
 
 class SensorUnit:
     """Inertial unit of separate sensors, which implements `hal.interfaces.devices.InertialUnit`."""
 
-    def __init__(self, clock: Clock, parts: Sequence[SensorPart], settings: SensorUnitSettings) -> None:
+    def __init__(self, clock: Clock, parts: Sequence[SensorPart], settings: UnitSettings) -> None:
         self.name = "inertial unit"
         self._clock, self._parts, self._settings = clock, parts, settings
-        self._rate_map, field_map = (
-            np.linalg.inv(matrix) @ settings.mounting
-            for matrix in (settings.gyro_matrix, settings.field_matrix)
-        )
-        self._field_map = field_map
-        self._field_offset = np.linalg.inv(settings.field_matrix) @ settings.field_bias
+        self._rate_map, self._field_map, self._field_offset = settings.body_maps()
         self._drivers: list[Any] = []
         self._readings: list[ImuReading] = []
         self._lock = threading.Lock()

@@ -20,11 +20,12 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from hal.drivers.sensor_unit import UnitSettings
 from hal.drivers.vn100_protocol import (
     AsciiLine,
     BinaryPacket,
@@ -52,24 +53,17 @@ _LINE_LOAD_LIMIT = 0.8  # largest fraction of the serial line's capacity that me
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Vn100Settings:
+class Vn100Settings(UnitSettings):
     """Settings of the VN-100 driver.
+
+    A binary rate must divide 800, and an ASCII rate must be listed for register 7. The largest accepted field
+    is 6 gauss for the testbed's unit, and 2.5 gauss for current units.
 
     Attributes:
         attitude_map: (4, 4) matrix that maps the unit's quaternion (NED into sensor frame) to the project's
             quaternion (reference frame into body frame).
-        mounting: (3, 3) rotation matrix from sensor axes into body axes.
-        gyro_matrix: (3, 3) matrix from the rate to the rate that the gyro measures, body axes.
-        field_matrix: (3, 3) matrix from the magnetic field to the field that the magnetometer measures,
-            without its bias, body axes.
-        field_bias: (3,) bias of the magnetometer, T, body axes.
-        rate_hz: samples per second; a binary rate must divide 800, an ASCII rate must be listed for register
-            7.
         output: output format, either binary packets or ASCII VNQMR lines without device time.
         unit_port: number of the unit's serial port to which the cable is connected, 1 or 2.
-        rate_range: largest accepted body rate per axis, rad/s.
-        field_range: largest accepted magnetic field per axis, T; 6 gauss for the testbed's unit, 2.5 gauss
-            for current units.
         acceleration_range: largest accepted acceleration per axis, m/s^2.
         configure: whether the driver configures the unit; otherwise any output with a complete reading is
             accepted.
@@ -80,15 +74,8 @@ class Vn100Settings:
     """
 
     attitude_map: FloatArray
-    mounting: FloatArray
-    gyro_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
-    field_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
-    field_bias: FloatArray = field(default_factory=lambda: np.zeros(3))
-    rate_hz: int
     output: Literal["binary", "ascii"]
     unit_port: int = 1
-    rate_range: float = math.radians(2000.0)
-    field_range: float
     acceleration_range: float = 16.0 * STANDARD_GRAVITY
     configure: bool = True
     response_timeout_ns: int = 100_000_000
@@ -418,15 +405,13 @@ class ReadingConverter:
         self.not_finite = 0
         self.rejection = ""
         self._settings = settings
-        matrices = (settings.gyro_matrix, settings.field_matrix)
-        gyro, magnetometer = (np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in matrices)
+        rate_map, field_map, self._field_offset = settings.body_maps()
         # This matrix maps a whole sample in one product: quaternion, rate, magnetic field and acceleration.
         self._map: FloatArray = np.zeros((13, 13))
         self._map[:4, :4] = settings.attitude_map
-        self._map[4:7, 4:7] = gyro @ settings.mounting
-        self._map[7:10, 7:10] = magnetometer @ settings.mounting * TESLA_PER_GAUSS
+        self._map[4:7, 4:7] = rate_map
+        self._map[7:10, 7:10] = field_map * TESLA_PER_GAUSS
         self._map[10:, 10:] = settings.mounting
-        self._field_offset = magnetometer @ settings.field_bias
         self._byte_ns, self._on_reset = byte_ns, on_reset
         self._places: dict[bytes, _Places | None] = {}
         self._device_ns = 0
@@ -624,11 +609,10 @@ class Vn100:
         return ",".join(self._ask(Question("RRG", (1,))))
 
     def poll(self) -> list[ImuReading]:
-        """Return the samples since the last call, oldest first. Never blocks.
+        """Return the samples since the last call, oldest first. Raises NotResponding if the port is lost.
 
         If the unit sends no samples, the driver searches for the unit and configures it again, one command
-        per call. Corrupted and implausible packets are counted, see `link`. Raises NotResponding if the
-        serial port is lost.
+        per call.
         """
         items = self._receive()
         found = (self._converter.reading(item) for item in items)

@@ -18,7 +18,7 @@ from hal.drivers.sensor_unit import (
     Adis16470,
     SensorPart,
     SensorUnit,
-    SensorUnitSettings,
+    UnitSettings,
     level_attitude,
     quaternion_of,
 )
@@ -28,7 +28,7 @@ from sim_hal.clock import SimClock
 from sim_hal.emulators.sensors import EmulatedAdis16470, Measurements
 from sim_hal.worlds.world import BodyMotion, about_thread
 
-SETTINGS = SensorUnitSettings(
+SETTINGS = UnitSettings(
     mounting=np.eye(3),
     gyro_matrix=np.eye(3),
     field_matrix=np.eye(3),

@@ -52,7 +52,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "TrackSettings": (devices.ObjectTracking,),
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),
-    "SensorUnitSettings": (devices.SensorsSection,),
+    "UnitSettings": (devices.SensorsSection,),
     "Vn100Settings": (devices.InertialUnitSection,),
     "HorizonCameraSettings": (devices.WideCamera,),
 }
