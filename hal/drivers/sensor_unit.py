@@ -118,7 +118,7 @@ class UnitSettings:
     field_range: float
 
     def body_maps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the matrices (3, 3) from measured rate and field to those of the body, and an offset (3,), T.
+        """Return matrices (3, 3) from measured rate and field to those of the body, and an offset (3,), T.
 
         The offset, which the bias causes, is subtracted from the field in body axes.
         """

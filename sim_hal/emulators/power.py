@@ -220,7 +220,8 @@ class SolarCellsModel:
 
     def in_lamplight(self, lamp: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return the currents (n,), A, while a lamp shines onto the panel with the normal `lamp` (3,)."""
-        return self._produced(LAMP * (self.normals @ lamp > math.cos(math.radians(5.0))), generator)
+        lit = np.asarray(self.normals @ lamp > math.cos(math.radians(5.0)), dtype=float)
+        return self._produced(LAMP * lit, generator)
 
     def _produced(self, light: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return the currents (n,), A, in the light (n,), relative to sunlight at normal incidence."""
