@@ -167,14 +167,16 @@ class PySerialPort:
                     self._open_again()
                 continue
             if data:
-                arrival_ns = self._clock.now_ns()
-                with self._lock:
-                    self._pending.append((arrival_ns, data))
-                    self._pending_bytes += len(data)
-                    while self._pending_bytes > _PENDING_LIMIT:
-                        _, oldest = self._pending.popleft()
-                        self._pending_bytes -= len(oldest)
-                        self.lost_bytes += len(oldest)
+                self._keep(self._clock.now_ns(), data)
+
+    def _keep(self, arrival_ns: int, data: bytes) -> None:
+        with self._lock:
+            self._pending.append((arrival_ns, data))
+            self._pending_bytes += len(data)
+            while self._pending_bytes > _PENDING_LIMIT:
+                _, oldest = self._pending.popleft()
+                self._pending_bytes -= len(oldest)
+                self.lost_bytes += len(oldest)
 
     def _open_again(self) -> None:
         """Try to reopen the port until this succeeds or `close` is called.
