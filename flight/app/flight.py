@@ -93,7 +93,7 @@ from knightcube.vision.startracker.index.build import ensure_default_index
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.startracker.survey import DetectionSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 if TYPE_CHECKING:
     from flight.loop.power import PowerTask

@@ -71,8 +71,7 @@ from knightcube.vision.startracker.solve import (
 )
 from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.geometry import Course
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, LikelihoodSettings, StreakStatus
 
 _LEAST_PRIOR_SIGMA = 5e-4
 """Standard deviation (rad) of the alignment between star camera and inertial unit."""

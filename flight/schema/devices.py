@@ -44,7 +44,7 @@ from knightcube.errors import UsageError
 from knightcube.gnc.control.coil_map import LEAST_SPREAD, CoilMap, coil_field, missing_direction
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.horizon_camera_job import polygon_mask
-from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, knowledge_of_pinhole
 
 _KNOWN = CameraKnowledge()
 _MOST_HIDDEN = 0.5

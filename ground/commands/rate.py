@@ -31,8 +31,13 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import SpaceObject, detect_objects
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import REASONS, FrameMotion, MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import (
+    REASONS,
+    FrameMotion,
+    LikelihoodSettings,
+    MotionResult,
+    StreakStatus,
+)
 
 LIKELIHOOD = "likelihood"
 

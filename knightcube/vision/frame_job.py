@@ -49,9 +49,13 @@ from knightcube.vision.startracker.solve import (
 )
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Survey, survey
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS
-from knightcube.vision.streaks.distorted_pinhole import streak_pinhole
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
+from knightcube.vision.streaks.geometry import streak_pinhole
+from knightcube.vision.streaks.streak_result import (
+    FrameMotion,
+    LikelihoodSettings,
+    MotionResult,
+    StreakStatus,
+)
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 # Relative correction of the assumed focal length above which the motion is fitted a second time.

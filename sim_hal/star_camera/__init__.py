@@ -5,9 +5,7 @@
     frame = render(model, stars.directions_at(2030.5), stars.magnitude, times, quaternions, rng)
 
 `times` and `quaternions` are the times and attitudes of the simulation steps during the exposure. The module
-`image` holds the camera's parameters, interpolates the attitude and converts charge to counts. The module
-`exposure` integrates the flux of each source along its path on the detector, for a global or a rolling
-shutter. The module `objects` adds moving objects and the effects of the camera's orbit.
+`image` renders the stars, and the module `objects` adds moving objects and the effects of the camera's orbit.
 """
 
 from sim_hal.star_camera.image import (

@@ -47,10 +47,7 @@ Expose = Callable[[int, FloatArray, FloatArray, Sequence[SourceTrack]], Future[I
 
 DEVICE = "resident space object"
 TRACK_ERROR = 1e-7
-"""Largest interpolation error (rad) of a track between its samples.
-
-This corresponds to 3e-4 px of the default camera.
-"""
+"""Largest interpolation error (rad) of a track between its samples, 3e-4 px of the default camera."""
 NEAREST = 1.0
 """Shortest distance (m) at which an object is modelled as a point."""
 _FIRST_DURATION = 1000.0
@@ -333,10 +330,8 @@ def view(
     down = -position / np.linalg.norm(position)
     disc = math.asin(EARTH_RADIUS / float(np.linalg.norm(position)))
     away = math.acos(np.clip(boresight @ down, -1.0, 1.0)) - disc
-    if (
-        away < earth_excluded
-        and sunlit_ground_angle(position, np.array(around.sun), boresight) < earth_excluded
-    ):
+    sun = np.array(around.sun)
+    if away < earth_excluded and sunlit_ground_angle(position, sun, boresight) < earth_excluded:
         return True, None
     if away > corner:
         return False, None

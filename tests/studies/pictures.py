@@ -31,8 +31,7 @@ from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solve import SolveSettings, SolveStatus
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.assembly import StarRenderer
 from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import SkySection

@@ -15,8 +15,7 @@ from knightcube.vision.horizon.settings import (
     LogarithmicResponse,
     SensedDirection,
 )
-from sim_hal.earth_camera import EarthCameraModel, EarthScene
-from sim_hal.earth_camera.scene import Atmosphere
+from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene
 from tests.sim_hal.earth_camera.scenes import random_direction
 
 KNOWN_LIMB = 1000.0

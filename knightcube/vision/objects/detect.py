@@ -21,8 +21,7 @@ corners may consist of several stars, or of an object that crosses a star. Brigh
 stars are streaks are objects that the camera tracks (Sease, Figure 4.5). Saturated regions, regions with
 large indicators, and regions in which objects and stars may merge are searched again after the stars are
 subtracted. Besides the image, the search for objects needs only the rotation of the camera during the
-exposure. The maximum-likelihood estimate of the rotation from all pixels of the streaks is more accurate than
-an estimate from the streak ends, and succeeds in more images.
+exposure.
 """
 
 from __future__ import annotations
@@ -43,6 +42,7 @@ from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
 from knightcube.vision.frame import MAD_TO_SIGMA, line_of, positions
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
+    LEAST_LINE_PX,
     PATHS_PER_LENGTH,
     Explanation,
     LocatedEnds,
@@ -77,14 +77,11 @@ class Indicators:
     """The three indicators of n streaks, in the order of `INDICATORS`.
 
     Attributes:
-        endpoints: start and end of each streak (n, 2, 2), px, in the direction in which the stars around it
-            move.
-        deviations: differences of the three indicators from those of a star at the same position (n, 3), in
-            standard deviations.
+        endpoints: start and end of each streak (n, 2, 2), px, in the direction of motion of the stars.
+        deviations: differences from the indicators of a star at the same position (n, 3), in sigmas.
         fired: which of the three indicators of each streak exceed their thresholds (n, 3).
         centre: centre of rotation in the image by least squares (2,), px; meaningless if `degenerate`.
-        degenerate: whether slope and length of the chords are used instead of the centre of rotation and the
-            angle.
+        degenerate: whether slopes and lengths of the chords are used instead of centre and angle.
     """
 
     endpoints: FloatArray
@@ -153,8 +150,7 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 # Distance of the rotation centre from the boresight, in focal lengths, above which slopes are used instead.
-# The distance of the rotation centre is computed from the rotation axis, because the errors of a fitted
-# centre make its distance too small.
+# It is computed from the rotation axis, because errors of a fitted centre make its distance too small.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -166,16 +162,10 @@ def evaluate(
     bounds: tuple[float, float, float],
     strict: float = 2.5,
 ) -> Indicators:
-    """Return the indicators of non-stellar streaks for a given rotation of the camera.
+    """Return the indicators of non-stellar streaks for a given `rotation` (3,), rad, of the camera.
 
-    Args:
-        endpoints: ends of the streaks (n, 2, 2), px, corrected for bias, in any order.
-        sigma: expected standard deviation of the endpoints of each streak (n,), px.
-        rotation: rotation of the camera during the exposure (3,), rad, camera axes.
-        pinhole: camera that took the image.
-        bounds: minimum threshold of each of the three indicators, in expected standard deviations.
-        strict: additional threshold of the indicators, in robust standard deviations over the streaks of the
-            image.
+    The ends of the streaks (n, 2, 2), px, are corrected for bias, and their expected standard deviations are
+    `sigma` (n,), px. The thresholds `bounds` and `strict` are those of `ObjectSettings`.
     """
     vectors = pinhole.unit_vectors(endpoints)
     stars = star_ends(vectors, rotation)
@@ -190,8 +180,7 @@ def evaluate(
     normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > _FARTHEST_CENTRE * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
     length = lengths(endpoints)
-    # Each difference from the streak of a star is expressed as a displacement (px) of one end across or along
-    # the streak.
+    # The differences from a star's streak are displacements (px) of one end across or along the streak.
     if degenerate:
         across = np.sin(slopes(endpoints) - slopes(expected)) * length
         along = length - lengths(expected)
@@ -210,10 +199,6 @@ def evaluate(
     return Indicators(endpoints, deviations, fired, centre, degenerate)
 
 
-# Length (px) below which the bright part of a region counts as a point.
-_LEAST_LINE_PX = 4.0
-
-
 def short_regions(
     segmented: Segmented,
     rotation: FloatArray,
@@ -221,11 +206,10 @@ def short_regions(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return bright regions that are shorter than the streak of a star at the same position.
+    """Return ends (n, 2, 2), px, their deviations (n,), px, and labels (n,) of short bright regions.
 
-    The three returned arrays are the ends of the regions (n, 2, 2), px, the standard deviations of the ends
-    (n,), px, and the labels of the regions (n,). The ends of a region are those of the uniform line with the
-    same moments as the region's bright part. For a point, both ends are equal.
+    These regions are shorter than the streak of a star at the same position. The ends of a region are those
+    of the uniform line with the same moments as the region's bright part. For a point, both ends are equal.
     """
     regions = segmented.regions
     noise = segmented.background.typical_noise
@@ -241,15 +225,14 @@ def short_regions(
     for (top, bottom, left, right), label in zip(short.boxes, short.label, strict=True):
         row, column = positions(short.labels[top:bottom, left:right] == label)
         weight = segmented.signal[row + top, column + left].astype(float)
-        # Pixels below half the maximum are excluded, because the streak of a faint star in the same region
-        # would lengthen a point.
+        # Pixels below half the maximum are excluded, because a faint star would lengthen a point.
         bright = weight >= 0.5 * weight.max()
         points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
         weight = weight[bright] / weight[bright].sum()
         centre = weight @ points
         offset = points - centre
         # A line shorter than the PSF becomes a point, because noise dominates its moments.
-        lines.append(line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX))
+        lines.append(line_of(centre, (offset * weight[:, None]).T @ offset, LEAST_LINE_PX))
     ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
@@ -306,14 +289,11 @@ class SpaceObject:
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """The result of a search: the examined streaks of an image, and the objects among them.
+    """The result of a search: the examined streaks of an image, and the objects found, the brightest first.
 
-    Attributes:
-        indicators: indicators of the streaks with two ends, followed by the indicators of the short regions.
-        verdicts: classification of each streak with two ends, followed by that of each short region.
-        crowded: classification of each region in which the corner detector found more than two corners.
-        objects: the objects found, the brightest first.
-        rotation: rotation of the camera that the search assumed (3,), rad, camera axes.
+    The indicators and verdicts are those of the streaks with two ends, followed by those of the short
+    regions. The verdicts `crowded` are those of the regions with more than two corners. The search assumed
+    the `rotation` (3,), rad, camera axes.
     """
 
     indicators: Indicators
@@ -325,36 +305,28 @@ class ObjectReport:
 
 # Distance (px) between two corners of a region below which they count as the same corner.
 _LEAST_CROSSING_PX = 10.0
-# Largest distance (px) of the second end of a line from the path of a star through the first end for which
-# the line is regarded as part of the path.
+# Largest distance (px) of a line's end from a star's path for which the line is part of the path.
 _ON_PATH_PX = 1.5
-# Distance (px) of the ends of a streak from the predicted ends of a star below which the streak is that of a
-# star.
+# Distance (px) of the ends of a streak from the predicted ends below which it is the streak of a star.
 _FITTED_PX = 1.0
 # Number of trial star paths per path length in the first test of whether stars explain the pixels.
 _FEW_PATHS = 2
-# Chi-square per pixel along an object's streak below which the fit is not repeated with stars fitted to the
-# region.
+# Chi-square per pixel along an object's streak below which the fit is not repeated with fitted stars.
 _GOOD_FIT = 1.4
-# Upper limit of chi-square per pixel along a streak of uniform brightness (three standard deviations for 1000
-# pixels).
+# Upper limit of chi-square per pixel along a uniform streak (three standard deviations for 1000 pixels).
 _UNIFORM = 1.15
-# Ratio of the brightness along a star's path to that of a line on this path above which the line may be part
-# of the star.
+# Ratio of the brightness of a star's path to that of a line on it above which the line may be the star's.
 _HIDDEN_STAR = 0.6
 # Number of parts into which a star's path is divided to compare their brightness.
 _PARTS = 12
-# Limits of the excess of chi-square (over its expected value) that remains with an object, relative to the
-# decrease of chi-square by the object. The first limit applies to every object. The second limit is stricter,
-# and applies to a uniform streak that resembles the streak of a star.
+# Limits of the excess of chi-square that remains with an object, relative to the decrease by the object: for
+# every object, and for a uniform streak that resembles the streak of a star.
 _MOST_UNEXPLAINED, _LEAST_UNEXPLAINED = 3.0, 0.25
 # Fraction of the required decrease of chi-square above which the light may be a part of an object's streak.
 _PART = 0.6
-# Largest excess of chi-square over its expected value, relative to the decrease of chi-square by a possible
-# object, for which the ends of the object are located.
+# Largest excess of chi-square, relative to its decrease by an object, for which the ends are located.
 _HOPELESS = 4.0
-# Margin (standard deviations of the PSF) added to the distance from a star's path at which the Gaussian
-# profile of the star falls below the noise.
+# Margin (standard deviations of the PSF) beyond the distance at which a star's profile equals the noise.
 _DIM_SIGMAS = 2.0
 # Minimum distance (px) of the ends of a region from the image border for the region to be inside the image.
 _BORDER_PX = 2
@@ -364,10 +336,8 @@ _BORDER_PX = 2
 class Judgement:
     """Classification of one streak or region.
 
-    Attributes:
-        verdict: classification of the streak or region.
-        candidate: the detected object, or None unless the verdict is OBJECT.
-        light: the stars that explain the pixels, or None for an object and for an untested streak.
+    The candidate is the detected object, or None unless the verdict is OBJECT. The light is that of the stars
+    that explain the pixels, or None for an object and for an untested streak.
     """
 
     verdict: Verdict
@@ -380,14 +350,9 @@ def _light_beside_numpy(
 ) -> tuple[int, float]:
     """Return the number of a region's pixels that are not on the path of a star, and the sum of their counts.
 
-    The path of a star is approximated by a parabola over its chord.
-
-    Args:
-        region: pixels of the region (m, 2).
-        light: counts of the pixels (m,).
-        ends: ends of the path (2, 2), px.
-        half: displacement (2,) of the middle of the path from the middle of the chord, px.
-        reach: distance (px) from the path above which a pixel does not belong to the path.
+    The path of a star is approximated by a parabola over its chord between the `ends` (2, 2), px. The middle
+    of the path is displaced by `half` (2,), px, from the middle of the chord. Pixels (m, 2) with the counts
+    `light` (m,) do not belong to the path if they are more than `reach` px away.
     """
     chord = ends[1] - ends[0]
     length = max(float(np.linalg.norm(chord)), 1.0)
@@ -403,7 +368,6 @@ def _light_beside_numpy(
 def _light_beside(
     region: IntArray, light: FloatArray, ends: FloatArray, half: FloatArray, reach: float
 ) -> tuple[int, float]:
-    """See `_light_beside_numpy`."""
     x, y = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     length = max(math.sqrt(x * x + y * y), 1.0)
     x, y = x / length, y / length
@@ -423,13 +387,7 @@ def _light_beside(
 class Judge:
     """Classifies streaks and regions of a frame as stars or objects by their pixels.
 
-    Attributes:
-        segmented: segmented frame.
-        rotation: rotation of the camera during the exposure (3,), rad, camera axes.
-        pinhole: camera that took the frame.
-        exposure: exposure time, s.
-        settings: settings of the segmentation of the frame and of the measurement of streak ends.
-        objects: thresholds of the search for objects.
+    The camera rotates by `rotation` (3,), rad, camera axes, during the `exposure`, s.
     """
 
     segmented: Segmented
@@ -461,7 +419,7 @@ class Judge:
         """Classify a region with more than two corners (k, 2), px."""
         if len(corners) > self.objects.most_corners:
             return Judgement(Verdict.UNCLEAR)
-        pairs = np.array([corners[list(pair)] for pair in itertools.combinations(range(len(corners)), 2)])
+        pairs = np.array(list(itertools.combinations(corners, 2)))
         pairs = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1) >= _LEAST_CROSSING_PX]
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         enough = self.objects.crossing_improvement
@@ -495,8 +453,7 @@ class Judge:
         noise = self.segmented.background.typical_noise
         brightness = float(signal.max() / noise)
         reach = self.objects.psf_sigma * (_DIM_SIGMAS + float(np.sqrt(2.0 * np.log(max(brightness, 1.0)))))
-        middle = self.pinhole.unit_vectors(ends.mean(axis=0)[None])[0]
-        path = star_path(middle, self.rotation, 0.5, self.pinhole)
+        path = star_path(ends.mean(axis=0), self.rotation, self.pinhole)
         half = path[len(path) // 2] - ends.mean(axis=0)
         count, other = _light_beside(region, signal, ends, half, reach)
         return other >= self.objects.point_significance * noise * float(np.sqrt(count + 1.0))
@@ -508,7 +465,7 @@ class Judge:
         weight /= weight.sum()
         centre = weight @ region
         offset = region - centre
-        ends = line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX)
+        ends = line_of(centre, (offset * weight[:, None]).T @ offset, LEAST_LINE_PX)
         try:
             light = self._light(ends, per_length=_FEW_PATHS)
         except FlightError:
@@ -590,21 +547,9 @@ class Judge:
     def _light(
         self, corners: FloatArray, known: Sequence[FloatArray] = (), per_length: int = PATHS_PER_LENGTH
     ) -> StarLight:
-        return StarLight(
-            self.segmented,
-            corners,
-            self.rotation,
-            self.pinhole,
-            self.objects.psf_sigma,
-            self.settings.gain,
-            self.settings.saturation or np.inf,
-            known,
-            per_length,
-        )
-
-    def _gained(self, light: StarLight, found: Explanation) -> float:
-        """Return the decrease of chi-square when an object is added to a model of stars."""
-        return light.chi_square - found.chi_square
+        camera = self.rotation, self.pinhole, self.objects.psf_sigma, self.settings.gain
+        saturation = self.settings.saturation or np.inf
+        return StarLight(self.segmented, corners, *camera, saturation, known, per_length)
 
     def _is_object(self, light: StarLight, found: Explanation, improvement: float, uniform: bool) -> bool:
         """Return whether an object decreases chi-square enough and explains the pixels along its streak.
@@ -614,7 +559,7 @@ class Judge:
         nearly all light that stars do not explain. A line is rejected if it explains only a small part of the
         light that remains after subtraction of the stars.
         """
-        gained = self._gained(light, found)
+        gained = light.chi_square - found.chi_square
         remains = found.chi_square - light.expected
         most = found.misfit <= 0.5 * found.misfit_of_stars and remains <= _MOST_UNEXPLAINED * gained
         most |= uniform and remains <= _LEAST_UNEXPLAINED * gained
@@ -647,12 +592,13 @@ class Judge:
         Returns None if the located streak is that of a star, or if stars explain its pixels.
         """
         rough = light.explain(ends)
-        gained = self._gained(light, rough)
+        gained = light.chi_square - rough.chi_square
         if gained < improvement or rough.chi_square - light.expected > _HOPELESS * gained:
             return None
         located = self._located(ends, light, stars, improvement)
         if not stars and (located is None or located[2].misfit > _GOOD_FIT):
-            stars = self._stars_along(ends)
+            own = np.flatnonzero(self.segmented.regions.label == region_along(self.segmented, ends))
+            stars = fit_stars(self._patch(int(own[0])), self.rotation, self.pinhole)[0] if len(own) else []
             again = self._located(ends, self._light(ends, stars), stars, improvement) if stars else None
             if again is not None and (located is None or again[2].misfit < located[2].misfit):
                 located = again
@@ -665,7 +611,7 @@ class Judge:
         if other < rate:
             ends, rate, other, direction = ends[::-1], other, rate, other_direction
             sigma = sigma[::-1]
-        gained = self._gained(light, found)
+        gained = light.chi_square - found.chi_square
         return SpaceObject(ends, sigma, fired, found.flux, gained, rate, direction, other)
 
     def _located(
@@ -711,17 +657,10 @@ class Judge:
                     return True
         return False
 
-    def _stars_along(self, ends: FloatArray) -> list[FloatArray]:
-        """Return the paths (m, 2), px, of the stars in the region that contains the line between `ends`."""
-        regions = self.segmented.regions
-        index = np.flatnonzero(regions.label == region_along(self.segmented, ends))
-        return fit_stars(self._patch(int(index[0])), self.rotation, self.pinhole)[0] if len(index) else []
-
     def _patch(self, index: int) -> Patch:
         """Return the patch of the frame around the region `index`."""
-        saturation = self.settings.saturation or np.inf
-        psf_sigma, gain = self.objects.psf_sigma, self.settings.gain
-        return cut_patch(self.segmented, self.segmented.regions, index, psf_sigma, gain, saturation)
+        gain, saturation = self.settings.gain, self.settings.saturation or np.inf
+        return cut_patch(self.segmented, index, self.objects.psf_sigma, gain, saturation)
 
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
         """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
@@ -759,14 +698,8 @@ def detect(
         return None
     ends = extend(streaks.endpoints, chord_outward(streaks.endpoints), settings.endpoint_bias)
     short, short_sigma, short_label = short_regions(segmented, rotation, pinhole, settings, objects)
-    indicators = evaluate(
-        np.concatenate([ends, short]),
-        np.concatenate([streaks.sigma, short_sigma]),
-        rotation,
-        pinhole,
-        objects.bounds,
-        objects.strict,
-    )
+    every, sigma = np.concatenate([ends, short]), np.concatenate([streaks.sigma, short_sigma])
+    indicators = evaluate(every, sigma, rotation, pinhole, objects.bounds, objects.strict)
     labels = np.concatenate([segmented.candidates.label[streaks.candidate], short_label])
     judge = Judge(segmented, rotation, pinhole, exposure, settings, objects)
     return _judged(judge, indicators, labels, streaks)
@@ -797,9 +730,8 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
     found += judge.merged(*(np.array(each, dtype=np.int64) for each in (settled, strange, explained)))
     verdicts = tuple(one.verdict for one in judged)
     found.sort(key=lambda candidate: -candidate.flux)
-    return ObjectReport(
-        indicators, verdicts[: len(labels)], verdicts[len(labels) :], tuple(found), judge.rotation
-    )
+    count = len(labels)
+    return ObjectReport(indicators, verdicts[:count], verdicts[count:], tuple(found), judge.rotation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -856,8 +788,7 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # The angle that a pixel subtends on the boresight is the largest such angle, and is used for all
-    # directions.
+    # The angle that a pixel subtends is largest on the boresight, and is used for all directions.
     sigma = np.array([item.middle_sigma for item in objects]) / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""

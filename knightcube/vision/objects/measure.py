@@ -33,7 +33,7 @@ from knightcube.vision.objects.settings import (
 from knightcube.vision.objects.streak_images import spread_over, spread_with_slopes
 from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.solve import FrameSolution
-from knightcube.vision.startracker.survey import Areas, DetectionSettings, FrameKind, Survey, survey
+from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, Survey, survey
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _REACH = 5.0
@@ -50,12 +50,9 @@ STAR_SIGMA = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trails:
-    """The n straight trails of stars in an image.
+    """The n straight trails of stars in an image, with the flux of each star (n,), counts.
 
-    Attributes:
-        middle: midpoints of the trails (n, 2), px.
-        half: vectors from the midpoint of each trail to its end (n, 2), px.
-        flux: flux of each star (n,), counts.
+    The half extents (n, 2), px, are the vectors from the midpoint (n, 2), px, of each trail to its end.
     """
 
     middle: FloatArray
@@ -69,7 +66,7 @@ class ObjectPatch:
 
     Attributes:
         light: counts above the sky level (rows, columns).
-        corner: position (x, y) in the image of the first pixel of the rectangle (2,), px.
+        corner: position (x, y) in the image of the first pixel (2,), px.
         noise: standard deviation of a background pixel, counts.
         gain: electrons per count.
         usable: mask of the pixels that are not saturated (rows, columns).
@@ -93,12 +90,9 @@ class ObjectPatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedObject:
-    """Position and flux of an object, fitted to its pixels.
+    """An object fitted to its pixels: midpoint of its trail (2,), px, with covariance (2, 2), px^2, and flux.
 
-    Attributes:
-        middle, covariance: midpoint of the object's trail (2,), px, and its covariance (2, 2), px^2.
-        flux, flux_sigma: flux of the object and its standard deviation, counts.
-        misfit: chi-square of the fit per degree of freedom.
+    The flux and its standard deviation are in counts. The misfit is chi-square per degree of freedom.
     """
 
     middle: FloatArray
@@ -135,8 +129,7 @@ def _fit_object(
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])
     rows, columns = patch.light.shape
     for _ in range(_ROUNDS):
-        # The array `light` is the modelled image, and `by_unknown` (k, pixels) contains its derivatives with
-        # respect to the k unknowns.
+        # The modelled image, and its derivatives (k, pixels) with respect to the k unknowns.
         path, share = _trail(unknowns[:2] - patch.corner, unknowns[2:4])
         both = np.stack([np.ones(len(share)), share])
         shape, *slopes = spread_with_slopes(path, both, columns, rows, patch.psf)
@@ -174,15 +167,9 @@ def _fit_object(
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
 """Largest ratio of the fitted flux of a star to the flux predicted from the catalogue."""
 _LEAST_SHARE = 0.15
-"""Minimum flux of an object relative to adjacent stars.
-
-The modelled images of stars have errors of about 10 %.
-"""
+"""Minimum flux of an object relative to adjacent stars, whose modelled images have errors of about 10 %."""
 _APART = 1.0
-"""Minimum distance (px) of an object from the nearest star.
-
-A closer object may be the second star of a pair.
-"""
+"""Minimum distance (px) of an object from the nearest star; closer light may be the second star of a pair."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
 """Ratio of the noise of a pixel to the median absolute difference between neighbouring pixels."""
 _MISFIT = 3.0
@@ -191,13 +178,7 @@ _MISFIT = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CatalogueTrails:
-    """Trails of n catalogue stars in an image.
-
-    Attributes:
-        middle: midpoints of the trails (n, 2), px.
-        half: vectors from the midpoint of each trail to its end (n, 2), px.
-        magnitude: V magnitudes of the stars (n,).
-    """
+    """Trails of n catalogue stars as in `Trails`, with the V magnitudes (n,) of the stars."""
 
     middle: FloatArray
     half: FloatArray
@@ -228,17 +209,12 @@ def _stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: Float
 class FramePatches:
     """Fits possible objects at given positions of an image, together with the catalogue stars nearby.
 
-    Args:
-        seen: survey of the image, with its sky background and bright areas.
-        stars: trails of the catalogue stars.
-        zero: magnitude of a star with a flux of one count.
-        psf: standard deviation of the PSF, px.
+    A star with a flux of one count has the magnitude `zero`. The standard deviation of the PSF is `psf`, px.
     """
 
     def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # The noise is computed from differences between neighbouring pixels, which contain little light of
-        # faint stars.
+        # Differences between neighbouring pixels contain little light of faint stars.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
@@ -255,12 +231,9 @@ class FramePatches:
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
         """Return an object whose light is merged with that of known stars, or None if there is none.
 
-        The fit of the object starts at the brightest pixel after the stars are subtracted.
-
-        Args:
-            point: centre of the area of light (2,), px.
-            length: length of the area of light, px.
-            significance: minimum flux of the object, in standard deviations.
+        The fit of the object starts at the brightest pixel after the stars are subtracted. The area of light
+        has its centre at `point` (2,), px, and the given `length`, px. The minimum flux of the object is
+        `significance` standard deviations.
         """
         patch = self._patch(point, 0.5 * length + _patch_reach(np.zeros(2), self._psf))
         if patch is None:
@@ -326,14 +299,9 @@ def measure_objects(
 ) -> MeasuredObjects | None:
     """Return the possible objects in an image, or None if the attitude of the image is unknown.
 
-    Args:
-        pixels: counts of the image (rows, columns).
-        solution: star tracker solution of the image.
-        exposure: exposure time, s.
-        epoch: Julian year of the positions of the stars.
-        velocity: velocity of the camera (3,), m/s, to correct aberration, or None for no correction.
-        detection: settings of the detection of bright areas in the image.
-        settings: settings of the measurement of objects.
+    The star tracker solution is that of the image `pixels` (rows, columns). The `epoch` is the Julian year of
+    the positions of the stars. The `velocity` of the camera (3,), m/s, corrects aberration; None for no
+    correction. The `detection` settings are those of the bright areas in the image.
     """
     sky = solution.sky_map(velocity)
     if sky is None or solution.fix is None:
@@ -360,13 +328,9 @@ def measure_objects(
         square = fits[of_fits][0].covariance + settings.floor**2 * np.eye(2)
         covariance[number] = slope @ square @ slope.T
     to_sky = attitude_matrix(solution.fix.quaternion).T
-    return MeasuredObjects(
-        points,
-        sky.directions(points) if len(points) else np.zeros((0, 3)),
-        covariance,
-        magnitudes[brightest],
-        to_sky @ solution.fix.covariance @ to_sky.T,
-    )
+    attitude = to_sky @ solution.fix.covariance @ to_sky.T
+    directions = sky.directions(points) if len(points) else np.zeros((0, 3))
+    return MeasuredObjects(points, directions, covariance, magnitudes[brightest], attitude)
 
 
 def _among_streaks(
@@ -386,8 +350,7 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of one count is computed from the identified streaks, and is NaN if no streak is
-    # identified.
+    # The magnitude of one count is that of the identified streaks, or NaN if no streak is identified.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
     if known is not None and np.any(known):
@@ -409,8 +372,7 @@ def _among_points(
     seen: Survey, stars: CatalogueTrails, settings: ObjectMeasurementSettings
 ) -> list[tuple[FittedObject, float]]:
     """Return the objects in an image whose stars are points, and the magnitude that one count represents."""
-    areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
-    ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
+    areas, ratio = seen.areas, _significances(seen)
     strong = np.flatnonzero(ratio >= settings.significance)
     if not len(strong) or not len(stars.magnitude):
         return []
@@ -418,8 +380,7 @@ def _among_points(
     nearest = away.argmin(axis=1)
     distance = away[np.arange(len(strong)), nearest]
     is_star = distance < settings.clearance + 0.5 * areas.length[strong]
-    # The median over the stars is used, because the brightest stars are saturated and the faintest stars may
-    # be pairs.
+    # The median is used, because bright stars are saturated and faint stars may be pairs.
     own = is_star & (distance < 1.0)
     if not np.any(own):
         return []
@@ -436,7 +397,11 @@ def _among_points(
         direction = float(areas.direction[area])
         half = 0.5 * max(float(areas.length[area]), 0.6) * np.array([np.cos(direction), np.sin(direction)])
         fit = patches.measured(areas.centre[area], half, float(areas.flux[area]))
-        fits.append(fit if fit is not None else _centre(areas, area, float(ratio[area]), settings))
+        if fit is None:
+            sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(float(ratio[area]), 1.0)
+            square = np.hypot(settings.centre_sigma, sigma) ** 2 * np.eye(2)
+            fit = FittedObject(areas.centre[area], square, float(areas.flux[area]), 0.0, 1.0)
+        fits.append(fit)
     odd = (distance > _OFF_PLACE) | (zero - faintness < stars.magnitude[nearest] - _TOO_BRIGHT)
     for area in strong[is_star & odd & inside].tolist():
         fit = patches.beside(areas.centre[area], float(areas.length[area]), settings.significance)
@@ -445,11 +410,10 @@ def _among_points(
     return [(fit, zero) for fit in fits]
 
 
-def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSettings) -> FittedObject:
-    """Return an object at the centroid of an area of light, which is used if the fit fails."""
-    sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(ratio, 1.0)
-    error = np.hypot(settings.centre_sigma, sigma)
-    return FittedObject(areas.centre[area], error**2 * np.eye(2), float(areas.flux[area]), 0.0, 1.0)
+def _significances(seen: Survey) -> FloatArray:
+    """Return the flux (n,) of each bright area of an image, in standard deviations."""
+    noise = float(np.median(seen.sky.noise.values))
+    return np.asarray(seen.areas.flux / (noise * np.sqrt(np.maximum(seen.areas.pixels, 1))))
 
 
 def _faintness(flux: FloatArray) -> FloatArray:
@@ -475,13 +439,8 @@ def measure_points(
 ) -> FieldPoints:
     """Return the points of light in a frame, with moving objects marked if the stars are streaks.
 
-    Args:
-        pixels: counts of the frame (rows, columns).
-        camera: camera of the frame.
-        exposure: exposure time, s.
-        motion: motion of the camera over the exposure, from the streaks of the frame.
-        settings: settings of the measurement of objects.
-        detection: settings of the detection of bright areas in the frame.
+    The motion of the camera over the `exposure`, s, is that from the streaks of the frame. The `detection`
+    settings are those of the bright areas in the frame (rows, columns).
     """
     moves = motion.status is StreakStatus.RATE and motion.rate is not None and motion.length >= STREAK_PX
     if moves and isinstance(motion, MotionResult) and motion.rate is not None:
@@ -497,12 +456,10 @@ def measure_points(
         moving = np.arange(len(points)) >= len(points) - len(middles)
     else:
         seen = survey(pixels, detection)
-        areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
-        ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
+        areas, ratio = seen.areas, _significances(seen)
         margin = (3.0 + 0.5 * areas.length)[:, None]
-        inside = np.all(
-            (areas.centre > margin) & (areas.centre < np.array(areas.shape[::-1]) - 1 - margin), axis=1
-        )
+        last = np.array(areas.shape[::-1]) - 1
+        inside = np.all((areas.centre > margin) & (areas.centre < last - margin), axis=1)
         chosen = np.flatnonzero((ratio >= _FIELD_SIGMAS) & inside)
         points, flux = areas.centre[chosen], areas.flux[chosen]
         sigma = np.sqrt(1.0 + areas.length[chosen] ** 2 / 12.0) / ratio[chosen]

@@ -42,11 +42,8 @@ MOST_STARS = 600
 class LocatedFrame:
     """The attitude of a frame relative to the stars of earlier frames, and a mask of the stars in the frame.
 
-    Attributes:
-        quaternion: attitude (4,) of the camera relative to the field.
-        covariance: covariance (3, 3) of the attitude relative to the field, camera axes, rad^2.
-        is_star: whether each point of the frame is a star of earlier frames (n,).
-        begun: whether this frame is the first frame of the field.
+    The attitude (4,) of the camera relative to the field has a covariance (3, 3), camera axes, rad^2. The
+    flag `begun` states whether this frame is the first frame of the field.
     """
 
     quaternion: FloatArray
@@ -70,12 +67,8 @@ class StarField:
 
         If fewer than three points are stars of the field, the field is not updated, and all points are
         treated as stars. If three successive frames have fewer than three stars of the field, all stars of
-        the field are removed, and the points of the third frame become the new field.
-
-        Args:
-            found: points of light in the frame.
-            predicted: predicted attitude (4,) of the camera relative to the field.
-            sigma: standard deviation of the predicted attitude, rad.
+        the field are removed, and the points of the third frame become the new field. The `predicted`
+        attitude (4,) of the camera relative to the field has the standard deviation `sigma`, rad.
         """
         self._frame += 1
         candidates = np.flatnonzero(~found.moving)
@@ -157,8 +150,7 @@ def _common_rotation(there: FloatArray, stars: FloatArray, quaternion: FloatArra
     turn = proposals[best]
     if np.count_nonzero(near) >= 2:
         first, second = there[near], stars[near]
-        # The rotation vector e from the directions `first` in the frame to the directions `second` of the
-        # stars is the least-squares solution of second = first + e x first.
+        # The rotation vector e is the least-squares solution of second = first + e x first.
         normal = len(first) * np.eye(3) - first.T @ first
         turn = np.linalg.lstsq(normal, np.cross(first, second).sum(axis=0), rcond=1e-9)[0]
     return multiply(quaternion, from_rotation_vector(turn))

@@ -35,7 +35,7 @@ from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import label_pixels, line_of
-from knightcube.vision.objects.streak_ends import Regions, Segmented
+from knightcube.vision.objects.streak_ends import Segmented
 from knightcube.vision.objects.streak_images import (
     fitted_line,
     least_squares,
@@ -45,6 +45,7 @@ from knightcube.vision.objects.streak_images import (
     star_path,
     star_paths,
     straight_path,
+    streak_at,
     streak_images,
 )
 
@@ -56,11 +57,9 @@ _LONGEST_CHAIN = 5.0
 _SAME_PATH = 0.15
 # Maximum number of rounds in which the light of an object's streak is followed and its ends are fitted.
 _ROUNDS = 5
-# Minimum length (px) beyond each end of a streak over which its light is followed: in the first rounds, and
-# in later rounds.
+# Minimum length (px) beyond each end over which light is followed: in the first and in later rounds.
 _BEYOND_FIRST, _BEYOND_LATER = 60.0, 25.0
-# Distance (px) between the assumed end of a streak and the point where its light stops, above which the fit
-# of the ends starts from this point.
+# Distance (px) between the end of a streak and that of its light above which the latter is fitted.
 _FOLLOWED = 1.5
 # Maximum number of Gauss-Newton steps of the ends in a round, and the step (px) that ends the fit.
 _END_FITS, _END_CONVERGED = 3, 0.05
@@ -68,8 +67,7 @@ _END_FITS, _END_CONVERGED = 3, 0.05
 _LOCATED = 0.3
 # Ratio of the brightness on the path to that of the streak above which the light belongs to another source.
 _BRIGHTER = 2.0
-# Error of the subtracted light of stars, relative to the brightness of the streak, above which the light is
-# ignored.
+# Relative error of subtracted starlight on the streak above which the light is ignored.
 _HIDDEN = 0.25
 # Minimum length (px) of a streak whose ends are located.
 _LEAST_LOCATED = 12.0
@@ -83,13 +81,10 @@ SHAPE_ERROR = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Quality of the hypothesis that the pixels of a region show stars and one object.
+    """Quality of the hypothesis that the pixels of a region show stars and one object of `flux` counts.
 
-    Attributes:
-        chi_square: chi-square of the best-fitting sum of star streaks and the object's streak.
-        misfit, misfit_of_stars: chi-square per pixel along the object's streak, for stars with the object and
-            for stars only.
-        flux: flux of the object, counts.
+    The chi-square is that of the best-fitting sum of star streaks and the object's streak. The misfits are
+    the chi-squares per pixel along the object's streak, for stars with the object and for stars only.
     """
 
     chi_square: float
@@ -100,12 +95,10 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedEnds:
-    """Ends of an object's streak, located by means of the light along the whole streak.
+    """The ends (2, 2), px, of an object's streak, located by means of the light along the whole streak.
 
-    Attributes:
-        ends: the two ends (2, 2), px.
-        sigma: standard deviation of each end (2,), px, along the axis of the larger error.
-        misfit: chi-square per pixel along the streak.
+    The standard deviation of each end (2,), px, is that along the axis of the larger error. The misfit is the
+    chi-square per pixel along the streak.
     """
 
     ends: FloatArray
@@ -133,12 +126,11 @@ class StarLight:
 
     Attributes:
         chi_square: chi-square of the best-fitting sum of star streaks.
-        pixels: number of pixels near the trial star paths and the lines between corners.
+        pixels: number of pixels used.
         expected: expected chi-square of a correct model. For bright light it is less than `pixels`, because
             the weights of bright pixels also allow for model errors.
 
-    Raises:
-        FlightError: if the least-squares solution of the brightnesses does not converge.
+    Raises FlightError if the least-squares solution of the brightnesses does not converge.
     """
 
     def __init__(
@@ -154,9 +146,7 @@ class StarLight:
         per_length: int = PATHS_PER_LENGTH,
     ) -> None:
         stars = _star_paths(corners, rotation, pinhole, per_length)
-        lines = [
-            straight_path(corners[list(pair)]) for pair in itertools.combinations(range(len(corners)), 2)
-        ]
+        lines = [straight_path(np.array(pair)) for pair in itertools.combinations(corners, 2)]
         rows, columns = segmented.signal.shape
         self._psf_sigma, self._rotation, self._pinhole = psf_sigma, rotation, pinhole
         self._segmented, self._gain, self._saturation = segmented, gain, saturation
@@ -181,8 +171,7 @@ class StarLight:
     def explain(self, ends: FloatArray) -> Explanation:
         """Return the quality of the hypothesis of stars and one object between `ends` (2, 2), px.
 
-        The object's path is straight in the image or relative to the stars, whichever gives the smaller
-        chi-square.
+        The object's path is straight in the image or among the stars, whichever gives the smaller chi-square.
         """
         lines = self._object_images(ends)
         fits = [self._with_line(line) for line in lines]
@@ -212,14 +201,10 @@ class StarLight:
     def located(self, ends: FloatArray, among_stars: bool) -> LocatedEnds | None:
         """Return the most likely ends of the light of an object's streak, or None if no streak is found.
 
-        The light is followed along the path of the streak beyond both ends. The initial ends are those of the
-        most likely part of the path with uniform brightness and no light outside. From the initial ends, ends
-        and brightness are fitted to the pixels. Light is not followed into other regions. Known stars are
-        subtracted.
-
-        Args:
-            ends: initial guess of the two ends (2, 2), px.
-            among_stars: whether the path is straight relative to the stars, not in the image.
+        The light is followed along the path of the streak beyond both `ends` (2, 2), px, but not into other
+        regions. The path is straight in the image or `among_stars`. The initial ends are those of the most
+        likely part of the path with uniform brightness and no light outside. From the initial ends, ends and
+        brightness are fitted to the pixels. Known stars are subtracted.
         """
         beyond = max(_BEYOND_FIRST, float(np.linalg.norm(ends[1] - ends[0])))
         label = region_along(self._segmented, ends)
@@ -268,13 +253,7 @@ class StarLight:
 
         The results are the fractions of the path at which its light begins and ends (2,), their standard
         deviations (2,), px, the pixels (p, 2), their counts without known stars (p,), and their weights (p,).
-
-        Args:
-            curve: points (m, 2), px, that are 1 px apart.
-            parts: fractions of the path at the points (m,).
-            ends: current ends of the path (2, 2), px.
-            among_stars: whether the path is straight relative to the stars, not in the image.
-            label: label of the region of the path.
+        The points of the `curve` (m, 2), px, are 1 px apart, at the fractions `parts` (m,) of the path.
         """
         rows, columns = self._segmented.signal.shape
         pixels = pixels_near(curve, _REACH * self._psf_sigma, rows, columns)
@@ -285,7 +264,7 @@ class StarLight:
         target = signal
         if len(self._known):
             paths = [*self._known, self._path(ends, among_stars)]
-            images = [streak_images(pixels, path[None], self._psf_sigma, False)[0, 0] for path in paths]
+            images = [streak_at(pixels, path, self._psf_sigma) for path in paths]
             shapes = np.array(images) * weight
             flux, _ = _brightnesses(shapes @ shapes.T, shapes @ (signal * weight), 0.0)
             target = signal - flux[:-1] @ np.array(images[:-1])
@@ -294,8 +273,7 @@ class StarLight:
         usual = float(np.median(light[inner])) if inner.any() else 0.0
         if usual <= 0.0:
             return None
-        # Twice the logarithm of the likelihood ratio, at each point of the path, of light with the median
-        # brightness of the path to no light.
+        # Twice the log-likelihood ratio, at each point, of light with the median brightness to no light.
         gain = share * usual * (2.0 * light - usual)
         gain[light > _BRIGHTER * usual + 3.0 / np.sqrt(np.maximum(share, 1e-300))] = 0.0
         if len(self._known):
@@ -310,12 +288,7 @@ class StarLight:
         return bounds, np.array([first_sigma, last_sigma]), pixels, target, weight
 
     def _fitted_ends(
-        self,
-        pixels: IntArray,
-        target: FloatArray,
-        weight: FloatArray,
-        ends: FloatArray,
-        among_stars: bool,
+        self, pixels: IntArray, target: FloatArray, weight: FloatArray, ends: FloatArray, among_stars: bool
     ) -> LocatedEnds | None:
         """Return the ends fitted to the counts `target` (p,) of pixels (p, 2), or None if the fit fails."""
         size = 0.0
@@ -326,18 +299,16 @@ class StarLight:
                 return None
             path = self._path(ends, among_stars)
             along = (pixels - ends[0]) @ chord / size**2
-            near = np.flatnonzero(
-                (along > -_WIDE_REACH / size) & (along < 1.0 + _WIDE_REACH / size) & (weight > 0)
-            )
+            beyond = _WIDE_REACH / size
+            near = np.flatnonzero((along > -beyond) & (along < 1.0 + beyond) & (weight > 0))
             if len(near) < _LEAST_LOCATED:
                 return None
             images = streak_images(pixels[near], path[None], self._psf_sigma, True)[0]
             second = np.clip(along[near], 0.0, 1.0)
             # A displacement of an end along the streak also changes the brightness of the streak.
             thinned = images[0] * (chord / size**2)[:, None]
-            design = np.concatenate(
-                [images[:1], images[1:] * (1.0 - second) + thinned, images[1:] * second - thinned]
-            )
+            first_end, last_end = images[1:] * (1.0 - second) + thinned, images[1:] * second - thinned
+            design = np.concatenate([images[:1], first_end, last_end])
             design *= weight[near]
             scale = np.sqrt(np.maximum(np.sum(design**2, axis=1), 1e-300))
             normal = (design @ design.T) / np.outer(scale, scale) + _RIDGE * np.eye(5)
@@ -382,8 +353,7 @@ class StarLight:
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
         """Return the weighted image (p,) of a streak with one count in total along `path` (m, 2), px."""
-        image = streak_images(self._near, path[None], self._psf_sigma, False)[0, 0]
-        return np.asarray(image * self._weight)
+        return streak_at(self._near, path, self._psf_sigma) * self._weight
 
 
 def region_along(segmented: Segmented, ends: FloatArray) -> int:
@@ -438,9 +408,8 @@ def _light_along(
     """
     width = float(np.sqrt(psf_sigma**2 + 1.0 / 12.0))
     chord = curve[-1] - curve[0]
-    place = np.interp(
-        (pixels - curve[0]) @ chord, np.maximum.accumulate((curve - curve[0]) @ chord), np.arange(len(curve))
-    )
+    along = np.maximum.accumulate((curve - curve[0]) @ chord)
+    place = np.interp((pixels - curve[0]) @ chord, along, np.arange(len(curve)))
     tangent = np.gradient(curve, axis=0)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
     near = np.rint(place).astype(np.int64)
@@ -461,8 +430,9 @@ def _pixel_weights(
 ) -> FloatArray:
     """Return the reciprocal standard deviations of pixels with `signal` counts above the background `level`.
 
-    The standard deviation includes the noise of the background, photon noise (`gain` in electrons per count)
-    and the model error of bright streaks. Pixels above 95 % of the `saturation` counts have the weight 0.
+    The standard deviation includes the noise of the background (`noise`, counts), photon noise (`gain` in
+    electrons per count) and the model error of bright streaks. Pixels above 95 % of the `saturation` counts
+    have the weight 0.
     """
     light = np.maximum(signal, 0.0)
     clipped = signal + level >= 0.95 * saturation
@@ -476,15 +446,8 @@ def _counts_at_numpy(
     """Return the counts (p,) above the background and the weights (p,) of pixels, and expected chi-square.
 
     Each pixel contributes to the expected chi-square the fraction of its variance that is due to background
-    noise and photon noise.
-
-    Args:
-        image: counts above the background (rows, columns).
-        pixels: pixels (x, y) in the image (p, 2).
-        level: level of the background, counts.
-        noise: standard deviation of a pixel of the background, counts.
-        gain: electrons per count.
-        saturation: counts at which a pixel saturates, see `_pixel_weights`.
+    noise and photon noise. The image (rows, columns) contains the counts above the background, and the pixels
+    (p, 2) are given as (x, y). The other arguments are those of `_pixel_weights`.
     """
     signal = image[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     weight = _pixel_weights(signal, level, noise, gain, saturation)
@@ -495,7 +458,6 @@ def _counts_at_numpy(
 def _counts_at(
     image: Image, pixels: IntArray, level: float, noise: float, gain: float, saturation: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """See `_counts_at_numpy`."""
     signal, weight, expected = np.empty(len(pixels)), np.zeros(len(pixels)), 0.0
     for p in range(len(pixels)):
         counts = float(image[pixels[p, 1], pixels[p, 0]])
@@ -512,20 +474,15 @@ def _counts_at(
 def _brightnesses(normal: FloatArray, right: FloatArray, power: float) -> tuple[FloatArray, float]:
     """Return the non-negative least-squares coefficients (k,) of k images, and the chi-square.
 
-    Args:
-        normal: scalar products (k, k) of the weighted images of the stars with one another.
-        right: scalar products (k,) of the weighted images with the weighted pixels of the frame.
-        power: sum of the squares of the weighted pixels.
-
-    Raises:
-        FlightError: if the equations are not positive definite, or the solver does not converge.
+    The arguments are the scalar products (k, k) of the weighted images with one another, those (k,) of the
+    images with the weighted pixels of the frame, and the sum of the squares of these pixels. Raises
+    FlightError if the equations are not positive definite, or if the solver does not converge.
     """
     scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal / scale / scale[:, None]
     # The ridge keeps the equations regular if images are equal or empty.
     scaled.reshape(-1)[:: len(scale) + 1] += _RIDGE
-    # The LAPACK routines are called directly, because the argument checks of numpy take longer than the
-    # routines.
+    # LAPACK is called directly, because the argument checks of numpy take longer than the routines.
     factor, failed = lapack.dpotrf(scaled, lower=1)
     if failed:
         raise FlightError(f"brightnesses of {len(scale)} streaks: the equations are not positive definite")
@@ -565,8 +522,8 @@ _NOT_THEIRS = 4.0
 _WIDE_REACH = 5.0
 # Largest step (px) of a fit, step (px) below which the fit has converged, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
-# Minimum length (px) of an object's line of light. A shorter line is treated as a point.
-_LEAST_LINE_PX = 4.0
+LEAST_LINE_PX = 4.0
+"""Minimum length (px) of an object's line of light. A shorter line is treated as a point."""
 # Distance at which the Gaussian that smooths an image is truncated, in standard deviations.
 _FARTHEST = 4.0
 
@@ -579,10 +536,10 @@ class Patch:
         signal: counts above the background (rows, columns), including the light of other regions.
         weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts; 0 if saturated.
         noise: standard deviation of a background pixel, counts.
-        corner: position (x, y) in the frame of the first pixel of the rectangle (2,), px.
+        corner: position (x, y) in the frame of the first pixel (2,), px.
         mask: mask of the pixels that belong to the region (rows, columns).
-        beyond: counts assumed beyond the rectangle, as ((above, below), (left, right)); infinite outside the
-            frame, because streaks may continue there.
+        beyond: counts assumed above, below, left and right of the rectangle (4,); infinite outside the frame,
+            because streaks may continue there.
         psf_sigma: standard deviation of the PSF, px.
         gain: electrons per count.
         seen: signal convolved with the PSF (rows, columns).
@@ -593,7 +550,7 @@ class Patch:
     noise: float
     corner: FloatArray
     mask: BoolArray
-    beyond: tuple[tuple[float, float], tuple[float, float]]
+    beyond: FloatArray
     psf_sigma: float
     gain: float = 1.0
     seen: FloatArray = field(init=False)
@@ -622,14 +579,12 @@ class Patch:
         return self.noise / (2.0 * float(np.sqrt(np.pi)) * self.psf_sigma)
 
 
-def cut_patch(
-    segmented: Segmented, regions: Regions, index: int, psf_sigma: float, gain: float, saturation: float
-) -> Patch:
+def cut_patch(segmented: Segmented, index: int, psf_sigma: float, gain: float, saturation: float) -> Patch:
     """Return the patch of the frame around region `index`.
 
     Pixels above 95 % of the `saturation` counts have the weight 0.
     """
-    rows, columns = segmented.signal.shape
+    regions, (rows, columns) = segmented.regions, segmented.signal.shape
     top, bottom, left, right = (int(edge) for edge in regions.boxes[index])
     top, left = max(top - _ROOM, 0), max(left - _ROOM, 0)
     bottom, right = min(bottom + _ROOM, rows), min(right + _ROOM, columns)
@@ -638,10 +593,8 @@ def cut_patch(
     weight = _pixel_weights(signal, background.typical_level, background.typical_noise, gain, saturation)
     mask = regions.labels[top:bottom, left:right] == regions.label[index]
     corner = np.array([left, top], dtype=float)
-    above, below, before, after = (
-        np.inf if off else 0.0 for off in (top == 0, bottom == rows, left == 0, right == columns)
-    )
-    beyond = ((above, below), (before, after))
+    at_edge = top == 0, bottom == rows, left == 0, right == columns
+    beyond = np.where(at_edge, np.inf, 0.0)
     return Patch(signal, weight, background.typical_noise, corner, mask, beyond, psf_sigma, gain)
 
 
@@ -652,7 +605,6 @@ def _smoothed(light: FloatArray, psf_sigma: float) -> FloatArray:
 
 
 def _convolved_numpy(light: FloatArray, profile: FloatArray) -> FloatArray:
-    """Return an image as `_convolved` does."""
     whole = np.concatenate([profile[:0:-1], profile])
     down = ndimage.correlate1d(light, whole, axis=0, mode="constant")
     return np.asarray(ndimage.correlate1d(down, whole, axis=1, mode="constant"))
@@ -690,7 +642,7 @@ def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[lis
     left = patch.signal
     rows, columns = patch.signal.shape
     centre = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
-    path = _path_of(centre, rotation, pinhole)
+    path = star_path(centre, rotation, pinhole)
     # The offsets are points of a star's path relative to the midpoint of the path, and include both ends.
     every = max(1, round(2.0 * patch.psf_sigma))
     offsets = path[np.unique(np.append(np.arange(0, len(path), every), len(path) - 1))] - centre
@@ -700,11 +652,7 @@ def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[lis
             break
         middles.append(patch.corner + middle)
         middles, left = _fit_together(patch, middles, rotation, pinhole)
-    return [_path_of(middle, rotation, pinhole) for middle in middles], left
-
-
-def _path_of(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    return star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
+    return [star_path(middle, rotation, pinhole) for middle in middles], left
 
 
 # Number of points of a star's path that are tested first, for each pixel that may be the middle of the path.
@@ -725,16 +673,14 @@ def _brightest_star(patch: Patch, left: FloatArray, offsets: FloatArray) -> Floa
     first = np.unique(np.linspace(0, len(steps) - 1, _FIRST_OFFSETS).astype(int))
     order = np.concatenate([first[len(first) // 2 :], first[: len(first) // 2]])
     order = np.concatenate([order, np.setdiff1d(np.arange(len(steps)), order)])
-    beyond = np.array(patch.beyond).reshape(-1)
-    threshold = _STAR_SIGMAS * patch.smoothed_noise
-    best, column, row = _brightest_path(patch.smoothed(left), steps[order], factor[order], beyond, threshold)
+    threshold, seen = _STAR_SIGMAS * patch.smoothed_noise, patch.smoothed(left)
+    best, column, row = _brightest_path(seen, steps[order], factor[order], patch.beyond, threshold)
     return np.array([column, row], dtype=float) if best >= threshold else None
 
 
 def _brightest_path_numpy(
     seen: FloatArray, steps: IntArray, factor: FloatArray, beyond: FloatArray, threshold: float
 ) -> tuple[float, int, int]:
-    """Return the result of `_brightest_path`."""
     rows, columns = seen.shape
     # The image is padded with the values `beyond`, so that all pixels of a path lie in the array.
     x, y = np.abs(steps).max(axis=0)
@@ -766,12 +712,8 @@ def _brightest_path(
     Returns minus infinity, -1 and -1 if the minimum along the path is below the threshold at all positions of
     the path.
 
-    Args:
-        seen: image (rows, columns).
-        steps: pixels (x, y) of the path relative to its middle (k, 2).
-        factor: factors by which the image is multiplied at the pixels of the path (k,).
-        beyond: values above, below, left and right of the image (4,).
-        threshold: smallest accepted minimum along the path.
+    The image (rows, columns) is multiplied by `factor` (k,) at the pixels (x, y) of the path, which are given
+    relative to its middle by `steps` (k, 2). The values above, below, left and right of it are `beyond` (4,).
     """
     rows, columns = seen.shape
     best, best_column, best_row = -np.inf, -1, -1
@@ -803,7 +745,7 @@ def _fit_together(
 ) -> tuple[list[FloatArray], FloatArray]:
     """Return the path midpoints (2,), px, of stars fitted together, and the counts without these stars."""
     rows, columns = patch.signal.shape
-    paths = [_path_of(middle, rotation, pinhole) - patch.corner for middle in middles]
+    paths = [star_path(middle, rotation, pinhole) - patch.corner for middle in middles]
     pixels = pixels_near(np.concatenate(paths), _WIDE_REACH * patch.psf_sigma, rows, columns)
     flat = pixels[:, 1] * columns + pixels[:, 0]
     signal, weight = patch.signal.reshape(-1)[flat], patch.weight.reshape(-1)[flat]
@@ -816,11 +758,9 @@ def _fit_together(
         flux = np.maximum(solution[:, 0], 1e-9)
         steps = np.clip(solution[:, 1:] / flux[:, None], -_LARGEST_STEP, _LARGEST_STEP)
         middles = [middle + step for middle, step in zip(middles, steps, strict=True)]
-        paths = [_path_of(middle, rotation, pinhole) - patch.corner for middle in middles]
+        paths = [star_path(middle, rotation, pinhole) - patch.corner for middle in middles]
         theirs = (signal - flux @ images[:, 0]) * weight < _NOT_THEIRS
-    lights = np.concatenate(
-        [streak_images(pixels, path[None], patch.psf_sigma, False)[:, 0] for path in paths]
-    )
+    lights = np.stack([streak_at(pixels, path, patch.psf_sigma) for path in paths])
     share = weight * theirs
     flux = np.maximum(least_squares((lights * share).T, signal * share), 0.0)
     left = patch.signal.copy()
@@ -831,11 +771,8 @@ def _fit_together(
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     """Return the ends (2, 2), px, of the brightest significant light in a region without its stars, or None.
 
-    For a point, the two ends are equal. Residuals below the model error of a bright star are not significant.
-
-    Args:
-        patch: rectangle of the frame around the examined region.
-        left: counts of the rectangle after its stars are subtracted (rows, columns).
+    The array `left` (rows, columns) contains the counts of the patch after its stars are subtracted. For a
+    point, the two ends are equal. Residuals below the model error of a bright star are not significant.
     """
     seen = patch.smoothed(left)
     pixel = np.flatnonzero(seen > _LEFT_SIGMAS * patch.smoothed_noise)
@@ -851,7 +788,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     points, weight = np.stack([x, y], axis=-1).astype(float), seen[y, x]
     points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
     spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
-    guess = line_of(points.mean(axis=0), spread, _LEAST_LINE_PX)
+    guess = line_of(points.mean(axis=0), spread, LEAST_LINE_PX)
     return _fit_line(patch, left, guess + patch.corner)
 
 

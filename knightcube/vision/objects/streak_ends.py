@@ -46,14 +46,12 @@ _PEAK_FRACTION = 0.28
 
 @dataclass(frozen=True, slots=True)
 class Regions:
-    """Connected regions of one frame.
+    """The n connected regions of one frame, with the area (n,), px, and flux (n,), counts, of each region.
 
     Attributes:
         labels: label of the region at each pixel (rows, columns), int32; 0 outside all regions.
         label: label of each region (n,), as used in `labels`.
         boxes: bounding boxes of the regions (n, 4): first row, last row + 1, first column, last column + 1.
-        area: number of pixels in each region (n,).
-        flux: counts above the background in each region (n,).
         length: length of the uniform line with the same second moments as each region (n,), px.
     """
 
@@ -76,12 +74,8 @@ class Regions:
 class Segmented:
     """A frame segmented into bright regions.
 
-    Attributes:
-        signal: counts above the background with hot pixels repaired (rows, columns), float32.
-        background: background level and noise of the frame.
-        regions: all regions above the threshold.
-        candidates: those regions that may be streaks, in descending order of strength.
-        hot_pixels: number of repaired pixels.
+    The signal (rows, columns), float32, is the counts above the background with `hot_pixels` repaired hot
+    pixels. The candidates are those regions that may be streaks, in descending order of strength.
     """
 
     signal: Image
@@ -96,13 +90,11 @@ class Streaks:
     """Streaks of one frame, in descending order of strength.
 
     Attributes:
-        endpoints: the two ends (x, y) of each streak in arbitrary order (n, 2, 2), px, not yet corrected by
-            `extend`.
+        endpoints: the two ends (x, y) of each streak in arbitrary order (n, 2, 2), px, before `extend`.
         sigma: expected standard deviation of the endpoints of each streak (n,), px.
         flux: flux of each streak (n,), counts.
         candidate: index of each streak's region among the candidate regions (n,).
-        crowded: index and corners (k, 2), px, of each candidate region with more than two corners (peaks of
-            the cornerness).
+        crowded: index and corners (k, 2), px, of each candidate region with more than two corners.
     """
 
     endpoints: FloatArray
@@ -138,7 +130,6 @@ def segment_frame(pixels: Image, settings: EndpointSettings) -> Segmented:
 
 
 def _threshold_local_numpy(signal: Image, noise: Image, sigmas: float) -> BoolArray:
-    """See `threshold_local`."""
     return np.asarray(box_sum(signal) > (3.0 * sigmas) * noise)
 
 
@@ -146,9 +137,8 @@ def _threshold_local_numpy(signal: Image, noise: Image, sigmas: float) -> BoolAr
 def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
     """Return the pixels at which the 3 x 3 sum of `signal` exceeds `sigmas` times the noise of this sum.
 
-    The argument `signal` is the frame (rows, columns) without background, and the argument `noise` is the
-    standard deviation of each pixel (rows, columns), counts. The result does not include pixels at the border
-    of the frame.
+    The signal (rows, columns) is without background, and the noise (rows, columns) is the standard deviation
+    of each pixel, counts. The result does not include pixels at the border of the frame.
     """
     rows, columns = signal.shape
     limit, down = np.float32(3.0 * sigmas), np.empty_like(signal[0])
@@ -195,7 +185,6 @@ def _bounding_boxes_numpy(number: IntArray, row: IntArray, column: IntArray, cou
 
 @compiled_form_of(_bounding_boxes_numpy)
 def _bounding_boxes(number: IntArray, row: IntArray, column: IntArray, count: int) -> IntArray:
-    """See `_bounding_boxes_numpy`."""
     boxes = np.empty((count, 4), dtype=np.int64)
     boxes[:, ::2], boxes[:, 1::2] = np.iinfo(np.int64).max, 0
     for p in range(len(number)):
@@ -206,7 +195,6 @@ def _bounding_boxes(number: IntArray, row: IntArray, column: IntArray, count: in
 
 
 def _pixels_of_region_numpy(labels: Image, box: IntArray, label: int) -> IntArray:
-    """See `pixels_of_region`."""
     top, bottom, left, right = box
     row, column = positions(labels[top:bottom, left:right] == label)
     return np.stack([column + left, row + top], axis=-1)
@@ -214,10 +202,9 @@ def _pixels_of_region_numpy(labels: Image, box: IntArray, label: int) -> IntArra
 
 @compiled_form_of(_pixels_of_region_numpy)
 def pixels_of_region(labels: Image, box: IntArray, label: int) -> IntArray:
-    """Return the pixels (x, y) of a region (m, 2), row by row.
+    """Return the pixels (x, y) of the region with a given `label` (m, 2), row by row.
 
-    The arguments are the labels of a frame (rows, columns), the bounding box (4,) of the region as in
-    `Regions`, and the label of the region.
+    The labels (rows, columns) and the bounding box (4,) are those of `Regions`.
     """
     top, bottom, left, right = box
     count, place = 0, 0
@@ -235,19 +222,17 @@ def pixels_of_region(labels: Image, box: IntArray, label: int) -> IntArray:
 
 def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
     """Return which regions (n,) lie within `border` px of the frame's border, which may truncate streaks."""
-    top, bottom, left, right = regions.boxes.T
-    return np.asarray(
-        (top < border) | (left < border) | (bottom > shape[0] - border) | (right > shape[1] - border)
-    )
+    (rows, columns), (top, bottom, left, right) = shape, regions.boxes.T
+    outside = (top < border) | (left < border) | (bottom > rows - border) | (right > columns - border)
+    return np.asarray(outside)
 
 
 def expected_sigma(regions: Regions, background: Background, settings: EndpointSettings) -> FloatArray:
     """Return the expected standard deviation of the position of the endpoints of each region (n,), px."""
     density = regions.flux / (regions.length + 3.0)
     variance = background.typical_noise**2 + _PEAK_FRACTION * density / settings.gain
-    return np.asarray(
-        np.hypot(settings.endpoint_floor, settings.endpoint_noise * np.sqrt(variance) / density)
-    )
+    noise = settings.endpoint_noise * np.sqrt(variance) / density
+    return np.asarray(np.hypot(settings.endpoint_floor, noise))
 
 
 def measure_streaks(
@@ -257,8 +242,7 @@ def measure_streaks(
 ) -> Streaks:
     """Return the streaks: the candidate regions whose cornerness has exactly two peaks.
 
-    The argument `cornerness` is a function of an image and the settings that returns the response at each
-    pixel, used instead of the Harris corner detector.
+    If `cornerness` is given, it returns the response at each pixel instead of the Harris detector.
     """
     respond = harris_cornerness if cornerness is None else cornerness
     sigma = expected_sigma(segmented.candidates, segmented.background, settings)
@@ -268,7 +252,13 @@ def measure_streaks(
     if cornerness is None and settings.centre_of == "response" and settings.smoothing_sigma <= 0.0:
         every = _harris_corners(segmented, settings)
     else:
-        every = [_corners_in(segmented, index, settings, respond) for index in range(len(sigma))]
+        regions, every = segmented.candidates, []
+        for box, label in zip(regions.boxes, regions.label.tolist(), strict=True):
+            image, mask, corner = _cut(segmented.signal, regions.labels, box, label)
+            response = respond(image, settings)
+            intensity = response if settings.centre_of == "response" else image
+            limits = settings.peak_relative, settings.intensity_half_width
+            every.append(find_corners(response, mask, *limits, intensity) + corner)
     for index, corners in enumerate(every):
         if len(corners) == 2:
             found.append(index)
@@ -280,31 +270,11 @@ def measure_streaks(
     return Streaks(stacked, sigma[chosen], segmented.candidates.flux[chosen], chosen, tuple(crowded))
 
 
-def _corners_in(
-    segmented: Segmented,
-    index: int,
-    settings: EndpointSettings,
-    respond: Callable[[FloatArray, EndpointSettings], FloatArray],
-) -> FloatArray:
-    """Return the corners (n, 2), px, of a candidate region, which are the peaks of `respond`."""
-    image, mask, corner = cut_out(segmented, index)
-    response = respond(image, settings)
-    intensity = response if settings.centre_of == "response" else image
-    corners = find_corners(response, mask, settings.peak_relative, settings.intensity_half_width, intensity)
-    return corners + corner
-
-
-def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return image and mask of a candidate region with a margin, and the frame position of their first pixel.
+def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Return image and mask of the region `label` with a margin, and the frame position of the first pixel.
 
     In the image, the pixels of other regions are zero.
     """
-    candidates = segmented.candidates
-    return _cut(segmented.signal, candidates.labels, candidates.boxes[index], int(candidates.label[index]))
-
-
-def _cut(signal: Image, labels: Image, box: IntArray, label: int) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return the image, mask and first pixel of the region `label` with a margin, as `cut_out` does."""
     rows, columns = signal.shape
     top, bottom, left, right = box
     top, left = max(top - _PADDING, 0), max(left - _PADDING, 0)
@@ -319,35 +289,25 @@ def _harris_corners(segmented: Segmented, settings: EndpointSettings) -> list[Fl
     """Return the corners (n, 2), px, of each candidate region by the Harris response of the frame."""
     candidates = segmented.candidates
     derivative, window = (kernel_radius(each) for each in (settings.derivative_sigma, settings.window_sigma))
-    corners, counts = _corners_of_regions(
-        segmented.signal,
-        candidates.labels,
-        candidates.boxes,
-        candidates.label,
-        gaussian_kernel(settings.derivative_sigma, derivative),
-        gaussian_derivative_kernel(settings.derivative_sigma, derivative),
-        gaussian_kernel(settings.window_sigma, window),
-        settings.harris_k,
-        settings.peak_relative,
-        settings.intensity_half_width,
-    )
+    smooth = gaussian_kernel(settings.derivative_sigma, derivative)
+    slope = gaussian_derivative_kernel(settings.derivative_sigma, derivative)
+    kernels = smooth, slope, gaussian_kernel(settings.window_sigma, window)
+    limits = settings.harris_k, settings.peak_relative, settings.intensity_half_width
+    regions = candidates.labels, candidates.boxes, candidates.label
+    corners, counts = _corners_of_regions(segmented.signal, *regions, kernels, limits)
     return np.split(corners, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
+_Kernels = tuple[FloatArray, FloatArray, FloatArray]
+"""Kernels of the Gaussian that smooths for the gradient, of its derivative, and of the tensor's window."""
+_Limits = tuple[float, float, int]
+"""Harris constant k, minimum relative response of a corner, and half-width of the centre of intensity, px."""
+
+
 def _corners_of_regions_numpy(
-    signal: Image,
-    labels: Image,
-    boxes: IntArray,
-    label: IntArray,
-    smooth: FloatArray,
-    slope: FloatArray,
-    window: FloatArray,
-    k: float,
-    relative: float,
-    half_width: int,
+    signal: Image, labels: Image, boxes: IntArray, label: IntArray, kernels: _Kernels, limits: _Limits
 ) -> tuple[FloatArray, IntArray]:
-    """Return the corners of regions as `_corners_of_regions` does."""
-    corners = [np.zeros((0, 2))]
+    corners, (smooth, slope, window), (k, relative, half_width) = [np.zeros((0, 2))], kernels, limits
     for box, own in zip(boxes, label.tolist(), strict=True):
         image, mask, corner = _cut(signal, labels, box, own)
         gx, gy = _separable(image, smooth, slope), _separable(image, slope, smooth)
@@ -361,34 +321,15 @@ def _corners_of_regions_numpy(
 
 @compiled_form_of(_corners_of_regions_numpy)
 def _corners_of_regions(
-    signal: Image,
-    labels: Image,
-    boxes: IntArray,
-    label: IntArray,
-    smooth: FloatArray,
-    slope: FloatArray,
-    window: FloatArray,
-    k: float,
-    relative: float,
-    half_width: int,
+    signal: Image, labels: Image, boxes: IntArray, label: IntArray, kernels: _Kernels, limits: _Limits
 ) -> tuple[FloatArray, IntArray]:
     """Return the positions (m, 2), px, of all corners in n regions, and the number of corners in each, (n,).
 
-    Corners are peaks of the Harris response, which is computed only near the pixels of the regions.
-
-    Args:
-        signal: counts above the background (rows, columns).
-        labels: label of the region at each pixel (rows, columns); 0 outside all regions.
-        boxes: first row, last row + 1, first column and last column + 1 of each region (n, 4).
-        label: labels of the regions (n,).
-        smooth: kernel of the Gaussian that smooths the image for the gradient.
-        slope: kernel of the derivative of the Gaussian that smooths the image.
-        window: kernel of the window of the structure tensor.
-        k: constant of the Harris response.
-        relative: minimum response of a corner, relative to the largest response.
-        half_width: half-width of the window of the centre of intensity, px.
+    Corners are peaks of the Harris response, which is computed only near the pixels of the regions. The
+    argument `signal` is the counts above the background (rows, columns). The labels at each pixel, the
+    bounding boxes and the labels of the regions are those of `Regions`.
     """
-    largest, most = 0, 0
+    largest, most, (k, _, half_width) = 0, 0, limits
     for number in range(len(boxes)):
         height, width = boxes[number, 1] - boxes[number, 0], boxes[number, 3] - boxes[number, 2]
         size = (height + 2 * _PADDING) * (width + 2 * _PADDING)
@@ -404,14 +345,13 @@ def _corners_of_regions(
         own, spans, margin = label[number], _spans_of(around, label[number]), max(half_width, 1)
         if bottom - top <= right - left:
             wanted = _widened(spans, margin, right - left)
-            response = _response(light, around, own, wanted, smooth, slope, window, k, scratch)
-            found = _peaks(response, around, own, spans, relative, half_width, corners[total:])
+            response = _response(light, around, own, wanted, kernels, k, scratch)
+            found = _peaks(response, around, own, spans, limits, corners[total:])
         else:
-            # The response of a streak along the columns is computed from the transposed image, because the
-            # computation of few long rows is faster than that of many short rows.
+            # A streak along columns is transposed, because few long rows take less time than many short ones.
             wanted = _widened(_spans_across(around, own, spans), margin, bottom - top)
-            response = _response(light.T, around.T, own, wanted, smooth, slope, window, k, scratch)
-            found = _peaks(response.T, around, own, spans, relative, half_width, corners[total:])
+            response = _response(light.T, around.T, own, wanted, kernels, k, scratch)
+            found = _peaks(response.T, around, own, spans, limits, corners[total:])
         corners[total : total + found] += np.array([left, top])
         counts[number] = found
         total += found
@@ -466,9 +406,7 @@ def _response(
     labels: Image,
     label: int,
     wanted: IntArray,
-    smooth: FloatArray,
-    slope: FloatArray,
-    window: FloatArray,
+    kernels: _Kernels,
     k: float,
     scratch: FloatArray,
 ) -> FloatArray:
@@ -477,7 +415,7 @@ def _response(
     The pixels of other regions are set to zero. The arrays `scratch` (5, m) are used as memory for the images
     of the cut-out.
     """
-    rows, columns = light.shape
+    (rows, columns), (smooth, slope, window) = light.shape, kernels
     size, shape = rows * columns, (rows, columns)
     image, half = scratch[0, :size].reshape(shape), scratch[1, :size].reshape(shape)
     xx, yy = scratch[2, :size].reshape(shape), scratch[3, :size].reshape(shape)
@@ -509,7 +447,7 @@ def _correlate(
     spans: IntArray,
     down: FloatArray,
     across: FloatArray,
-    scratch: FloatArray,
+    half: FloatArray,
     out: FloatArray,
 ) -> None:
     """Set `out` to the correlation of an image with an outer product, within spans of columns (rows, 2).
@@ -522,7 +460,7 @@ def _correlate(
         first, stop = max(spans[row, 0] - wide, 0), min(spans[row, 1] + wide + 1, columns)
         if first >= stop:
             continue
-        line = scratch[row, first:stop]
+        line = half[row, first:stop]
         line[:] = 0.0
         for tap in range(2 * high + 1):
             _add_scaled(image[min(max(row + tap - high, 0), rows - 1), first:stop], down[tap], line)
@@ -537,11 +475,11 @@ def _correlate(
             # The columns from `low` to `end` do not need pixels beyond the border.
             low, end = min(max(first, -step), stop), max(min(stop, columns - step), first)
             for column in range(first, low):
-                out[row, column] += factor * scratch[row, 0]
+                out[row, column] += factor * half[row, 0]
             if low < end:
-                _add_scaled(scratch[row, low + step : end + step], factor, out[row, low:end])
+                _add_scaled(half[row, low + step : end + step], factor, out[row, low:end])
             for column in range(max(end, low), stop):
-                out[row, column] += factor * scratch[row, columns - 1]
+                out[row, column] += factor * half[row, columns - 1]
 
 
 @loop_helper
@@ -552,16 +490,10 @@ def _add_scaled(values: FloatArray, factor: float, total: FloatArray) -> None:
 
 @loop_helper
 def _peaks(
-    response: FloatArray,
-    labels: Image,
-    label: int,
-    spans: IntArray,
-    relative: float,
-    half_width: int,
-    corners: FloatArray,
+    response: FloatArray, labels: Image, label: int, spans: IntArray, limits: _Limits, corners: FloatArray
 ) -> int:
     """Set `corners` to the centres of intensity at the peaks of the response, and return their number."""
-    rows, columns = response.shape
+    (rows, columns), (_, relative, half_width) = response.shape, limits
     top, count = 0.0, 0
     for row in range(1, rows - 1):
         for column in range(max(spans[row, 0], 1), min(spans[row, 1], columns - 2) + 1):

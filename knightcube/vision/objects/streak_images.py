@@ -19,8 +19,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 
-# Spacing (px) of the Gaussians whose sum models a streak.
-# The sum of Gaussians has a ripple of 0.2 % for a PSF of 0.6 px.
+# Spacing (px) of the Gaussians that model a streak; the ripple is 0.2 % for a PSF of 0.6 px.
 _STEP_PX = 1.0
 # Number of points of a star's path from which the length of the path is computed.
 _SAMPLES = 17
@@ -29,13 +28,14 @@ _FARTHEST = 5.0
 _BELL, _ROOT_HALF = 1.0 / math.sqrt(2.0 * math.pi), math.sqrt(0.5)
 
 
-def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole: Pinhole) -> FloatArray:
-    """Return points (m, 2), px, along the path of a star during the exposure.
+_View = tuple[float, float, float]
+"""Focal length and image centre (x, y) of a camera, px."""
 
-    The argument `direction` (3,), camera axes, is the direction of the star when it has covered the fraction
-    `start` of its path.
-    """
-    return np.asarray(star_paths(direction[None], rotation, np.array([start]), pinhole)[0])
+
+def star_path(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+    """Return points (m, 2), px, along the path of a star that is at `middle` (2,), px, at mid-exposure."""
+    directions = pinhole.unit_vectors(middle[None])
+    return np.asarray(star_paths(directions, rotation, np.array([0.5]), pinhole)[0])
 
 
 def star_paths(
@@ -46,23 +46,18 @@ def star_paths(
     The array `directions` (n, 3), camera axes, contains the direction of each star when it has covered the
     fraction `starts` (n,) of its path. All paths have the number of points that the longest path requires.
     """
-    return _paths_on_circles(directions, rotation, starts, pinhole.focal_length, *pinhole.centre)
+    return _paths_on_circles(directions, rotation, starts, (pinhole.focal_length, *pinhole.centre))
 
 
 def _paths_on_circles_numpy(
-    directions: FloatArray,
-    rotation: FloatArray,
-    starts: FloatArray,
-    focal: float,
-    centre_x: float,
-    centre_y: float,
+    directions: FloatArray, rotation: FloatArray, starts: FloatArray, view: _View
 ) -> FloatArray:
-    """Return the points of `star_paths` for a focal length, px, and a centre of the image, px."""
+    focal, *centre = view
 
     def projected(parts: FloatArray) -> FloatArray:
         vectors = _rotated(directions, rotation, parts - starts[:, None])
         ahead = np.where(vectors[..., 2:] > 0.0, vectors[..., 2:], np.nan)
-        return np.asarray(focal * vectors[..., :2] / ahead + np.array([centre_x, centre_y]))
+        return np.asarray(focal * vectors[..., :2] / ahead + np.array(centre))
 
     steps = np.diff(projected(np.linspace(0.0, 1.0, _SAMPLES)), axis=1)
     lengths = np.hypot(steps[..., 0], steps[..., 1]).sum(axis=1)
@@ -72,14 +67,9 @@ def _paths_on_circles_numpy(
 
 @compiled_form_of(_paths_on_circles_numpy)
 def _paths_on_circles(
-    directions: FloatArray,
-    rotation: FloatArray,
-    starts: FloatArray,
-    focal: float,
-    centre_x: float,
-    centre_y: float,
+    directions: FloatArray, rotation: FloatArray, starts: FloatArray, view: _View
 ) -> FloatArray:
-    """Return the points of `star_paths` for a focal length, px, and a centre of the image, px."""
+    focal, centre_x, centre_y = view
     stars, longest = len(starts), 0.0
     sampled = np.empty((_SAMPLES, 2))
     for star in range(stars):
@@ -129,9 +119,7 @@ def straight_path(ends: FloatArray, parts: FloatArray | None = None) -> FloatArr
 
     The points are those at the given fractions `parts` (m,) of the line, or evenly spaced points.
     """
-    if parts is None:
-        steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
-        parts = (np.arange(steps) + 0.5) / steps
+    parts = _even_parts(ends) if parts is None else parts
     return np.asarray(ends[0] + parts[:, None] * (ends[1] - ends[0]))
 
 
@@ -144,17 +132,14 @@ def path_among_stars(
     assumed. The array `parts` (m,) contains the position of each point as a fraction of the motion, counted
     from the first of the `ends`. If `parts` is None, the points are evenly spaced.
     """
-    if parts is None:
-        steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
-        parts = (np.arange(steps) + 0.5) / steps
-    return _path_among_stars(ends, rotation, parts, float(pinhole.focal_length), *pinhole.centre)
+    parts = _even_parts(ends) if parts is None else parts
+    return _path_among_stars(ends, rotation, parts, (float(pinhole.focal_length), *pinhole.centre))
 
 
 def _path_among_stars_numpy(
-    ends: FloatArray, rotation: FloatArray, parts: FloatArray, focal: float, centre_x: float, centre_y: float
+    ends: FloatArray, rotation: FloatArray, parts: FloatArray, view: _View
 ) -> FloatArray:
-    """Return the points of `path_among_stars` for a focal length, px, and a centre of the image, px."""
-    centre = np.array([centre_x, centre_y])
+    focal, centre = view[0], np.array(view[1:])
     vectors = np.concatenate([(ends - centre) / focal, np.ones((2, 1))], axis=1)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     # Both ends are rotated to mid-exposure from the start and from the end of the exposure.
@@ -170,10 +155,8 @@ def _path_among_stars_numpy(
 
 
 @compiled_form_of(_path_among_stars_numpy)
-def _path_among_stars(
-    ends: FloatArray, rotation: FloatArray, parts: FloatArray, focal: float, centre_x: float, centre_y: float
-) -> FloatArray:
-    """Return the points of `path_among_stars` for a focal length, px, and a centre of the image, px."""
+def _path_among_stars(ends: FloatArray, rotation: FloatArray, parts: FloatArray, view: _View) -> FloatArray:
+    focal, centre_x, centre_y = view
     angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
     axis = rotation / (angle if angle > 0.0 else 1.0)
     middle, apart = np.empty((2, 2, 3)), np.zeros(2)
@@ -235,20 +218,24 @@ def _rotated(directions: FloatArray, rotation: FloatArray, parts: FloatArray) ->
     return np.asarray(out)
 
 
+def _even_parts(ends: FloatArray) -> FloatArray:
+    """Return the positions (m,) of evenly spaced points between two ends (2, 2), px, from 0 to 1."""
+    steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
+    return np.asarray((np.arange(steps) + 0.5) / steps)
+
+
 def _steps(length: float) -> int:
     return max(1, int(np.ceil(length / _STEP_PX)))
 
 
 def _pixels_near_numpy(points: FloatArray, reach: float, rows: int, columns: int) -> IntArray:
-    """Return the pixels (x, y) within about `reach` px of any of the points (m, 2), row by row, as (p, 2)."""
     points = np.rint(points)
     r = int(np.ceil(reach))
     inside = np.all((points >= -r) & (points < (columns + r, rows + r)), axis=-1)
     points = points[inside].astype(np.int64)
     first = points.min(axis=0, initial=columns + rows) - r
     width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
-    # The map of the points is widened along the rows by each half-width of a disc. Shifted along the columns
-    # and combined, the widened maps mark a disc around each point.
+    # The points are widened along rows to the widths of a disc, then shifted along columns and combined.
     lit = np.zeros((height, width), dtype=np.bool_)
     lit[points[:, 1] - first[1], points[:, 0] - first[0]] = True
     marked = np.zeros_like(lit)
@@ -347,15 +334,11 @@ _LEAST_POINTS = 4
 
 
 def streak_at(pixels: IntArray, path: FloatArray, sigma: float) -> FloatArray:
-    """Return the image (p,), on `pixels` (p, 2), of a streak with one count in total along `path` (m, 2), px.
-
-    See `streak_images`.
-    """
+    """Return the image (p,) on `pixels` (p, 2) of one streak along `path` (m, 2), px, see `streak_images`."""
     return np.asarray(streak_images(pixels, path[None], sigma, False)[0, 0])
 
 
 def _streak_images_numpy(pixels: IntArray, paths: FloatArray, sigma: float, slopes: bool) -> FloatArray:
-    """Return the images of streaks as `streak_images` does."""
     images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
     for path, image in zip(paths, images, strict=True):
         chord = path[-1] - path[0]
@@ -440,12 +423,9 @@ def streak_images(pixels: IntArray, paths: FloatArray, sigma: float, slopes: boo
     the pixel. The error is at most 2 % of the largest value. The image of a strongly curved path is the sum
     of the images of its points.
 
-    Args:
-        pixels: pixels (p, 2), row by row, on which the images are computed.
-        paths: points of the paths (k, m, 2), px.
-        sigma: standard deviation of the PSF, px.
-        slopes: whether the image of each streak is followed by its two derivatives, 1/px, with respect to a
-            displacement of the whole path along x and along y.
+    The `pixels` (p, 2) are sorted by row. The points of the `paths` (k, m, 2) are in px. With `slopes`, the
+    image of each streak is followed by its two derivatives, 1/px, with respect to displacements of the whole
+    path along x and along y.
     """
     images = np.zeros((len(paths), 3 if slopes else 1, len(pixels)))
     for k in range(len(paths)):
@@ -485,7 +465,6 @@ def _bell(x: float) -> float:
 
 @loop_helper
 def _add_points(image: FloatArray, pixels: IntArray, points: FloatArray, sigma: float) -> None:
-    """Add one count, divided equally among the `points` (m, 2), px, to `image` (1 or 3, p)."""
     reach, share = _FARTHEST * sigma + 1.0, 1.0 / len(points)
     for k in range(len(points)):
         for p in range(len(pixels)):
@@ -564,7 +543,6 @@ def _first_from(pixels: IntArray, row: float) -> int:
 
 @loop_helper
 def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: float) -> None:
-    """Add the light of one count along a nearly straight `path` (m, 2), px, to `image` (1 or 3, p)."""
     m, width = len(path), math.sqrt(sigma**2 + 1.0 / 12.0)
     room, narrow = _FARTHEST * width, 1.0 / width
     x0, y0, light = path[0, 0], path[0, 1], image[0]
@@ -614,25 +592,16 @@ def _add_streak(image: FloatArray, pixels: IntArray, path: FloatArray, sigma: fl
             image[2, p] += whole * cosine * (aside * (x - bend * y) - sloping * (y + bend * x))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LineImage:
-    """Image on p pixels of a straight streak with one count in total, and the derivatives of this image.
+def line_image(
+    ends: FloatArray, columns: int, rows: int, sigma: float
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the image, with one count in total, of a straight streak between different `ends` (2, 2), px.
 
-    Attributes:
-        pixels: flat indices of the pixels in the patch (p,).
-        images: five rows (5, p): the counts of the pixels, and the derivatives of the counts, 1/px, with
-            respect to four displacements. The displacements are those of the first end along and across the
-            streak, and of the second end along and across the streak.
-        axes: unit vectors along and across the streak (2, 2).
+    The returned arrays are the flat indices of p pixels nearby (p,), five images on these pixels (5, p), and
+    the unit vectors along and across the streak (2, 2). The images are the counts, and the derivatives of the
+    counts, 1/px, with respect to displacements of the first end along and across the streak, and of the
+    second end along and across the streak.
     """
-
-    pixels: IntArray
-    images: FloatArray
-    axes: FloatArray
-
-
-def line_image(ends: FloatArray, columns: int, rows: int, sigma: float) -> LineImage:
-    """Return the image of a straight streak between two different `ends` (2, 2), px, on the pixels nearby."""
     width = float(np.sqrt(sigma**2 + 1.0 / 12.0))
     length = float(np.linalg.norm(ends[1] - ends[0]))
     tangent = (ends[1] - ends[0]) / length
@@ -649,20 +618,13 @@ def line_image(ends: FloatArray, columns: int, rows: int, sigma: float) -> LineI
     profile = np.exp(-0.5 * (n / width) ** 2) / (np.sqrt(2.0 * np.pi) * width * length)
     covered = ndtr(a) - ndtr(b)
     whole = profile * covered
-    # The first moment of the image, with the relative position along the streak, is the contribution of the
-    # second end.
+    # The first moment, with the relative position along the streak, is the contribution of the second end.
     second = profile * (s * covered + width * (bell_a - bell_b)) / length
     aside = n / width**2
-    images = np.stack(
-        [
-            whole,
-            whole / length - profile * bell_a / width,
-            aside * (whole - second),
-            profile * bell_b / width - whole / length,
-            aside * second,
-        ]
-    )
-    return LineImage((y[row]) * columns + x[column], images, axes)
+    first_along = whole / length - profile * bell_a / width
+    last_along = profile * bell_b / width - whole / length
+    images = np.stack([whole, first_along, aside * (whole - second), last_along, aside * second])
+    return y[row] * columns + x[column], images, axes
 
 
 # Largest step (px) in the fit of a line, step (px) below which the fit ends, and maximum number of steps.
@@ -682,17 +644,16 @@ def least_squares(images: FloatArray, target: FloatArray) -> FloatArray:
 
 
 def _fitted_line_numpy(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float) -> FloatArray:
-    """Return the ends of a line as `fitted_line` does."""
     rows, columns = light.shape
     weights, lights = weight.reshape(-1), light.reshape(-1)
     for _ in range(_FITS):
-        line = line_image(ends, columns, rows, sigma)
-        share = weights[line.pixels]
-        solution = least_squares((line.images * share).T, lights[line.pixels] * share)
+        pixels, images, axes = line_image(ends, columns, rows, sigma)
+        share = weights[pixels]
+        solution = least_squares((images * share).T, lights[pixels] * share)
         if solution[0] <= 0.0:
             break
         steps = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP).reshape(2, 2)
-        ends = ends + steps @ line.axes
+        ends = ends + steps @ axes
         if np.abs(steps).max() < _CONVERGED or np.all(ends[0] == ends[1]):
             break
     return ends
@@ -702,11 +663,8 @@ def _fitted_line_numpy(light: FloatArray, weight: FloatArray, ends: FloatArray, 
 def fitted_line(light: FloatArray, weight: FloatArray, ends: FloatArray, sigma: float) -> FloatArray:
     """Return the ends (2, 2), px, of the line that Gauss-Newton fits to the counts `light` (rows, columns).
 
-    Args:
-        light: counts of the pixels (rows, columns).
-        weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts.
-        ends: initial guess of the two ends (2, 2), px, which differ.
-        sigma: standard deviation of the PSF, px.
+    The reciprocal standard deviations of the pixels are `weight` (rows, columns), 1/counts. The two `ends`
+    (2, 2), px, are an initial guess, and differ.
     """
     ends = ends.copy()
     sums = np.empty((6, 5))
@@ -840,11 +798,8 @@ def spread_with_slopes(
 class _Profiles:
     """Profiles of m points on w adjacent pixels along one axis of `count` pixels.
 
-    Attributes:
-        count: number of pixels along the axis.
-        first: index of the first of the w pixels of each point (m,), which may be outside the range of the
-            axis.
-        values: integrals of the point spread over the pixels (m, w).
+    The first of the w pixels of each point (m,) may be outside the range of the axis. The values (m, w) are
+    the integrals of the point spread over the pixels.
     """
 
     count: int
@@ -870,8 +825,7 @@ def _added(x: _Profiles, y: _Profiles, across: FloatArray, down: FloatArray) -> 
     """Return the image (rows, columns) of points that are each the product of two profiles.
 
     The arrays `across` (m, w) and `down` (m, w) contain the two factors of each point, on the pixels that the
-    profiles `x` and `y` cover along the two axes. Only the pixels near the points are computed, which saves
-    time for long streaks in large images.
+    profiles `x` and `y` cover along the two axes.
     """
     width = across.shape[1]
     columns = x.count + 2 * width

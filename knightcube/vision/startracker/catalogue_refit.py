@@ -27,7 +27,6 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
-from knightcube.vision.streaks.distorted_pinhole import streak_pinhole
 from knightcube.vision.streaks.estimate import StreakVerdict, with_rate, with_stars
 from knightcube.vision.streaks.frame import ReducedFrame, reduce_frame
 from knightcube.vision.streaks.geometry import (
@@ -39,11 +38,11 @@ from knightcube.vision.streaks.geometry import (
     path_lengths,
     polar_angles,
     positions,
+    streak_pinhole,
 )
 from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
 from knightcube.vision.streaks.normal_equations import light_of
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 
 # Ratio of the distance below which streaks overlap to the half-width of the strip of a bright streak.
 _NEAR = 1.4

@@ -34,8 +34,12 @@ from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, ap
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind
 from knightcube.vision.startracker.verification import PRIOR_SIGMAS, expected_stars, track
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import (
+    FrameMotion,
+    LikelihoodSettings,
+    MotionResult,
+    StreakStatus,
+)
 
 
 class SolveStatus(Enum):

@@ -24,15 +24,16 @@ from itertools import chain, islice
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from knightcube.vision.frame import saturation_count
-from knightcube.vision.streaks.faint_stars import FaintStars, find_faint, frame_angles
+from knightcube.vision.streaks.faint_stars import FaintStars, find_faint, polar_grid
 from knightcube.vision.streaks.first_guess import (
     SCANNED_STARS,
     Circles,
     MotionGuess,
     find_axis,
+    frame_angles,
     guess_axis,
     measured_rate_change,
     motion_by_course,
@@ -46,10 +47,11 @@ from knightcube.vision.streaks.geometry import (
     Course,
     Shutter,
     StreakScene,
-    chained_stars,
+    azimuth_differences,
     exposure_bounds,
     mid_exposure_positions,
     path_lengths,
+    polar_angles,
     positions,
     sensitivities,
 )
@@ -67,15 +69,15 @@ from knightcube.vision.streaks.joint_fit import (
     true_ends,
     unbroken,
 )
-from knightcube.vision.streaks.polar_grid import polar_grid
-from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 from knightcube.vision.streaks.streak_result import (
     REASONS,
+    LikelihoodSettings,
     MotionResult,
     StreakStatus,
     admit,
     direction_of_time,
     in_time,
+    knowledge_of_pinhole,
     validate,
 )
 from knightcube.vision.streaks.uncertainty import (
@@ -119,18 +121,15 @@ _CROWDED = 0.05
 _BEYOND_CROWD = 100_000.0
 # Largest excess chi-square of a well-fitted star, relative to the star's squared significance.
 _MOST_RESIDUAL = 0.01
-# Largest significance (standard deviations) with which one star contributes to the chi-square that a fit
-# explains.
+# Upper limit of a star's significance (standard deviations) in the chi-square that a fit explains.
 _ENOUGH = 200.0
-# Weight of the flux in regions longer than the guessed streak length in the comparison of guesses. The weight
-# of overlong regions is below 1, because a long region may be a blend of two streaks.
+# Weight of the flux in overlong regions, which may be blends of two streaks, in the comparison of guesses.
 _CONTRADICTION = 0.6
 # Median chi-square per degree of freedom of a preliminary fit above which a vibration is fitted.
 _SHAKEN = 2.5
 # Last step of a preliminary fit (standard deviations) below which the fit counts as converged.
 _CALM = 2.0
-# Fraction of streak ends that a wrong rotation confirms by chance, because it matches one end of a streak. In
-# the comparison of guesses, it is subtracted from the fraction of confirmed streak ends.
+# Fraction of streak ends that a wrong rotation confirms, because it matches one end of each streak.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -223,13 +222,11 @@ def _rescanned(
         bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
         x, y, z = frame @ pinhole.unit_vectors(found.stars[bright]).T
         circles = Circles(frame, z, np.arctan2(y, x))
-        for candidate in islice(scan_angles(camera.frame, pinhole, circles, 1, angle), 1):
-            stars, light = candidate.stars[:_FIRST_STARS], candidate.light[:_FIRST_STARS]
-            if len(light) < settings.least_stars:
+        for best, stars, light in scan_angles(camera.frame, pinhole, circles, 1, angle):
+            if len(light[:_FIRST_STARS]) < settings.least_stars:
                 continue
-            tried = _tried(
-                camera, MotionGuess(CameraMotion.steady(frame[2] * candidate.angle), stars, light, 0.0)
-            )
+            motion = CameraMotion.steady(frame[2] * best)
+            tried = _tried(camera, MotionGuess(motion, stars[:_FIRST_STARS], light[:_FIRST_STARS], 0.0))
             if tried is not None:
                 yield tried
 
@@ -268,18 +265,15 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     A convincing fit is accepted without comparison with other fits. Returns None if the fit does not succeed.
     """
     count = len(guess.light)
-    everyone = np.ones(count, dtype=np.bool_)
-    width = float(np.hypot(camera.sigma, 0.29))
     motion = guess.motion if camera.course is None else camera.course.scaled_to(guess.motion.rotation)
     motion = motion if camera.sense is None else motion.directed(camera.sense)
     stars = mid_exposure_positions(camera.pinhole, motion, camera.shutter, guess.stars)
-    scene = StreakScene(motion, width, stars, guess.light, np.zeros(count), everyone)
+    scene = StreakScene.of(motion, camera.sigma, stars, guess.light)
     camera = replace(camera, growing=not motion.constant)
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # The variable `ends` is the fraction of confirmed streak ends or that of streaks without gaps, whichever
-    # is smaller.
+    # The variable `ends` is the fraction of confirmed streak ends or of unbroken streaks, the smaller.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
@@ -306,10 +300,8 @@ def _vibrating(camera: FitProblem, fit: StreakFit) -> StreakFit | None:
 def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
     """Return a fit of star positions, fluxes and the point-spread width for a camera at rest."""
     count = min(len(regions), camera.settings.most_stars)
-    width = float(np.hypot(camera.sigma, 0.29))
-    everyone = np.ones(count, dtype=np.bool_)
     still = CameraMotion.steady(np.zeros(3))
-    scene = StreakScene(still, width, regions.centre[:count], regions.flux[:count], np.zeros(count), everyone)
+    scene = StreakScene.of(still, camera.sigma, regions.centre[:count], regions.flux[:count])
     free = np.array([False] * 6 + [True])
     return iterate(camera, scene, free, replace(LAST, rounds=_STILL_ROUNDS))
 
@@ -328,6 +320,14 @@ _AGREEING_LIGHT = 0.5
 _UNEVEN = 0.4
 # Largest accepted fraction of stars with flux beyond a streak end.
 _MOST_TRAILING = 0.5
+
+
+# Largest distance (px) across the streak between two segments of one streak.
+_CHAIN_ASIDE = 1.3
+# Smallest and largest angle between the centres of two segments of one streak, relative to the rotation.
+_CHAIN_APART = (0.55, 1.7)
+# Largest flux ratio of two segments of one streak.
+_CHAIN_RATIO = 2.5
 
 
 class StreakVerdict(Enum):
@@ -376,14 +376,31 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     return StreakVerdict.DOUBTFUL if doubted else StreakVerdict.CONFIRMED
 
 
+def chained_stars(
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
+) -> BoolArray:
+    """Return whether each of the first `judged` stars seems to be only a segment of a streak, (judged,).
+
+    If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
+    on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.
+    Different stars rarely form a chain of equal segments by chance.
+    """
+    polar, azimuth = polar_angles(pinhole, motion, stars)
+    rotations = azimuth_differences(azimuth[:judged], azimuth)
+    rotations = rotations / max(float(np.linalg.norm(motion.rotation)), 1e-12)
+    aside = np.abs(polar[:judged, None] - polar) * pinhole.focal_length
+    ratio = light[:judged, None] / np.maximum(light, 1e-9)
+    joined = (aside < _CHAIN_ASIDE) & (rotations > _CHAIN_APART[0]) & (rotations < _CHAIN_APART[1])
+    return np.asarray((joined & (ratio < _CHAIN_RATIO) & (ratio > 1.0 / _CHAIN_RATIO)).any(axis=1))
+
+
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
     """Return whether most flux of bright, complete streaks belongs to stars that contradict the motion."""
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
         inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
-    # Stars that are fainter than all stars in the fit are ignored, because they were not compared with the
-    # motion.
+    # Stars fainter than all stars in the fit are ignored, because they were not compared with the motion.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
@@ -393,8 +410,7 @@ def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
 _SAME_STAR = 3.0
 # Minimum chi-square difference between the two signs of the rotation for a decision on the sign.
 _LEAST_MARGIN = 50.0
-# Minimum ratio of the chi-square difference between both signs to its scatter over the stars for a decision
-# on the sign.
+# Minimum ratio of the chi-square difference between both signs to its scatter, for a decision on the sign.
 _LEAST_AGREEMENT = 3.0
 # Upper limit of a single star's chi-square difference in the decision on the sign of the rotation.
 _MOST_DIFFERENCE = 50.0
@@ -402,15 +418,10 @@ _MOST_DIFFERENCE = 50.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A motion from the joint fit, with its streaks.
+    """A motion from the joint fit, with its rotation vector over the exposure (3,), rad, and its streaks.
 
-    Attributes:
-        result: estimation result with the motion.
-        rotation: rotation vector over the exposure (3,), rad.
-        verdict: result of the streak check for the motion.
-        middles: centres of the n bright streaks (n, 2), px. For a global shutter, `middles` is empty.
-        excess: chi-square of each bright streak minus the number of its pixels (n,). For a global shutter,
-            `excess` is empty.
+    For a rolling shutter, `middles` (n, 2), px, are the centres of the n bright streaks, and `excess` (n,) is
+    the chi-square of each streak minus the number of its pixels. For a global shutter, both are empty.
     """
 
     result: MotionResult
@@ -421,7 +432,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the result of the streak check is `CONFIRMED` or `DOUBTFUL`."""
+        """Whether the motion is not rejected by the streak check."""
         return self.verdict is not StreakVerdict.REJECTED
 
 
@@ -434,12 +445,9 @@ def _rolling_result(
 ) -> MotionResult | None:
     """Return the result for a camera with a rolling shutter, or None if no motion fits.
 
-    Args:
-        fit_along: function that fits a motion with a rotation in the sense of a given vector (3,).
-        axis: initial guess of the rotation axis (3,), with arbitrary sign.
-        prior_rate: (3,) rad/s; None if unknown.
-        prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
-        sigmas: minimum significance (standard deviations) with which the prior rate determines the sign.
+    The function `fit_along` fits a motion with a rotation in the sense of a given vector (3,). The rotation
+    `axis` (3,) is an initial guess with arbitrary sign. The prior rate determines the sign if its
+    significance exceeds `sigmas` standard deviations.
     """
     if prior_rate is not None:
         sign = direction_of_time(axis, prior_rate, prior_sigma, sigmas)
@@ -455,8 +463,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # If the fit succeeds for only one sign, the other sign may still be correct, so that no rate is
-        # returned.
+        # If the fit succeeds for only one sign, the other sign may still be correct, so no rate is returned.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -475,8 +482,7 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y in the vector of the shared parameters followed by one star's
-# parameters.
+# Indices of rate, acceleration, x and y in the vector of shared parameters and one star's parameters.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 # Index of the flux in the vector of the shared parameters followed by one star's parameters.
 _LIGHT = 9
@@ -484,8 +490,7 @@ _LIGHT = 9
 _UNSETTLED = 2.0
 # Minimum decrease of chi-square for which a rotation that reverses during the exposure is assumed.
 _REVERSED = 30.0
-# Largest distance (px) between two streaks that count as a double image of one star.
-# Vibration causes double images, because a star spends most time at the turning points of the vibration.
+# Largest distance (px) between the two streaks of a double image, which a vibration causes.
 _DOUBLE = 8.0
 # Minimum flux ratio of the fainter to the brighter component of a double image.
 _DOUBLE_RATIO = 0.3
@@ -666,18 +671,10 @@ def estimate_motion(
 ) -> MotionResult:
     """Return the mean rate over one exposure with its covariance, and the stars of the frame `pixels`.
 
-    Args:
-        pixels: raw counts (rows, columns), of an unsigned integer type.
-        pinhole: pinhole model of a camera with the shape of `pixels`.
-        exposure: exposure time, s.
-        settings: settings of the camera and of the fit.
-        prior_rate: approximate rate (3,) in camera axes, rad/s, which determines only the sign of the
-            rotation. None: unknown.
-        prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
-        previous_checksum: checksum of the previous frame. A frame with the same checksum indicates a frozen
-            camera.
-        prior_course: rotation as a function of time during the exposure, as estimated by the navigation
-            filter; None if unknown.
+    The camera `pinhole` has the shape of the frame (rows, columns). The exposure, the settings and the prior
+    rate are those of `estimate_rate`. A frame with the checksum `previous_checksum` of the previous frame
+    indicates a frozen camera. The `prior_course` is the rotation as a function of time during the exposure,
+    as estimated by the navigation filter; None if unknown.
 
     Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the attributes
     `status` and `reason` of the result state the cause.
@@ -688,19 +685,19 @@ def estimate_motion(
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
-    prepared = prepare_frame(pixels, pinhole, saturation, settings)
-    binning, regions, line_time_sigma = prepared.binning, prepared.regions, settings.line_time_sigma
+    binning, frame, regions, sigma = prepare_frame(pixels, pinhole, saturation, settings)
+    line_time_sigma = settings.line_time_sigma
     settings, pinhole = binning.settings(settings), binning.pinhole
     shutter = Shutter(settings.delay_per_row / exposure, pinhole.centre[1])
     growing = settings.rate_model == "accelerating"
-    camera = FitProblem(prepared.frame, pinhole, shutter, settings, prepared.sigma, growing)
+    camera = FitProblem(frame, pinhole, shutter, settings, sigma, growing)
     if prior_course is not None and settings.rate_model != "constant":
         camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
     seen = MotionResult(
         StreakStatus.FAILED,
         checksum,
         exposure,
-        hot_pixels=prepared.frame.hot_pixels,
+        hot_pixels=frame.hot_pixels,
         line_time_sigma=line_time_sigma,
     )
     if len(regions) < settings.least_stars:
@@ -768,9 +765,8 @@ def _best_motion(
     leading = _fitted(camera, seen, first)
     if leading.verdict is StreakVerdict.CONFIRMED:
         return leading
-    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle. A scan of the
-    # whole frame takes less time than the fit of another motion. If streaks are broken into fragments, the
-    # rotation axis of the fit is often correct, but the angle is wrong.
+    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle. If streaks are
+    # broken into fragments, the rotation axis of the fit is often correct, but the angle is wrong.
     angles = _frame_angles(camera, leading.rotation)
     if leading.possible and _has_angle(leading.rotation, angles):
         return leading
@@ -806,19 +802,16 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     last, found = _candidate(camera, seen, first)
     if found.possible or first.scene.motion.vibration.exists:
         return found
-    start = first if last is None else _bright_stars(camera, last, len(first.scene.light))
+    start = first
+    if last is not None:
+        scene = last.scene.select(np.flatnonzero(last.scene.trusted))
+        scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
+        start = replace(last, scene=scene, windows=camera.windows(scene), hidden=None)
     vibrating = _vibrating(replace(camera, growing=bool(start.free[3])), start)
     if vibrating is None:
         return found
     shaken = _candidate(camera, seen, vibrating)[1]
     return shaken if shaken.possible else found
-
-
-def _bright_stars(camera: FitProblem, fit: StreakFit, most: int) -> StreakFit:
-    """Return a fit reduced to the `most` brightest stars that determine the motion."""
-    scene = fit.scene.select(np.flatnonzero(fit.scene.trusted))
-    scene = scene.select(np.argsort(-scene.light, kind="stable")[:most])
-    return replace(fit, scene=scene, windows=camera.windows(scene), hidden=None)
 
 
 def _candidate(

@@ -1,4 +1,4 @@
-"""Detection of faint star streaks for a known motion, and search for the rotation angle, on polar grids.
+"""Detection of faint star streaks for a known motion on a polar grid about the rotation axis.
 
 The sums of 3 x 3 pixels of the frame are sampled on circles about the rotation axis, where all streaks are
 straight and equally long. The matched filter of a streak is a running sum over the length of the streak.
@@ -6,34 +6,377 @@ Along a circle, the filter response to a star is a triangle, truncated at the bo
 the circles, the filter response is proportional to the brightness profile of the star. Each peak of the
 filter response is a star. The heights of overlapping peaks are the solution of a linear system. For bright
 stars, the second difference of the response along the circle separates overlapping triangles.
-
-If the brightest regions do not determine the rotation angle, all circles are searched. The search of all
-circles is needed if streaks are faint and fragmented, or if the border truncates all streaks. The mean of the
-pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
-length with the largest sum of squared significances is the length of the streaks.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
-from knightcube.compiled import compiled_form_of
+from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, paths
-from knightcube.vision.streaks.polar_grid import (
-    ACROSS,
-    PolarGrid,
-    RunningSums,
-    cumulative_sums,
-    polar_grid,
-    running_sums,
-)
+
+Int32Array = npt.NDArray[np.int32]
+
+ACROSS = 1.8
+"""Spacing (px) of neighbouring circles of the polar grid."""
+
+# Spacing (px) of the samples along a circle of the polar grid.
+_ALONG = 4.0
+# Number of circles processed in one step, small enough for their samples to fit into the processor's cache.
+_CHUNK = 64
+# Smallest angle (rad) between a circle of the polar grid and the rotation axis.
+_NEAREST = 0.003
+# Spacing (px) of the points that trace the border of the detector.
+_BORDER_STEP = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolarGrid:
+    """A polar grid of c samples on each of r circles about the rotation axis.
+
+    Attributes:
+        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the axis.
+        polar: angle between each circle and the rotation axis (r,), rad.
+        azimuth: azimuth about the rotation axis of each sample on a circle (c,), rad.
+        length: length of a streak, as a number of samples along a circle.
+        angle: rotation angle over the exposure, rad.
+        speed: image displacement per radian of azimuth on each circle (r,), px/rad.
+    """
+
+    frame: FloatArray
+    polar: FloatArray
+    azimuth: FloatArray
+    length: float
+    angle: float
+    speed: FloatArray
+
+    @property
+    def full(self) -> bool:
+        """Whether the circles of the polar grid are complete, with azimuths from 0 to 2 pi."""
+        return abs(float(self.azimuth[-1] - self.azimuth[0])) > 2.0 * np.pi - 0.05
+
+    @property
+    def off_centre(self) -> float:
+        """Offset (samples) of the centre of a running sum from a sample: 0, or 0.5 for an even sum length."""
+        return 0.0 if round(self.length) % 2 else 0.5
+
+    def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
+        """Return the pixel coordinates (k, 2) at fractional rows and columns (k,) of the polar grid."""
+        polar = self.polar[0] + row * (self.polar[1] - self.polar[0])
+        azimuth = self.azimuth[0] + column * (self.azimuth[1] - self.azimuth[0])
+        local = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+        return pinhole.project((self.frame.T @ local).T)
+
+
+def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
+    """Return a polar grid with one in `every` of the circles that cross the detector."""
+    angle = float(np.linalg.norm(motion.rotation))
+    axis = motion.rotation / angle
+    middle = np.array([0.0, 0.0, 1.0])
+    if axis @ middle < 0.0:
+        axis = -axis
+    first = middle - (middle @ axis) * axis
+    inside_field = float(np.arccos(np.clip(axis[2], -1.0, 1.0)))
+    if np.linalg.norm(first) < 1e-6:
+        first = np.array([1.0, 0.0, 0.0])
+    first = first / np.linalg.norm(first)
+    frame = np.stack([first, np.cross(axis, first), axis])
+    half = pinhole.half_diagonal
+    spacing = every * ACROSS / pinhole.focal_length
+    polar = np.arange(max(inside_field - half, _NEAREST), inside_field + half, spacing)
+    fastest = float(np.max(np.sin(polar))) * pinhole.focal_length
+    step = min(_ALONG / fastest, angle / 6.0)
+    widest = float(np.pi)
+    if inside_field > half:
+        widest = float(np.arcsin(min(np.sin(half) / np.sin(inside_field), 1.0)))
+    widest = min(widest + 0.5 * angle, np.pi)
+    azimuth = np.arange(-widest, widest, step)
+    return PolarGrid(frame, polar, azimuth, angle / step, angle, np.sin(polar) * pinhole.focal_length)
+
+
+def _direction_terms(grid: PolarGrid) -> tuple[Float32Array, Float32Array]:
+    """Return terms (3, c) of azimuths and (3, r) of circles, whose sum is the direction of a sample.
+
+    The direction is not a unit vector, but is divided by the sine of its polar angle.
+    """
+    turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
+    rising = grid.frame[2][:, None] / np.tan(grid.polar)
+    return turning.astype(np.float32), rising.astype(np.float32)
+
+
+_Camera = tuple[tuple[float, float, float], tuple[int, int]]
+"""Focal length and image centre (x, y), px, and numbers of columns and rows."""
+
+
+def _camera_of(pinhole: Pinhole) -> _Camera:
+    return (float(pinhole.focal_length), *pinhole.centre), (pinhole.columns, pinhole.rows)
+
+
+def _samples(
+    flat: Float32Array, turning: Float32Array, rising: Float32Array, camera: _Camera, per_count: float
+) -> tuple[Float32Array, BoolArray]:
+    """Return samples of the 3 x 3 sums `flat`, and a mask of the samples on the detector, (r, c).
+
+    The samples are rounded to integer multiples of 1/`per_count`, so that their sums are fast and exact. The
+    sums must be zero along the border of the frame. The other arguments are those of `_sum_along`.
+    """
+    view, shape = camera
+    last = np.int32(shape[0] - 1), np.int32(shape[1] - 1)
+    depth = turning[2] + rising[2, :, None]
+    np.maximum(depth, np.float32(1e-3), out=depth)
+    np.divide(np.float32(view[0]), depth, out=depth)
+    places = []
+    for axis, limit in ((0, last[0]), (1, last[1])):
+        place = turning[axis] + rising[axis, :, None]
+        place *= depth
+        # After the addition of 0.5, truncation to an integer rounds to the nearest integer.
+        place += np.float32(view[1 + axis] + 0.5)
+        np.maximum(place, np.float32(0.0), out=place)
+        np.minimum(place, np.float32(limit), out=place)
+        places.append(place.astype(np.int32))
+    column, row = places
+    inside = (column > 0) & (column < last[0]) & (row > 0) & (row < last[1])
+    index = row * np.int32(shape[0])
+    index += column
+    samples = flat.take(index)
+    samples *= np.float32(per_count)
+    return np.rint(samples, out=samples), inside
+
+
+def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slice, slice]]:
+    """Yield groups of circles with the range of azimuths in which they cross the detector.
+
+    If the circles are complete, a margin of `room` samples is included on both sides of the detector.
+    """
+    x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
+    sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
+    along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
+    down = np.concatenate([np.zeros_like(sides[0]), sides[1], np.full_like(sides[0], y), y - sides[1]])
+    local = pinhole.unit_vectors(np.stack([along, down], axis=-1)) @ grid.frame.T
+    polar, azimuth = np.arccos(np.clip(local[:, 2], -1.0, 1.0)), np.arctan2(local[:, 1], local[:, 0])
+    column = (azimuth - grid.azimuth[0]) / (grid.azimuth[1] - grid.azimuth[0])
+    count, margin = len(grid.azimuth), _BORDER_STEP / pinhole.focal_length
+    for start in range(0, len(grid.polar), _CHUNK):
+        part = slice(start, min(start + _CHUNK, len(grid.polar)))
+        near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
+        # The azimuth pi is the direction from the rotation axis away from the image centre.
+        behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
+        if grid.full and pinhole.contains(behind, margin=2.0)[0]:
+            yield part, slice(0, count)
+        elif near.any():
+            beside = margin / max(np.sin(grid.polar[start]), margin) / (grid.azimuth[1] - grid.azimuth[0])
+            low, high = column[near].min() - beside, column[near].max() + beside + 1.0
+            if grid.full and (low < room or high > count - room):
+                low, high = 0.0, count
+            yield part, slice(max(int(low), 0), min(int(np.ceil(high)), count))
+
+
+# Side (px) of the square of pixels whose sum is one sample of the polar grid.
+_BOX = 3.0
+# Largest cumulative sum of samples that can be represented, in units of the rounding step.
+_HIGHEST = 2.0**30
+# Number that rounds a sample (float32) to an integer if it is added and then subtracted in double precision.
+_ROUND = np.float64(1.5 * 2.0**52)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunningSums:
+    """Running sums (r, c) of the samples along the circles, over the length of a streak, in counts.
+
+    Attributes:
+        light: the running sums (r, c).
+        count: number of samples on the detector in each running sum (r, c).
+        span: first and last column of each circle on the detector (r, 2), or -inf and inf if the samples on
+            the detector are not contiguous.
+        excess: noise of the running sums on each circle, relative to the noise for independent samples (r,).
+    """
+
+    light: Float32Array
+    count: Int32Array
+    span: FloatArray
+    excess: FloatArray
+
+
+def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
+    """Return the running sums over one streak length, centred on each sample of the polar grid.
+
+    The pixel sums `sums` must be zero along the border of the frame. The samples are rounded to multiples of
+    `unit` counts.
+    """
+    width = max(round(grid.length), 1)
+    rows, columns = len(grid.polar), len(grid.azimuth)
+    # Elements outside the detector are never written, so that the system allocates no memory for them.
+    response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
+    span = np.tile([-np.inf, np.inf], (rows, 1))
+    unit = max(unit, float(sums.max()) * width / _HIGHEST)
+    groups = _groups(pinhole, grid, width)
+    parts = np.array([(part.start, part.stop, of.start, of.stop) for part, of in groups])
+    turning, rising = _direction_terms(grid)
+    limits = width, grid.full, float(np.float32(1.0 / unit)), float(np.float32(unit))
+    flat, parts, camera = sums.reshape(-1), parts.reshape(-1, 4), _camera_of(pinhole)
+    _sum_along(response, count, span, flat, turning, rising, parts, camera, limits)
+    span[np.isfinite(span)] += grid.off_centre
+    # Near the rotation axis, neighbouring samples have common pixels, so that their noise is correlated.
+    spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
+    slow = np.flatnonzero(spacing < _BOX)
+    steps = np.arange(1, width)
+    common = np.maximum(1.0 - spacing[slow, None] * steps / _BOX, 0.0)
+    excess = np.ones(len(spacing))
+    excess[slow] = np.sqrt(1.0 + 2.0 * common @ (1.0 - steps / width))
+    return RunningSums(response, count, span, excess)
+
+
+_Limits = tuple[int, bool, float, float]
+"""Streak length (samples), whether circles are complete, rounding steps per count, and counts per step."""
+
+
+def _sum_along_numpy(
+    response: Float32Array,
+    count: Int32Array,
+    span: FloatArray,
+    flat: Float32Array,
+    turning: Float32Array,
+    rising: Float32Array,
+    parts: IntArray,
+    camera: _Camera,
+    limits: _Limits,
+) -> None:
+    """Compute the running sums `response` and their numbers of samples `count` (r, c), and `span` (r, 2).
+
+    The direction of a sample is the sum of a vector from `turning` (3, c) for its azimuth and a vector from
+    `rising` (3, r) for its circle. Each row of `parts` (g, 4) contains the indices of the first circle of a
+    group, the circle after the last, the first azimuth and the azimuth after the last.
+    """
+    width, full, per_count, unit = limits
+    before, after, columns = width // 2, width - width // 2, response.shape[1]
+    for begin, end, left, right in parts:
+        part, crossing = slice(begin, end), slice(left, right)
+        samples, inside = _samples(flat, turning[:, crossing], rising[:, part], camera, per_count)
+        wide = samples.shape[1]
+        # The samples and their mask are padded by one streak length on both sides.
+        padded = np.zeros((2, len(samples), wide + 2 * width + 1), dtype=np.int32)
+        middle = slice(width + 1, width + 1 + wide)
+        padded[0, :, middle] = samples
+        padded[1, :, middle] = inside
+        if full and wide == columns:
+            padded[:, :, : width + 1] = padded[:, :, wide : wide + width + 1]
+            padded[:, :, middle.stop :] = padded[:, :, middle.start : middle.start + width]
+        total = np.cumsum(padded, axis=2, dtype=np.int32)
+        low, high = max(left - after + 1, 0), min(right + before, columns)
+        first = low - left + width - before
+        last = first + high - low
+        held = total[:, :, first + width : last + width] - total[:, :, first:last]
+        np.multiply(held[0], np.float32(unit), out=response[part, low:high], casting="same_kind")
+        count[part, low:high] = held[1]
+        start, stop = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
+        whole = inside.sum(axis=1) == stop - start + 1
+        # The centre of a running sum of an even number n of samples lies half a sample before the sample n/2.
+        edges = np.stack([start - 0.5, stop + 0.5], axis=1) + left
+        span[part] = np.where(whole[:, None], edges, span[part])
+
+
+@compiled_form_of(_sum_along_numpy)
+def _sum_along(
+    response: Float32Array,
+    count: Int32Array,
+    span: FloatArray,
+    flat: Float32Array,
+    turning: Float32Array,
+    rising: Float32Array,
+    parts: IntArray,
+    camera: _Camera,
+    limits: _Limits,
+) -> None:
+    width, full, per_count, unit = limits
+    before, after, columns = width // 2, width - width // 2, response.shape[1]
+    total = np.zeros((2, columns + 2 * width + 2), np.int32)
+    sample, index = np.empty((2, columns), np.int32), np.empty(columns, np.int32)
+    for g in range(len(parts)):
+        left, wide = parts[g, 2], parts[g, 3] - parts[g, 2]
+        low, high = max(left - after + 1, 0), min(parts[g, 3] + before, columns)
+        first = low - left + width - before
+        for row in range(parts[g, 0], parts[g, 1]):
+            _pixel_indices(index[:wide], turning, left, rising[:, row], camera)
+            start, stop, seen = wide, -1, 0
+            for k in range(wide):
+                rounded = np.float32(flat[abs(index[k])] * np.float32(per_count)) + _ROUND - _ROUND
+                sample[0, k], sample[1, k] = np.int32(rounded), np.int32(index[k] > 0)
+                if index[k] > 0:
+                    start, stop, seen = min(start, k), k, seen + 1
+            for which in range(2):
+                _sum_up(total[which], sample[which], wide, width, full and wide == columns)
+            for k in range(high - low):
+                response[row, low + k] = (total[0, first + k + width] - total[0, first + k]) * unit
+                count[row, low + k] = total[1, first + k + width] - total[1, first + k]
+            if seen == 0:
+                start, stop = 0, wide - 1
+            if seen == stop - start + 1:
+                span[row, 0], span[row, 1] = left + start - 0.5, left + stop + 0.5
+
+
+@loop_helper
+def _sum_up(total: Int32Array, sample: Int32Array, wide: int, width: int, around: bool) -> None:
+    """Compute cumulative sums of `wide` samples with a margin of `width` samples on both sides.
+
+    The margins repeat the samples of a circle that is complete (`around`), and are zero otherwise.
+    """
+    held = np.int32(0)
+    for k in range(width):
+        if around:
+            held += sample[wide - width + k]
+        total[k + 1] = held
+    for k in range(wide):
+        held += sample[k]
+        total[width + k + 1] = held
+    for k in range(width):
+        if around:
+            held += sample[k]
+        total[width + wide + k + 1] = held
+
+
+@loop_helper
+def _pixel_indices(
+    index: Int32Array, turning: Float32Array, left: int, rising: Float32Array, camera: _Camera
+) -> None:
+    """Compute the flat pixel index of each sample of a circle, which is negative outside the detector.
+
+    The first sample has the azimuth with the index `left`.
+    """
+    view, shape = camera
+    columns, rows = np.int32(shape[0]), np.int32(shape[1])
+    zero, one, half = np.float32(0.0), np.int32(1), np.float32(0.5)
+    right, bottom = np.float32(columns - one), np.float32(rows - one)
+    x, y = np.float32(view[1] + half), np.float32(view[2] + half)
+    focal, nearest = np.float32(view[0]), np.float32(1e-3)
+    across, down, deep = rising[0], rising[1], rising[2]
+    for k in range(len(index)):
+        scale = focal / max(turning[2, left + k] + deep, nearest)
+        column = np.int32(min(max((turning[0, left + k] + across) * scale + x, zero), right))
+        row = np.int32(min(max((turning[1, left + k] + down) * scale + y, zero), bottom))
+        inside = (column > 0) & (column < columns - one) & (row > 0) & (row < rows - one)
+        index[k] = row * columns + column if inside else -(row * columns + column)
+
+
+def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
+    """Return the cumulative sums (r, c + 1) of all samples on a circle before each sample."""
+    out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
+    turning, rising = _direction_terms(grid)
+    for part, crossing in _groups(pinhole, grid, 0):
+        around, aloft = turning[:, crossing], rising[:, part]
+        samples, _ = _samples(sums.reshape(-1), around, aloft, _camera_of(pinhole), 1.0)
+        out[part, crossing.start + 1 : crossing.stop + 1] = np.cumsum(samples, axis=1, dtype=np.float64)
+        out[part, crossing.stop + 1 :] = out[part, crossing.stop, None]
+    return out
+
 
 # Minimum fraction of a faint star's streak that must lie on the detector.
 _LEAST_SEEN = 0.35
@@ -53,8 +396,7 @@ _SHARP_SHARE = 0.3
 _OWN_SHARE = 0.45
 # Maximum number of peaks in one pass of the search.
 _MOST_PEAKS = 1000
-# Offsets (rows, columns) to the neighbours with which a local maximum is compared, in ascending order of
-# distance.
+# Offsets (rows, columns) to the neighbours of a local maximum, in ascending order of distance.
 _NEIGHBOURS = sorted(
     ((down, beside) for down in (-1, 0, 1) for beside in (-2, -1, 0, 1, 2) if (down, beside) != (0, 0)),
     key=lambda step: abs(step[0]) + abs(step[1]),
@@ -101,8 +443,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference, and its noise, are scaled so that the second difference equals the response for
-    # an isolated star.
+    # Second difference and noise are scaled so that the former equals the response for an isolated star.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -122,32 +463,25 @@ def standing_peaks(
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
-    kept = _unshaded(row, column, value, spans, grid.length, sigmas, ACROSS)
+    kept = _unshaded(row, column, value, spans, grid.length, sigmas)
     row, column = row[kept], column[kept]
     return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
 
 
 def _unshaded_numpy(
-    row: IntArray,
-    column: IntArray,
-    value: FloatArray,
-    spans: FloatArray,
-    length: float,
-    sigmas: float,
-    across: float,
+    row: IntArray, column: IntArray, value: FloatArray, spans: FloatArray, length: float, sigmas: float
 ) -> BoolArray:
     """Return a mask (k,) of the peaks, the strongest first, that are not caused by stronger peaks.
 
     The arguments are grid indices and heights `value` of the peaks, the ranges `spans` (k, 2) of columns on
-    the detector, the streak length in samples, the minimum height, and the spacing of the circles, px.
+    the detector, the streak length in samples, and the minimum height.
     """
     by_row = np.argsort(row, kind="stable")
     first = np.searchsorted(row[by_row], row - _FARTHEST + 1)
     count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
-    # A frame with many stars has hundreds of thousands of pairs of peaks, and most pairs are too far apart to
-    # overlap.
+    # Most of the hundreds of thousands of pairs of peaks in a crowded frame are too far apart to overlap.
     near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
@@ -155,7 +489,7 @@ def _unshaded_numpy(
     share /= np.maximum(overlap_of(there, there, spans, length), _LEAST_SEEN)[stronger]
     shading = np.flatnonzero(share > 0.0)
     stronger, weaker = stronger[shading], weaker[shading]
-    share = share[shading] * profile((row[stronger] - row[weaker]) * across)
+    share = share[shading] * profile((row[stronger] - row[weaker]) * ACROSS)
     begin = np.searchsorted(stronger, np.arange(len(row) + 1))
     own = value.copy()
     kept = np.zeros(len(row), dtype=np.bool_)
@@ -170,15 +504,8 @@ def _unshaded_numpy(
 
 @compiled_form_of(_unshaded_numpy)
 def _unshaded(
-    row: IntArray,
-    column: IntArray,
-    value: FloatArray,
-    spans: FloatArray,
-    length: float,
-    sigmas: float,
-    across: float,
+    row: IntArray, column: IntArray, value: FloatArray, spans: FloatArray, length: float, sigmas: float
 ) -> BoolArray:
-    """See `_unshaded_numpy`."""
     own, kept = value.copy(), np.zeros(len(row), dtype=np.bool_)
     for k in range(len(row)):
         if own[k] < sigmas or own[k] < _OWN_SHARE * value[k]:
@@ -192,7 +519,7 @@ def _unshaded(
             first = max(max(column[k], column[w]) - 0.5 * length, low)
             last = min(min(column[k], column[w]) + 0.5 * length, high)
             share = max(last - first, 0.0) / length / max(whole, _LEAST_SEEN)
-            aside = int(min(abs(row[k] - row[w]) * across * _PER_PX + 0.5, len(_PROFILE) - 1.0))
+            aside = int(min(abs(row[k] - row[w]) * ACROSS * _PER_PX + 0.5, len(_PROFILE) - 1.0))
             own[w] -= own[k] * share * _PROFILE[aside]
     return kept
 
@@ -220,7 +547,6 @@ def _summits_numpy(flat: Float32Array, place: IntArray, columns: int) -> BoolArr
 
 @compiled_form_of(_summits_numpy)
 def _summits(flat: Float32Array, place: IntArray, columns: int) -> BoolArray:
-    """See `_summits_numpy`."""
     out = np.ones(len(place), dtype=np.bool_)
     for p in range(len(place)):
         value = flat[place[p]]
@@ -261,8 +587,8 @@ _SOME_PLACES = 1 << 16
 _LEAST_LENGTH = 6.0
 # Fraction of a star's flux that lies within three pixels across the streak.
 _CAPTURED = 0.83
-# Ratio of the noise of a sum of n overlapping 3 x 3 samples to sqrt(n) times the noise of a pixel.
-_SAMPLE_NOISE = 3.1
+SAMPLE_NOISE = 3.1
+"""Ratio of the noise of a sum of n overlapping 3 x 3 samples to sqrt(n) times the noise of a pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,19 +614,18 @@ def find_faint(
     at these pixels.
     """
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
-    reach = (
-        float(np.linalg.norm(motion.rotation)) * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
-    )
+    angle = float(np.linalg.norm(motion.rotation))
+    reach = angle * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
     if max(float(np.hypot(*middle[0])), reach) < _LEAST_LENGTH:
         return FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
     grid = polar_grid(pinhole, motion)
-    usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
+    usual = SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
     held = running_sums(_residual_sums(frame, modelled), pinhole, grid, usual / _ROUNDING)
     # The noise of a running sum depends on the number of its samples. Sums of too few samples are excluded.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
     noise[: math.ceil(_LEAST_SEEN * grid.length)] = np.inf
     row, column, height = _found_stars(held, noise, grid, sigmas, most)
-    significance = _significance(held, noise, grid, row, column, height)
+    significance = _significance(held, noise, grid, (row, column, height))
     order = np.argsort(-significance, kind="stable")
     row, column, height, significance = row[order], column[order], height[order], significance[order]
     stars = grid.pixels(pinhole, row, column - grid.off_centre)
@@ -314,24 +639,18 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
     """Return the 3 x 3 sums (rows * columns,) of the frame without modelled stars and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Pixels from which bright stars were subtracted get a smaller weight, because their residuals are mostly
-    # photon noise.
+    # Pixels with subtracted stars get a smaller weight, because their residuals are mostly photon noise.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
     lost = frame.bad.copy()
     lost[pixels] = False
     unmodelled = np.flatnonzero(lost)
-    return less_boxes(
-        frame.sums,
-        frame.shape,
-        np.concatenate([pixels, unmodelled]),
-        np.concatenate([signal - left, frame.signal[unmodelled]]),
-    )
+    taken = np.concatenate([signal - left, frame.signal[unmodelled]])
+    return less_boxes(frame.sums, frame.shape, np.concatenate([pixels, unmodelled]), taken)
 
 
 def _less_boxes_numpy(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
-    """See `less_boxes`."""
     out, (rows, columns) = sums.copy(), shape
     for down in (-columns, 0, columns):
         for beside in (-1, 0, 1):
@@ -362,10 +681,12 @@ def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Ima
     return out
 
 
-def _found_stars(
-    held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractional grid rows and columns, and heights, of the peaks of the filter response `held`.
+_Peaks = tuple[FloatArray, FloatArray, FloatArray]
+"""Fractional grid rows and columns, and heights, of the peaks of stars, each (k,)."""
+
+
+def _found_stars(held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int) -> _Peaks:
+    """Return the peaks of the filter response `held`.
 
     Each pass of the search finds peaks in the residual response, solves for the heights of all stars, and
     subtracts these stars. The array `noise` contains the noise of a running sum, indexed by its number of
@@ -391,61 +712,35 @@ def _found_stars(
             continue
         row, column = np.append(row, new_row[:room]), np.append(column, new_column[:room])
         height = _heights(held, row, column, grid)
-        kept = _significance(held, noise, grid, row, column, height) > sigmas
+        kept = _significance(held, noise, grid, (row, column, height)) > sigmas
         row, column, height = row[kept], column[kept], height[kept]
-        left = flat[place] - _responses(held, place, grid, row, column, height)
+        responses = np.zeros(len(place))
+        stars = row, column, height
+        _add_responses(responses, place, held.span, held.light.shape, grid.length, stars)
+        left = flat[place] - responses
     return row, column, height
 
 
-def _significance(
-    held: RunningSums,
-    noise: FloatArray,
-    grid: PolarGrid,
-    row: FloatArray,
-    column: FloatArray,
-    height: FloatArray,
-) -> FloatArray:
-    """Return the significance (k,) of stars with peak heights `height` (k,), in standard deviations."""
+def _significance(held: RunningSums, noise: FloatArray, grid: PolarGrid, stars: _Peaks) -> FloatArray:
+    """Return the significance (k,) of `stars`, in standard deviations."""
+    row, column, height = stars
     middle = np.rint(row).astype(int)
     seen = overlap_of(column, column, held.span[middle], grid.length)
     own = noise[held.count[middle, np.rint(column).astype(int) % held.light.shape[1]]] * held.excess[middle]
     return np.asarray(height * seen / own)
 
 
-def _responses(
-    held: RunningSums,
-    place: IntArray,
-    grid: PolarGrid,
-    row: FloatArray,
-    column: FloatArray,
-    height: FloatArray,
-) -> FloatArray:
-    """Return the sum of the filter responses of all stars at the ascending flat indices `place` (p,)."""
-    out = np.zeros(len(place))
-    _add_responses(out, place, held.span, held.light.shape, grid.length, row, column, height, ACROSS)
-    return out
-
-
 def _add_responses_numpy(
-    out: FloatArray,
-    place: IntArray,
-    span: FloatArray,
-    shape: tuple[int, int],
-    length: float,
-    row: FloatArray,
-    column: FloatArray,
-    height: FloatArray,
-    across: float,
+    out: FloatArray, place: IntArray, span: FloatArray, shape: tuple[int, int], length: float, stars: _Peaks
 ) -> None:
-    """Add the filter responses of stars at the grid indices `row` and `column` to the array `out` (p,).
+    """Add the filter responses of `stars` at the ascending flat indices `place` (p,) to the array `out` (p,).
 
-    The other arguments are those of `_responses`, the shape of the grid, the streak length in samples, and
-    the spacing of the circles, px.
+    The range `span` (r, 2) is that of `RunningSums`, and the streak length is in samples.
     """
-    rows, columns = shape
+    (rows, columns), (row, column, height) = shape, stars
     # On each neighbouring circle, the filter response of a star covers a contiguous range of columns.
     circle = row.astype(np.int64)[:, None] + np.arange(1 - _FARTHEST, _FARTHEST + 1)
-    weight = height[:, None] * profile((circle - row[:, None]) * across)
+    weight = height[:, None] * profile((circle - row[:, None]) * ACROSS)
     weight = np.where((circle >= 0) & (circle < rows), weight, 0.0)
     circle = np.clip(circle, 0, rows - 1)
     low = np.maximum(np.ceil(column - length), 0.0).astype(np.int64)
@@ -462,36 +757,23 @@ def _add_responses_numpy(
         many = count[some]
         which = np.arange(many.sum()) + np.repeat(first[some] - np.cumsum(many) + many, many)
         at = (place[which] - np.repeat(circle[some] * columns, many)).astype(np.float64)
-        common = overlap_of(
-            at,
-            np.repeat(column[star[some]], many),
-            np.repeat(span[circle[some]], many, axis=0),
-            length,
-        )
+        there, spans = np.repeat(column[star[some]], many), np.repeat(span[circle[some]], many, axis=0)
+        common = overlap_of(at, there, spans, length)
         common *= np.repeat(weight[some], many)
         np.add.at(out, which, common)
 
 
 @compiled_form_of(_add_responses_numpy)
 def _add_responses(
-    out: FloatArray,
-    place: IntArray,
-    span: FloatArray,
-    shape: tuple[int, int],
-    length: float,
-    row: FloatArray,
-    column: FloatArray,
-    height: FloatArray,
-    across: float,
+    out: FloatArray, place: IntArray, span: FloatArray, shape: tuple[int, int], length: float, stars: _Peaks
 ) -> None:
-    """See `_add_responses_numpy`."""
-    rows, columns = shape
+    (rows, columns), (row, column, height) = shape, stars
     for star in range(len(row)):
         low = int(max(math.ceil(column[star] - length), 0))
         high = int(min(math.floor(column[star] + length), columns - 1))
         middle = int(row[star])
         for circle in range(max(middle + 1 - _FARTHEST, 0), min(middle + _FARTHEST + 1, rows)):
-            aside = int(min(abs(circle - row[star]) * across * _PER_PX + 0.5, len(_PROFILE) - 1.0))
+            aside = int(min(abs(circle - row[star]) * ACROSS * _PER_PX + 0.5, len(_PROFILE) - 1.0))
             weight = height[star] * _PROFILE[aside]
             if weight <= 0.0:
                 continue
@@ -508,8 +790,7 @@ def _add_responses(
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
     """Return peak heights (k,) of stars such that the sum of their responses is the measured response."""
     middle = np.rint(row).astype(int)
-    # The arrays `one` and `other` contain the indices of all pairs of stars that may overlap, including pairs
-    # of a star with itself.
+    # The indices of all pairs of stars that may overlap, including pairs of a star with itself.
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], row - _FARTHEST, side="right")
     count = np.searchsorted(row[order], row + _FARTHEST) - first
@@ -518,20 +799,15 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     near = np.flatnonzero(np.abs(column[one] - column[other]) < grid.length)
     one, other = one[near], other[near]
     span = held.span[middle]
-    common = np.stack(
-        [np.maximum(span[one, 0], span[other, 0]), np.minimum(span[one, 1], span[other, 1])], axis=-1
-    )
-    overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
-        (row[one] - row[other]) * ACROSS
-    )
-    # The measured responses `seen` are multiplied by the same factor as the diagonal, so that the
-    # regularisation does not change the heights of isolated stars.
+    first, last = np.maximum(span[one, 0], span[other, 0]), np.minimum(span[one, 1], span[other, 1])
+    common = np.stack([first, last], axis=-1)
+    overlap = overlap_of(column[one], column[other], common, grid.length)
+    overlap = overlap * profile((row[one] - row[other]) * ACROSS)
+    # The factor of the diagonal keeps the heights of isolated stars independent of the regularisation.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
-    seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(
-        np.float64
-    )
-    return _solved(one, other, overlap, seen)
+    seen = held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(np.float64)
+    return _solved(one, other, overlap, (1.0 + _RIDGE) * seen)
 
 
 def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
@@ -555,76 +831,3 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
         size, before = float(residual @ residual), size
         direction = residual + size / before * direction
     return np.asarray(x * scale)
-
-
-# Ratio of consecutive trial lengths of a box, which is a run of samples along a circle.
-_FACTOR = 1.1
-# Smallest trial length (samples) of a box, which is a run of samples along a circle.
-_SHORTEST = 5
-# Factor by which the search for the rotation angle reduces the number of circles.
-_SPARSE = 2
-# Minimum significance (standard deviations) of the mean of a box relative to the samples on both sides of it,
-# for the box to count in the search for the rotation angle.
-_LEAST_SIGMAS = 5.0
-# Upper limit of the significance (standard deviations) of one box in the sum over all boxes of one length.
-_ENOUGH = 40.0
-
-
-def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
-    """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
-    # The grid is sampled as for a rotation by one radian.
-    grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
-    step = grid.angle / grid.length
-    held = cumulative_sums(frame.sums, pinhole, grid)
-    held *= np.float32(1.0 / (_SAMPLE_NOISE * np.sqrt(np.median(frame.floor[::97]))))
-    longest = min(len(grid.azimuth) // 2, int(np.pi / step))
-    if longest < 2 * _SHORTEST:
-        return []
-    count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
-    widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
-    room = int(sharper_widths(int(widths[-1]), longest)[-1]) // 2
-    # The azimuth is the first array axis, so that memory is read contiguously.
-    padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
-    score = np.array([_box_significance(padded, room, int(width)) for width in widths])
-    before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
-    peak = np.flatnonzero((score > before) & (score >= after))
-    peak = peak[np.argsort(-score[peak], kind="stable")][:most]
-    angles = []
-    for index in peak:
-        near = sharper_widths(int(widths[index]), longest)
-        refined = [_box_significance(padded, room, int(width)) for width in near]
-        angles.append(int(near[int(np.argmax(refined))]) * step)
-    return angles
-
-
-def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the sum of the squared significances of the most significant boxes of `width` samples.
-
-    The array `padded` (c, r) contains the cumulative sums along the azimuth on r circles, with a margin of
-    `room` samples at both ends.
-    """
-    stretches = (len(padded) - 2 * room - width) // width
-    outer, inner, behind, beyond = (
-        padded[room + offset : room + offset + stretches * width]
-        for offset in (-(width // 2), 0, width, width + width // 2)
-    )
-    light = behind - inner
-    light *= np.float32(2.0)
-    light -= beyond
-    light += outer
-    # The circles are divided into intervals of one box length. The most significant box of an interval is
-    # counted if no adjacent interval, on the same or a neighbouring circle, has a more significant box.
-    best = light.reshape(stretches, width, -1).max(axis=1)
-    best *= np.float32(1.0 / np.sqrt(2.0 * width))
-    around = np.pad(best, 1)
-    highest = best >= _LEAST_SIGMAS
-    for down in (0, 1, 2):
-        for beside in (0, 1, 2):
-            highest &= best >= around[down : down + stretches, beside : beside + best.shape[1]]
-    return float(np.sum(np.minimum(best[highest], _ENOUGH) ** 2))
-
-
-def sharper_widths(width: int, longest: int) -> IntArray:
-    """Return the integer box lengths (samples) within half a search step of `width`, up to `longest`."""
-    room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
-    return np.arange(max(width - room, 2), min(width + room, longest) + 1)

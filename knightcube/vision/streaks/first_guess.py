@@ -16,6 +16,11 @@ circle to the position of its largest sum. A box of the correct length contains 
 and no samples beyond the ends of the streak. Boxes that are too long or too short by a factor of two explain
 only half of the chi-square. The scan therefore finds the rotation angle without a good initial guess, whereas
 a fit of the pixels converges only from within a few point-spread widths.
+
+If the brightest regions do not determine the rotation angle, for example because streaks are faint and
+fragmented, or because the border truncates all streaks, all circles of a polar grid are searched. The mean of
+the pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
+length with the largest sum of squared significances is the length of the streaks.
 """
 
 from __future__ import annotations
@@ -26,9 +31,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.faint_stars import SAMPLE_NOISE, cumulative_sums, polar_grid
 from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_lengths, positions
 
@@ -47,8 +53,7 @@ _WEIGHED = 3
 _CAP = 2.0
 # Upper limit of the significance (standard deviations) of a star in the scan for the rotation angle.
 _ENOUGH = 60.0
-# Minimum significance (standard deviations) of a star from the scan for the rotation angle that is used in
-# the fit.
+# Minimum significance (standard deviations) of a star from the scan that is used in the fit.
 _CERTAIN = 8.0
 # Minimum fraction of a streak within the frame for its star to be used in the fit.
 _LEAST_SEEN = 0.25
@@ -58,11 +63,9 @@ _LEAST_SEEN = 0.25
 class Circles:
     """Circles about the rotation axis, each through the centroid of one of the n brightest regions.
 
-    Attributes:
-        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the rotation
-            axis.
-        height: cosine of the angle between each circle and the rotation axis (n,).
-        azimuth: azimuth about the rotation axis of the centroid of each region (n,), rad.
+    The rows of the matrix `frame` (3, 3) are two unit vectors normal to the rotation axis, and the axis. The
+    `height` (n,) is the cosine of the angle between each circle and the axis, and the `azimuth` (n,), rad, is
+    that of the centroid of each region.
     """
 
     frame: FloatArray
@@ -70,35 +73,23 @@ class Circles:
     azimuth: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AngleCandidate:
-    """A trial rotation angle, with the stars that were found for this angle.
-
-    Attributes:
-        angle: rad.
-        stars: positions of the n stars at mid-exposure (n, 2), px.
-        light: (n,) counts.
-    """
-
-    angle: float
-    stars: FloatArray
-    light: FloatArray
+ScannedAngle = tuple[float, FloatArray, FloatArray]
+"""Trial rotation angle, rad, with the positions (n, 2), px, and fluxes (n,), counts, of its n stars."""
 
 
 def scan_angles(
     frame: ReducedFrame, pinhole: Pinhole, circles: Circles, most: int, near: float | None = None
-) -> Iterator[AngleCandidate]:
+) -> Iterator[ScannedAngle]:
     """Yield at most `most` likely rotation angles, sorted by distance from `near` (rad) if it is given."""
     boxes = _boxes(frame, pinhole, circles)
     longest = boxes.total.shape[1] - 2
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
-    gain = boxes.best(widths).gain
+    gain = boxes.best(widths)[0]
     # The weight of a bright star is limited, because it may be a blend of two stars.
     scale = np.minimum(_ENOUGH**2 / np.maximum(gain.max(axis=0), 1.0), 1.0)
     score = gain @ scale
-    # If the border truncates all streaks, all rotation angles above a limit explain the same flux, and the
-    # smallest of these angles is chosen.
+    # If the border truncates all streaks, the smallest of the equally likely rotation angles is chosen.
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")]
@@ -109,21 +100,9 @@ def scan_angles(
         yield _refined_angle(boxes, pinhole, circles, scale, int(widths[index]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _BestBoxes:
-    """The best boxes of w widths along the circles of n regions, as arrays (w, n).
-
-    Attributes:
-        gain: chi-square that each box explains.
-        first: index of the first sample of each box.
-        light: sum of the samples of each box.
-        seen: number of samples of each box within the frame.
-    """
-
-    gain: FloatArray
-    first: IntArray
-    light: FloatArray
-    seen: FloatArray
+_Best = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+"""Explained chi-square, first sample, sum of the samples, and number of samples within the frame, of the best
+boxes of w widths along the circles of n regions, each (w, n)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,18 +119,15 @@ class _Boxes:
     begin: float
     step: float
 
-    def best(self, widths: IntArray) -> _BestBoxes:
+    def best(self, widths: IntArray) -> _Best:
         """Return the box that explains most chi-square, for each region and each of `widths` (w,)."""
-        return _BestBoxes(*_best_boxes(self.total, self.exist, self.variance, self.middle, widths))
-
-
-_Best = tuple[FloatArray, IntArray, FloatArray, FloatArray]
+        return _best_boxes(self.total, self.exist, self.variance, self.middle, widths)
 
 
 def _best_boxes_numpy(
     total: FloatArray, exist: FloatArray, variance: FloatArray, middle: IntArray, widths: IntArray
 ) -> _Best:
-    """Return the attributes of `_BestBoxes` for the box lengths `widths` (w,), from those of `_Boxes`."""
+    """Return the best boxes for the lengths `widths` (w,), from the attributes of `_Boxes`."""
     last = total.shape[1] - 1
     each = np.arange(len(middle))[:, None]
     shape = len(widths), len(middle)
@@ -170,7 +146,6 @@ def _best_boxes_numpy(
 def _best_boxes(
     total: FloatArray, exist: FloatArray, variance: FloatArray, middle: IntArray, widths: IntArray
 ) -> _Best:
-    """See `_best_boxes_numpy`."""
     last = total.shape[1] - 1
     shape = len(widths), len(middle)
     most, place, light, seen = np.empty(shape), np.empty(shape, np.int64), np.empty(shape), np.empty(shape)
@@ -210,26 +185,20 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
     own = np.maximum(own, np.sqrt(noise))
     light = np.minimum(light, _CAP * own[:, None])
     start = np.zeros((len(middle), 1))
-    return _Boxes(
-        np.concatenate([start, np.cumsum(light, axis=1)], axis=1),
-        np.concatenate([start, np.cumsum(exist, axis=1)], axis=1),
-        noise + 3.0 * own / frame.gain,
-        middle,
-        -wide,
-        step,
-    )
+    total, number = (np.concatenate([start, np.cumsum(each, axis=1)], axis=1) for each in (light, exist))
+    return _Boxes(total, number, noise + 3.0 * own / frame.gain, middle, -wide, step)
 
 
 def _refined_angle(
     boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatArray, width: int
-) -> AngleCandidate:
+) -> ScannedAngle:
     """Return the best rotation angle near the box length `width` (samples), with the stars for this angle."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
     held = boxes.best(widths)
-    best = int(np.argmax(held.gain @ scale))
-    across, first, light, seen = int(widths[best]), held.first[best], held.light[best], held.seen[best]
-    certain = (held.gain[best] > _CERTAIN**2) & (seen > _LEAST_SEEN * across)
+    best = int(np.argmax(held[0] @ scale))
+    across, first, light, seen = int(widths[best]), held[1][best], held[2][best], held[3][best]
+    certain = (held[0][best] > _CERTAIN**2) & (seen > _LEAST_SEEN * across)
     # The position of a star along its path is determined only if at least one streak end is in the frame.
     bounded = np.zeros(len(certain), dtype=np.bool_)
     for sample in (first, first + across):
@@ -249,7 +218,7 @@ def _refined_angle(
     order = np.flatnonzero(good)[np.argsort(-light[good], kind="stable")]
     near = np.linalg.norm(pixel[order, None] - pixel[order], axis=2) < 4.0 * _STEP
     order = order[~np.triu(near, k=1).any(axis=0)]
-    return AngleCandidate(across * boxes.step, pixel[order], light[order])
+    return across * boxes.step, pixel[order], light[order]
 
 
 # Number of bright regions whose pairs propose rotation axes.
@@ -266,8 +235,7 @@ _LEAST_LENGTH = 3.5
 _LENGTH_ERROR = 1.0
 # Relative part of the standard error of a region's length, as a fraction of the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of two rankings. Only one of the two rankings includes the votes
-# against a rotation angle.
+# Maximum number of rotation angles from each of two rankings, of which one includes the votes against.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) between the circles on which two fragments of one streak lie.
 _SAME_CIRCLE = 2.0
@@ -283,13 +251,9 @@ _LEAST_GROWTH = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGuess:
-    """An initial guess of the motion and of the stars for a fit.
+    """An initial guess of the motion, and of the stars: centres (n, 2), px, and fluxes (n,), counts.
 
-    Attributes:
-        motion: guessed motion of the camera.
-        stars: centres of the n streaks (n, 2), px.
-        light: (n,) counts.
-        contradicted: fraction of the flux in regions that are too long for the guessed rotation angle.
+    The fraction of the flux in regions that are too long for the guessed rotation angle is `contradicted`.
     """
 
     motion: CameraMotion
@@ -309,8 +273,7 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
     flow = image_flow(pinhole, regions.centre)
     equation = np.einsum("ni,nij->nj", regions.normal, flow)
     tolerance = np.maximum(_SIDE_ERROR / np.maximum(regions.length, 1.0), _LEAST_ERROR)
-    # Long and bright regions get a large weight, because the image of several stars is rarely so long and
-    # bright.
+    # The weight of long and bright regions is large, because blends of stars are rarely long and bright.
     worth = np.sqrt(regions.flux) * np.minimum(regions.length, 100.0)
     leaders = long[np.argsort(-worth[long], kind="stable")[:_PROPOSERS]]
     i, j = (leaders[index] for index in np.triu_indices(len(leaders), k=1))
@@ -346,18 +309,15 @@ class AxisGuess:
 
     Attributes:
         agree: whether each bright region agrees with the rotation axis (n,).
-        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the rotation
-            axis.
+        frame: matrix (3, 3) whose rows are two unit vectors normal to the rotation axis, and the axis.
         height: cosine of the angle between each region and the rotation axis (n,).
         middle: azimuth about the rotation axis of the centroid of each region (n,), rad.
         first: lowest azimuth about the rotation axis in each region (n,), rad.
         last: highest azimuth about the rotation axis in each region (n,), rad.
         width: arc length of each region from the second moment of its brightness (n,), rad.
         speed: image displacement per radian of rotation at each region (n,), px/rad.
-        cut_first: whether the border of the frame truncates each region at the end with the lowest azimuth
-            (n,).
-        cut_last: whether the border of the frame truncates each region at the end with the highest azimuth
-            (n,).
+        cut_first, cut_last: whether the border of the frame truncates each region at the end with the lowest
+            and with the highest azimuth (n,).
     """
 
     agree: BoolArray
@@ -379,8 +339,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
         return None
     axis, agree = found
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # Azimuth zero is the direction from the rotation axis to the image centre, and is arbitrary if the
-    # rotation axis passes through the image centre.
+    # Azimuth zero is the direction to the image centre, or arbitrary if the axis passes through the centre.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]
@@ -391,22 +350,13 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     reference = np.arctan2(centre[:, 1], centre[:, 0])
     view = (float(pinhole.focal_length), *pinhole.centre)
     pixels = regions.column, regions.row, regions.light, regions.owner
-    (mean, square, height), (low, high), bounds = _arcs(*pixels, frame, reference, view)
+    (mean, square, height), (low, high), bounds = _arcs(pixels, frame, reference, view)
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
     # The brightness variance along a uniform arc is length^2 / 12 plus the variance of the point spread.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
-    return AxisGuess(
-        agree,
-        frame,
-        height,
-        mean + reference,
-        bounds[0] + reference,
-        bounds[1] + reference,
-        width,
-        np.maximum(speed, 1.0),
-        _at_border(regions, pinhole, low),
-        _at_border(regions, pinhole, high),
-    )
+    arcs = height, mean + reference, bounds[0] + reference, bounds[1] + reference, width
+    at_border = _at_border(regions, pinhole, low), _at_border(regions, pinhole, high)
+    return AxisGuess(agree, frame, *arcs, np.maximum(speed, 1.0), *at_border)
 
 
 def motions_by_length(
@@ -464,32 +414,27 @@ def motions_by_scan(
     """Yield initial guesses of motion and stars from a scan for the rotation angle, see `scan_angles`."""
     chosen = np.flatnonzero(guess.agree)[:SCANNED_STARS]
     circles = Circles(guess.frame, guess.height[chosen], guess.middle[chosen])
-    for candidate in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
-        if len(candidate.light):
-            motion = CameraMotion.steady(guess.frame[2] * candidate.angle)
-            yield MotionGuess(motion, candidate.stars[:most], candidate.light[:most], 0.0)
+    for angle, stars, light in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
+        if len(light):
+            motion = CameraMotion.steady(guess.frame[2] * angle)
+            yield MotionGuess(motion, stars[:most], light[:most], 0.0)
 
 
 _Arcs = tuple[FloatArray, IntArray, FloatArray]
+_RegionPixels = tuple[IntArray, IntArray, FloatArray, IntArray]
+"""Column, row, light and owner of `BrightRegions`."""
 
 
 def _arcs_numpy(
-    column: IntArray,
-    row: IntArray,
-    light: FloatArray,
-    owner: IntArray,
-    frame: FloatArray,
-    reference: FloatArray,
-    view: tuple[float, float, float],
+    pixels: _RegionPixels, frame: FloatArray, reference: FloatArray, view: tuple[float, float, float]
 ) -> _Arcs:
     """Return moments (3, n), end pixels (2, n) and azimuths of the end pixels (2, n) of n regions.
 
     The moments are the mean and the variance of the azimuth about the axis, relative to the azimuths
-    `reference` (n,), and the mean cosine of the angle from the axis. The pixels of the regions are those of
-    `BrightRegions`, and the matrix `frame` (3, 3) is that of `Circles`. The tuple `view` contains the focal
-    length and the image centre (x, y) of the camera, px.
+    `reference` (n,), and the mean cosine of the angle from the axis. The matrix `frame` (3, 3) is that of
+    `Circles`. The tuple `view` contains the focal length and the image centre (x, y) of the camera, px.
     """
-    n, (focal, centre_x, centre_y) = len(reference), view
+    n, (focal, centre_x, centre_y), (column, row, light, owner) = len(reference), view, pixels
     v = np.stack([(column - centre_x) / focal, (row - centre_y) / focal, np.ones(len(row))])
     x, y, z = frame @ (v / np.sqrt(np.sum(v * v, axis=0)))
     azimuth = np.arctan2(y, x) - reference[owner]
@@ -497,36 +442,22 @@ def _arcs_numpy(
     flux = np.bincount(owner, light, n)
     mean = np.bincount(owner, light * azimuth, n) / flux
     square = np.bincount(owner, light * azimuth**2, n) / flux - mean**2
-    outermost = np.stack(_outermost(azimuth, owner, n))
+    order = np.argsort(owner.astype(np.int16), kind="stable")
+    theirs, whose = azimuth[order], owner[order]
+    start, found = np.searchsorted(whose, np.arange(n)), []
+    for extreme in (np.minimum.reduceat(theirs, start), np.maximum.reduceat(theirs, start)):
+        pixel = np.flatnonzero(theirs == extreme[whose])
+        found.append(order[pixel[np.searchsorted(whose[pixel], np.arange(n))]])
+    outermost = np.stack(found)
     moments = np.stack([mean, square, np.bincount(owner, light * z, n) / flux])
     return moments, outermost, azimuth[outermost]
 
 
-def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Return the pixels with the lowest and with the highest azimuth in each of `n` regions, each (n,)."""
-    order = np.argsort(owner.astype(np.int16), kind="stable")
-    theirs, whose = azimuth[order], owner[order]
-    start = np.searchsorted(whose, np.arange(n))
-    found = []
-    for extreme in (np.minimum.reduceat(theirs, start), np.maximum.reduceat(theirs, start)):
-        pixel = np.flatnonzero(theirs == extreme[whose])
-        found.append(order[pixel[np.searchsorted(whose[pixel], np.arange(n))]])
-    return found[0], found[1]
-
-
 @compiled_form_of(_arcs_numpy)
 def _arcs(
-    column: IntArray,
-    row: IntArray,
-    light: FloatArray,
-    owner: IntArray,
-    frame: FloatArray,
-    reference: FloatArray,
-    view: tuple[float, float, float],
+    pixels: _RegionPixels, frame: FloatArray, reference: FloatArray, view: tuple[float, float, float]
 ) -> _Arcs:
-    """See `_arcs_numpy`."""
-    focal, centre_x, centre_y = view
-    n = len(reference)
+    n, (focal, centre_x, centre_y), (column, row, light, owner) = len(reference), view, pixels
     moments, outermost, bounds = np.zeros((3, n)), np.zeros((2, n), np.int64), np.empty((2, n))
     flux = np.zeros(n)
     bounds[0], bounds[1] = np.inf, -np.inf
@@ -597,8 +528,7 @@ def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
     """Return rotation angle, standard error and weight (k, 3) from k pairs of fragments on one circle."""
     part = np.flatnonzero(guess.agree & ~regions.cut)
     sine = np.sqrt(np.maximum(1.0 - guess.height[part] ** 2, 1e-12))
-    # The factor `scale` converts a difference of `height`, which is the cosine of the angle from the rotation
-    # axis, into the distance (px) between two circles.
+    # The factor `scale` converts a difference of `height` into the distance (px) between two circles.
     scale = guess.speed[part] / sine**2
     near = np.abs(guess.height[part, None] - guess.height[part]) * scale < _SAME_CIRCLE
     gap = guess.first[part][None, :] - guess.last[part][:, None]
@@ -619,8 +549,7 @@ def _stars_of_angle(
     reach = np.abs(guess.last - guess.first)
     one = guess.cut_first ^ guess.cut_last
     cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # The centre of a truncated streak is computed from its end inside the frame.
-    # A bright region extends about 2 px beyond the end of the streak.
+    # The centre of a truncated streak is computed from its end in the frame; regions extend 2 px beyond it.
     past = 2.0 / guess.speed
     middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)
     middle = np.where(whole, guess.middle - growth / 12.0 * angle, middle)
@@ -631,3 +560,75 @@ def _stars_of_angle(
     pixel = pinhole.project((guess.frame.T @ local).T)
     seen = np.isfinite(pixel).all(axis=1)
     return pixel[seen], (regions.flux / part)[chosen][seen]
+
+
+# Ratio of consecutive trial lengths of a box, which is a run of samples along a circle.
+_FRAME_FACTOR = 1.1
+# Smallest trial length (samples) of a box, which is a run of samples along a circle.
+_FRAME_SHORTEST = 5
+# Factor by which the search for the rotation angle reduces the number of circles.
+_SPARSE = 2
+# Minimum significance (standard deviations) of a box relative to the samples on both sides of it.
+_LEAST_SIGMAS = 5.0
+# Upper limit of the significance (standard deviations) of one box in the sum over all boxes of one length.
+_FRAME_ENOUGH = 40.0
+
+
+def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
+    """Return at most `most` rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
+    # The grid is sampled as for a rotation by one radian.
+    grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
+    step = grid.angle / grid.length
+    held = cumulative_sums(frame.sums, pinhole, grid)
+    held *= np.float32(1.0 / (SAMPLE_NOISE * np.sqrt(np.median(frame.floor[::97]))))
+    longest = min(len(grid.azimuth) // 2, int(np.pi / step))
+    if longest < 2 * _FRAME_SHORTEST:
+        return []
+    count = int(np.log(longest / _FRAME_SHORTEST) / np.log(_FRAME_FACTOR)) + 1
+    widths = np.unique(np.rint(_FRAME_SHORTEST * _FRAME_FACTOR ** np.arange(count)).astype(np.int64))
+    room = int(sharper_widths(int(widths[-1]), longest)[-1]) // 2
+    # The azimuth is the first array axis, so that memory is read contiguously.
+    padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
+    score = np.array([_box_significance(padded, room, int(width)) for width in widths])
+    before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
+    peak = np.flatnonzero((score > before) & (score >= after))
+    peak = peak[np.argsort(-score[peak], kind="stable")][:most]
+    angles = []
+    for index in peak:
+        near = sharper_widths(int(widths[index]), longest)
+        refined = [_box_significance(padded, room, int(width)) for width in near]
+        angles.append(int(near[int(np.argmax(refined))]) * step)
+    return angles
+
+
+def _box_significance(padded: Float32Array, room: int, width: int) -> float:
+    """Return the sum of the squared significances of the most significant boxes of `width` samples.
+
+    The array `padded` (c, r) contains the cumulative sums along the azimuth on r circles, with a margin of
+    `room` samples at both ends.
+    """
+    stretches = (len(padded) - 2 * room - width) // width
+    outer, inner, behind, beyond = (
+        padded[room + offset : room + offset + stretches * width]
+        for offset in (-(width // 2), 0, width, width + width // 2)
+    )
+    light = behind - inner
+    light *= np.float32(2.0)
+    light -= beyond
+    light += outer
+    # The circles are divided into intervals of one box length. The most significant box of an interval is
+    # counted if no adjacent interval, on the same or a neighbouring circle, has a more significant box.
+    best = light.reshape(stretches, width, -1).max(axis=1)
+    best *= np.float32(1.0 / np.sqrt(2.0 * width))
+    around = np.pad(best, 1)
+    highest = best >= _LEAST_SIGMAS
+    for down in (0, 1, 2):
+        for beside in (0, 1, 2):
+            highest &= best >= around[down : down + stretches, beside : beside + best.shape[1]]
+    return float(np.sum(np.minimum(best[highest], _FRAME_ENOUGH) ** 2))
+
+
+def sharper_widths(width: int, longest: int) -> IntArray:
+    """Return the integer box lengths (samples) within half a search step of `width`, up to `longest`."""
+    room = max(1, round(0.6 * (_FRAME_FACTOR - 1.0) * width))
+    return np.arange(max(width - room, 2), min(width + room, longest) + 1)

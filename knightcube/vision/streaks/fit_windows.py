@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,39 +20,341 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
+    PointsAtLines,
     Shutter,
+    StarPaths,
     StreakScene,
     exposure_bounds,
     path_lengths,
     paths,
     positions,
 )
-from knightcube.vision.streaks.path_pixels import STEEPEST, Patches, Strips, cut_patches, cut_strips
+
+LINES = 10
+"""Number of lines of pixels in one block. Each line crosses the path of the star."""
+
+STEEPEST = 0.68
+"""Minimum cosine between a path and the normal of a line of pixels, slightly below the cosine of 45 deg."""
+
+SLOWEST = 1e-3
+"""Lower limit (px per exposure) of a star's speed, which avoids divisions by zero."""
+# Largest camera rotation (rad) in one part of a path, whose column or row must change monotonically.
+_LONGEST_ROTATION = 1.1
+# Number of instants at which part of a path is evaluated to find where it crosses lines of pixels.
+_CROSSING_SAMPLES = 17
+# Ratio of a star's speeds along rows and columns at which its path is divided. If the ratio were 1, the
+# border between two parts could follow a diagonal of pixels, all of which would be omitted.
+_DIAGONAL = 1.03
+# Number of instants at which the direction of part of a path is evaluated.
+_DIRECTION_INSTANTS = 7
+# Lower limit of the cosine between a path and the normal of a line of pixels beyond the end of the path.
+_MOST_BENT = 0.5
+# Width (px) of the gap between adjoining parts of a straight path. Pixels in the gap belong to neither part.
+_SEAM = 0.003
+# Increase of the gap width (px) between parts of a curved path, per cubed strip width and squared curvature.
+_ARC = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Strips:
+    """Pixels near the paths of stars: b blocks, each of `LINES` lines of k pixels across the path.
+
+    Attributes:
+        star: index of the star of each block of pixels (b,), in ascending order.
+        time: time at which the star crosses each line of pixels (b, LINES), exposures since mid-exposure.
+        corner: column and row of the first pixel of each line of pixels (b, LINES, 2).
+        step: step in column and row from one pixel of a line to the next (b, 2).
+        index: flat index in the frame of each pixel (b, LINES, k), or 0 for a pixel that is not `inside`.
+        inside: mask (b, LINES, k) of the pixels in the frame that are nearer to their block's part of the
+            path than to other parts.
+    """
+
+    star: IntArray
+    time: FloatArray
+    corner: IntArray
+    step: IntArray
+    index: IntArray
+    inside: BoolArray
+
+
+def cut_strips(
+    pinhole: Pinhole,
+    motion: CameraMotion,
+    stars: FloatArray,
+    times: FloatArray,
+    width: float,
+    ending: BoolArray | None = None,
+) -> Strips:
+    """Return the pixels within `width` px of the paths of `stars` (n, 2), px, between start and end `times`.
+
+    The start and end times (n, 2) are relative to mid-exposure, in units of the exposure time. The mask
+    `ending` (n, 2) states which start and end times are ends of a streak. At an end of a streak, pixels
+    beyond the end are included. If `ending` is None, all start and end times are ends of a streak.
+    """
+    part, low, high, outer = _parts(pinhole, motion, stars, times)
+    if ending is not None:
+        outer &= ending[part]
+    # The sampled positions extend by the same distance beyond both ends of each part of a path.
+    chosen, reach = stars[part], 1.45 * width + 1.0
+    begin = low - reach / _speed(paths(pinhole, motion, chosen, low))
+    end = high + reach / _speed(paths(pinhole, motion, chosen, high))
+    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _CROSSING_SAMPLES)
+    place = positions(pinhole, motion, np.repeat(chosen, _CROSSING_SAMPLES, axis=0), sampled.reshape(-1))
+    place = place.reshape(-1, _CROSSING_SAMPLES, 2)
+    span = np.abs(place[:, -1] - place[:, 0])
+    along_rows = span[:, 0] >= span[:, 1]
+    major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])
+    size = np.where(along_rows, pinhole.columns, pinhole.rows)
+    first = np.maximum(np.ceil(major.min(axis=1)), 0).astype(np.int64)
+    last = np.minimum(np.floor(major.max(axis=1)), size - 1).astype(np.int64)
+    count = np.maximum(last - first + 1, 0)
+    blocks = -(-count // LINES)
+    owner = np.repeat(np.arange(len(part)), blocks)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+    line = first[owner, None] + number[:, None] * LINES + np.arange(LINES)
+    real = line <= last[owner, None]
+    time = _crossings(major, sampled, line, owner)
+    path = paths(pinhole, motion, np.repeat(stars[part[owner]], LINES, axis=0), time.reshape(-1))
+    lines = _Lines(part[owner], owner, line, time, real, along_rows[owner])
+    return _pixels(pinhole, lines, path, width, (low, high, outer))
+
+
+class _Lines(NamedTuple):
+    """Lines of pixels across star paths, in b blocks that each belong to one part of the path of one star.
+
+    The line numbers, the times at which the star crosses the lines, and the mask of the lines in the frame
+    have the shape (b, LINES).
+    """
+
+    star: IntArray
+    part: IntArray
+    line: IntArray
+    time: FloatArray
+    real: BoolArray
+    along_rows: BoolArray
+
+
+def _parts(
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+    """Return star, start time and end time of each path part, and a mask (.., 2) of the streak ends."""
+    turned = float(np.linalg.norm(motion.rotation)) + float(np.linalg.norm(motion.acceleration))
+    longest = float(np.max(times[:, 1] - times[:, 0], initial=0.0))
+    pieces = max(1, math.ceil(turned * longest / _LONGEST_ROTATION))
+    edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
+    # The start and end times have no rounding errors, so that streak ends are recognised by equality.
+    edges[:, -1] = times[:, 1]
+    part = np.repeat(np.arange(len(times)), pieces)
+    low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
+    owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
+    star, edge = np.append(np.repeat(np.arange(len(times)), pieces + 1), part[owner]), edges.reshape(-1)
+    edge = np.append(edge, diagonal)
+    order = np.lexsort((edge, star))
+    star, edge = star[order], edge[order]
+    begin = np.flatnonzero(star[1:] == star[:-1])
+    part, low, high = star[begin], edge[begin], edge[begin + 1]
+    return part, low, high, np.stack([low == times[part, 0], high == times[part, 1]], axis=-1)
+
+
+def _diagonals(
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return which path parts must be divided, and the times at which the main direction of the path changes.
+
+    Each part is given by its star's position (`stars`, (n, 2), px) and by start and end times `low` and
+    `high` (n,).
+    """
+    instants = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _DIRECTION_INSTANTS)
+    path = paths(pinhole, motion, np.repeat(stars, _DIRECTION_INSTANTS, axis=0), instants.reshape(-1))
+    way = np.abs(path.velocity.reshape(-1, _DIRECTION_INSTANTS, 2))
+    major = way.sum(axis=1).argmax(axis=1)[:, None]
+    steep = np.where(major, way[..., 1], way[..., 0]) < STEEPEST * np.hypot(way[..., 0], way[..., 1])
+    divided = np.flatnonzero(steep.any(axis=1))
+    excess = way[divided, :, 0] - _DIAGONAL * way[divided, :, 1]
+    which, before = np.nonzero((excess[:, 1:] < 0.0) != (excess[:, :-1] < 0.0))
+    first, last = excess[which, before], excess[which, before + 1]
+    which = divided[which]
+    begin, end = instants[which, before], instants[which, before + 1]
+    return which, begin + (end - begin) * first / (first - last)
+
+
+def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
+    """Return approximate times at which paths cross lines of pixels (`line`, (b, LINES))."""
+    falling = major[:, -1] < major[:, 0]
+    major = np.where(falling[:, None], major[:, ::-1], major)
+    sampled = np.where(falling[:, None], sampled[:, ::-1], sampled)
+    within = np.clip(line, major[owner, :1], major[owner, -1:])
+    # The coordinates of successive parts are shifted apart, so that one call interpolates all parts.
+    begin = np.arange(len(major)) * (float(np.ptp(major)) + 1.0 if major.size else 1.0)
+    at = (within + begin[owner, None]).reshape(-1)
+    times = np.interp(at, (major + begin[:, None]).reshape(-1), sampled.reshape(-1)) if len(at) else at
+    return np.asarray(times.reshape(line.shape))
+
+
+_Bounds = tuple[FloatArray, FloatArray, BoolArray]
+"""Start time and end time of each part of a path, and a mask (.., 2) of times that are streak ends."""
+_Field = tuple[int, int, float]
+"""Numbers of columns and rows of the frame, and largest distance (px) of a pixel from the path."""
+
+
+def _pixels(pinhole: Pinhole, lines: _Lines, path: StarPaths, width: float, parts: _Bounds) -> Strips:
+    """Return the pixel strips formed by `lines`, which cross the paths at the points `path` (b * LINES)."""
+    line, along = lines.line, lines.along_rows[:, None]
+    position, velocity, _ = points = path.at_lines(line.shape)
+    tangent = np.where(along, *velocity) / np.maximum(np.hypot(*velocity), SLOWEST)
+    steep = np.maximum(np.abs(tangent), _MOST_BENT)
+    half = math.ceil(float(np.max(np.where(lines.real, width / steep, 0.0), initial=0.0)))
+    minor = np.rint(np.where(along, position[1], position[0])).astype(np.int64) - half
+    corner = np.stack([np.where(along, line, minor), np.where(along, minor, line)], axis=-1)
+    bounds = (np.ascontiguousarray(parts[0]), np.ascontiguousarray(parts[1]), parts[2])
+    within = np.empty((*line.shape, 2 * half + 1), dtype=np.bool_)
+    _select_pixels(within, corner, points, lines, bounds, (pinhole.columns, pinhole.rows, float(width)))
+    # Blocks of lines without any usable pixel are dropped.
+    crossed = np.flatnonzero(within.any(axis=(0, 1)))
+    used = np.flatnonzero(within.any(axis=(1, 2)))
+    begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
+    inside = np.ascontiguousarray(within[used, :, begin:end])
+    step = np.where(along[used], [[0, 1]], [[1, 0]])
+    corner = corner[used] + begin * step[:, None]
+    first = corner[..., 1] * pinhole.columns + corner[..., 0]
+    next_pixel = (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
+    index = first[..., None] + np.arange(end - begin) * next_pixel
+    index *= inside
+    return Strips(lines.star[used], lines.time[used], corner, step, index, inside)
+
+
+def _select_pixels_numpy(
+    within: BoolArray, corner: IntArray, points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field
+) -> None:
+    """Compute the mask `within` (b, LINES, k) of pixels that are nearest to the path part of their block."""
+    part, time, real, along_rows = lines.part, lines.time, lines.real, lines.along_rows
+    along, (low, high, outer), (columns, rows, width) = along_rows[:, None], bounds, field
+    position, velocity, bent = points
+    speed = np.maximum(np.hypot(velocity[0], velocity[1]), SLOWEST)
+    tangent = velocity / speed
+    bend = (bent[1] * tangent[0] - bent[0] * tangent[1]) / speed**2
+    step = np.where(along, [[0, 1]], [[1, 0]])
+    count = within.shape[2]
+    there, way = position.transpose(1, 2, 0), tangent.transpose(1, 2, 0)
+    aside, ahead = path_distances(corner, step, there, way, count)
+    # An accuracy of 0.01 px suffices for the selection of pixels, so that float32 is used.
+    pace, curved = speed.astype(np.float32), bend.astype(np.float32)
+    ahead /= np.maximum(np.float32(1.0) - curved * aside, np.float32(0.5))
+    aside -= np.float32(0.5) * curved * ahead * ahead
+    foot = np.divide(ahead, pace, out=ahead)
+    foot += time.astype(np.float32)
+    # A pixel between two parts of a path may be omitted, but no pixel is counted twice.
+    seam, room = (_SEAM + _ARC * width**3 * np.square(bend)) / speed, width / speed
+    start = low[part, None] + np.where(outer[part, :1], -room, seam)
+    stop = high[part, None] - np.where(outer[part, 1:], -room, seam)
+    offset = np.arange(count)[:, None, None]
+    minor, limit = np.where(along, corner[..., 1], corner[..., 0]), np.where(along, rows, columns)
+    chosen = np.abs(aside, out=aside) <= np.float32(width)
+    chosen &= foot >= start.astype(np.float32)
+    chosen &= foot < stop.astype(np.float32)
+    chosen &= offset >= np.where(real, -minor, count)
+    chosen &= offset < limit - minor
+    within[:] = chosen.transpose(1, 2, 0)
+
+
+@compiled_form_of(_select_pixels_numpy)
+def _select_pixels(
+    within: BoolArray, corner: IntArray, points: PointsAtLines, lines: _Lines, bounds: _Bounds, field: _Field
+) -> None:
+    position, velocity, bent = points
+    part, time, real, along_rows = lines.part, lines.time, lines.real, lines.along_rows
+    (low, high, outer), (columns, rows, width) = bounds, field
+    blocks, each, count = within.shape
+    for b in range(blocks):
+        along, p = along_rows[b], part[b]
+        limit = rows if along else columns
+        for i in range(each):
+            speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), SLOWEST)
+            tx, ty = velocity[0, b, i] / speed, velocity[1, b, i] / speed
+            bend = (bent[1, b, i] * tx - bent[0, b, i] * ty) / speed**2
+            dx, dy = corner[b, i, 0] - position[0, b, i], corner[b, i, 1] - position[1, b, i]
+            across, ahead = dy * tx - dx * ty, dx * tx + dy * ty
+            by_across, by_ahead = (tx, ty) if along else (-ty, tx)
+            seam, room = (_SEAM + _ARC * width**3 * bend * bend) / speed, width / speed
+            start = low[p] + (-room if outer[p, 0] else seam) - time[b, i]
+            stop = high[p] - (-room if outer[p, 1] else seam) - time[b, i]
+            minor = corner[b, i, 1] if along else corner[b, i, 0]
+            begin, end = max(0, -minor), min(count, limit - minor)
+            if not real[b, i]:
+                end = 0
+            for k in range(count):
+                aside, s = across + k * by_across, ahead + k * by_ahead
+                s /= max(1.0 - bend * aside, 0.5)
+                aside -= 0.5 * bend * s * s
+                near = abs(aside) <= width and start <= s / speed < stop
+                within[b, i, k] = near and begin <= k < end
+
+
+def path_distances(
+    corner: IntArray, step: IntArray, position: FloatArray, tangent: FloatArray, count: int
+) -> tuple[Float32Array, Float32Array]:
+    """Return distances (px) across and along the path of `count` pixels on each of l lines, (count, b, l).
+
+    The first pixel of each line (`corner`) and the step to the next pixel (`step`) are those of `Strips`;
+    `position` and `tangent` (b, l, 2) are the position and unit tangent at which the path crosses each line
+    of pixels. The index of a pixel within its line is the first array axis, so that operations run along
+    contiguous memory.
+    """
+    offset = np.arange(count, dtype=np.float32)[:, None, None]
+    dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
+    tx, ty = tangent[..., 0], tangent[..., 1]
+    by_x, by_y = step[:, :1], step[:, 1:]
+    aside = (by_y * tx - by_x * ty).astype(np.float32) * offset
+    aside += (dy * tx - dx * ty).astype(np.float32)
+    ahead = (by_x * tx + by_y * ty).astype(np.float32) * offset
+    ahead += (dx * tx + dy * ty).astype(np.float32)
+    return aside, ahead
+
+
+def _speed(path: StarPaths) -> FloatArray:
+    return np.maximum(np.hypot(path.velocity[:, 0], path.velocity[:, 1]), SLOWEST)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patches:
+    """Square patches of pixels around n spots, which are short streaks or slow parts of streaks.
+
+    Each patch has p columns and p rows of the frame (n, p). The flat index in the frame (n, p, p) is 0 for a
+    pixel that is not `inside` the frame.
+    """
+
+    column: IntArray
+    row: IntArray
+    index: IntArray
+    inside: BoolArray
+
+
+def cut_patches(pinhole: Pinhole, middles: FloatArray, half: int) -> Patches:
+    """Return square patches of pixels within `half` px of `middles` (n, 2), px, along rows and columns."""
+    corner = np.rint(middles).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
+    column, row = corner[:, 0], corner[:, 1]
+    inside = ((row >= 0) & (row < pinhole.rows))[:, :, None] & ((column >= 0) & (column < pinhole.columns))[
+        :, None, :
+    ]
+    index = np.where(inside, row[:, :, None] * pinhole.columns + column[:, None, :], 0)
+    return Patches(column, row, index, inside)
+
 
 # Path length (point-spread widths) below which a star is fitted on a square patch of pixels.
 _SPOT_WIDTHS = 8.0
-# Margin (standard deviations) between the modelled counts and saturation below which a pixel is excluded. The
-# modelled counts are used, because a selection by the measured counts would be biased by their noise.
-_MARGIN = 3.0
 # Number of instants at which the position of a star on its path is evaluated.
 _INSTANTS = 9
-# Allowance for model errors in the exclusion of outliers, relative to the modelled counts of a pixel.
-_UNRESOLVED = 0.1
 # Largest relative change of a star's speed over one point-spread width on a strip of pixels.
 _STEADY = 0.05
 # Minimum length (point-spread widths) of the fast part of a path for a fit on a strip of pixels.
 _LEAST_FAST = 4.0
-# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
-_SLOWEST = 1e-3
 # Number of instants at which the rate is evaluated to find the slow part of a star's path.
 _SAMPLES = 129
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPixels:
-    """The values of the frame at the fitted pixels.
-
-    The first axis of the arrays is the index of a block of pixels.
+    """The values of the frame at the fitted pixels; the first axis is the index of a block of pixels.
 
     Attributes:
         slot: index of each pixel in the list of all fitted pixels, which contains a pixel shared by several
@@ -74,59 +377,20 @@ class BlockPixels:
     crowded: IntArray
     common: IntArray
 
-    def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
-        """Return weights and residuals of the pixels for the modelled counts `total` of all fitted pixels.
-
-        The weight is the inverse variance, or 0 for an excluded pixel. Pixels whose residuals exceed `clip`
-        standard deviations plus a tenth of the modelled counts are excluded; `clip` 0 excludes none.
-        """
-        pixels = self.slot, self.inside, self.signal, self.floor, self.ceiling
-        return residuals(total, *pixels, self.gain, clip)
-
-
-def residuals(
-    total: Float32Array,
-    slot: IntArray,
-    inside: BoolArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    ceiling: Float32Array,
-    gain: float,
-    clip: float,
-) -> tuple[Float32Array, Float32Array]:
-    """Return weights and residuals of pixels, see `BlockPixels.residual`."""
-    model = total.take(slot)
-    variance = np.maximum(model, np.float32(0.0))
-    variance *= np.float32(1.0 / gain)
-    variance += floor
-    residual = signal - model
-    deviation = np.sqrt(variance)
-    good = inside & (model + np.float32(_MARGIN) * deviation < ceiling)
-    if clip > 0.0:
-        deviation *= np.float32(clip)
-        deviation += np.float32(_UNRESOLVED) * model
-        good &= np.abs(residual) <= deviation
-    weight = np.where(good, np.float32(1.0) / variance, np.float32(0.0))
-    residual[~good] = 0.0
-    return weight, residual
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitWindows:
     """The fitted pixels: strips of pixels along long streaks, and square patches of pixels around spots.
 
     Attributes:
-        long: indices of the stars whose long streak is fitted on a strip of pixels (a,). If the star moves
-            slowly on part of its path, it also has a square patch of pixels for this part.
-        spot: indices of the stars that are fitted on a square patch of pixels (b,).
-        strips: pixels of the strips along long streaks. The star with index i in `strips` has the index
-            `long[i]` in the scene.
-        patches: pixels of the square patches around spots. The patch with index i belongs to the star with
-            the index `spot[i]` in the scene.
+        long: indices in the scene of the a stars of `strips` (a,). A star that moves slowly on part of its
+            path also has a patch for this part.
+        spot: indices in the scene of the b stars of `patches` (b,).
+        strips: pixels of the strips along long streaks.
+        patches: pixels of the square patches around spots.
         pixels: flat indices in the frame of all m fitted pixels (m,), each given once.
         slot: index in the list `pixels` of each pixel of all strips and patches, as a flat array.
-        on_strips: values of the frame on the strips of pixels along long streaks.
-        on_patches: values of the frame on the square patches of pixels around spots.
+        on_strips, on_patches: values of the frame on the strips and on the patches.
         shared: number of pixels that belong to more than one star.
     """
 
@@ -149,11 +413,9 @@ class FitWindows:
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
         """Return the fit windows reduced to the pixels selected by the masks `on_strips` and `on_patches`."""
-        return replace(
-            self,
-            on_strips=replace(self.on_strips, inside=on_strips),
-            on_patches=replace(self.on_patches, inside=on_patches),
-        )
+        strips = replace(self.on_strips, inside=on_strips)
+        patches = replace(self.on_patches, inside=on_patches)
+        return replace(self, on_strips=strips, on_patches=patches)
 
 
 def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
@@ -167,7 +429,6 @@ def _summed_numpy(slot: IntArray, first: Float32Array, second: FloatArray, count
 
 @compiled_form_of(_summed_numpy)
 def _summed(slot: IntArray, first: Float32Array, second: FloatArray, count: int) -> Float32Array:
-    """See `_summed_numpy`."""
     total, begin = np.zeros(count), len(first)
     for p in range(begin):
         total[slot[p]] += first[p]
@@ -207,21 +468,14 @@ def cut_windows(
     crowded = np.flatnonzero(np.append(shared, False).take(slot))
     common = (np.cumsum(shared) - 1).take(slot.take(crowded))
     of_frame = frame.signal, frame.floor, frame.counts, frame.bad
-    good, signal, floor, ceiling = _frame_values(index, inside, *of_frame, float(frame.top))
+    good, signal, floor, ceiling = _frame_values(index, inside, of_frame, float(frame.top))
     cut, first = strips.index.size, int(np.searchsorted(crowded, strips.index.size))
 
     def view(shape: tuple[int, ...], begin: int, of: slice) -> BlockPixels:
         part = slice(begin, begin + math.prod(shape))
-        return BlockPixels(
-            slot[part].reshape(shape),
-            good[part].reshape(shape),
-            signal[part].reshape(shape),
-            floor[part].reshape(shape),
-            ceiling[part].reshape(shape),
-            frame.gain,
-            crowded[of] - begin,
-            common[of],
-        )
+        ours = slot[part].reshape(shape), good[part].reshape(shape), signal[part].reshape(shape)
+        levels = floor[part].reshape(shape), ceiling[part].reshape(shape)
+        return BlockPixels(*ours, *levels, frame.gain, crowded[of] - begin, common[of])
 
     on_strips = view(strips.index.shape, 0, slice(0, first))
     on_patches = view(patches.index.shape, cut, slice(first, len(crowded)))
@@ -251,7 +505,6 @@ def _numbered_numpy(index: IntArray, inside: BoolArray, size: int) -> tuple[IntA
 
 @compiled_form_of(_numbered_numpy)
 def _numbered(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, IntArray, IntArray]:
-    """See `_numbered_numpy`."""
     number = np.empty(size, dtype=np.int32)
     for p in range(len(index)):
         if inside[p]:
@@ -270,16 +523,15 @@ def _numbered(index: IntArray, inside: BoolArray, size: int) -> tuple[IntArray, 
     return pixels[:count].copy(), slot, times
 
 
+_FrameArrays = tuple[Float32Array, Float32Array, Image, BoolArray]
+"""Signal, floor, counts and bad pixels of `ReducedFrame`."""
+
+
 def _frame_values_numpy(
-    index: IntArray,
-    inside: BoolArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    counts: Image,
-    bad: BoolArray,
-    top: float,
+    index: IntArray, inside: BoolArray, of_frame: _FrameArrays, top: float
 ) -> tuple[BoolArray, Float32Array, Float32Array, Float32Array]:
     """Return a mask of the usable pixels, and signal, floor and ceiling of all pixels, see `BlockPixels`."""
+    signal, floor, counts, bad = of_frame
     light = signal.take(index)
     # The background is the raw counts minus the signal, and is subtracted from the saturation level.
     ceiling = np.float32(top) - counts.take(index) + light
@@ -288,16 +540,9 @@ def _frame_values_numpy(
 
 @compiled_form_of(_frame_values_numpy)
 def _frame_values(
-    index: IntArray,
-    inside: BoolArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    counts: Image,
-    bad: BoolArray,
-    top: float,
+    index: IntArray, inside: BoolArray, of_frame: _FrameArrays, top: float
 ) -> tuple[BoolArray, Float32Array, Float32Array, Float32Array]:
-    """See `_frame_values_numpy`."""
-    size = len(index)
+    size, (signal, floor, counts, bad) = len(index), of_frame
     good, light = np.empty(size, dtype=np.bool_), np.empty(size, dtype=np.float32)
     variance, ceiling = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
     for p in range(size):
@@ -346,9 +591,8 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     pace, change = motion.relative_rate(time), np.abs(motion.relative_rate(time, 1)).max()
     steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
-    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    # A star is slow while the relative change of its speed over one point-spread width exceeds the limit
-    # `_STEADY`.
+    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), SLOWEST)
+    # A star is slow if its speed changes relatively by more than `_STEADY` over one point-spread width.
     slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:

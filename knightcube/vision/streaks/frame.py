@@ -27,8 +27,7 @@ from knightcube.vision.frame import (
     saturation_count,
 )
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +40,7 @@ class ReducedFrame:
         sums: sum of `signal` over the 3 x 3 pixels around each pixel.
         floor: noise variance of each pixel without a star, counts^2.
         counts: raw counts.
-        top: saturation level, the smallest raw counts at which a pixel is saturated.
+        top: smallest raw counts at which a pixel is saturated.
         bad: mask of the saturated and hot pixels, which the fit excludes.
         gain: gain of the camera, electrons per count.
         hot_pixels: number of hot pixels in the frame.
@@ -72,17 +71,8 @@ def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> Reduce
     hot = find_hot_pixels(signal, floor)
     signal[hot] = 0.0
     bad[hot] = True
-    return ReducedFrame(
-        (pixels.shape[0], pixels.shape[1]),
-        signal.reshape(-1),
-        box_sum(signal).reshape(-1),
-        floor.reshape(-1),
-        pixels.reshape(-1),
-        top,
-        bad.reshape(-1),
-        gain,
-        len(hot[0]),
-    )
+    flat = signal.reshape(-1), box_sum(signal).reshape(-1), floor.reshape(-1), pixels.reshape(-1)
+    return ReducedFrame((pixels.shape[0], pixels.shape[1]), *flat, top, bad.reshape(-1), gain, len(hot[0]))
 
 
 # Minimum area (pixels) of a bright region. A single noise peak fills nine pixels of the 3 x 3 sums.
@@ -101,10 +91,7 @@ class BrightRegions:
         length: length of the uniform line that has the same second moments as each region (n,), px.
         flux: (n,) counts.
         cut: whether each region touches the border of the frame (n,).
-        owner: index of the region to which each pixel belongs (m,).
-        column: column index of each pixel of a region (m,).
-        row: row index of each pixel of a region (m,).
-        light: counts above the background of each pixel of a region (m,).
+        owner, column, row, light: region, position and counts above the background of each pixel (m,).
         lit: fraction of the frame's pixels that exceed the threshold for bright regions.
     """
 
@@ -141,26 +128,16 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     found = moments(owner, column, row, light, len(chosen))
     rows, columns = frame.shape
     edge = (row < _BORDER) | (row >= rows - _BORDER) | (column < _BORDER) | (column >= columns - _BORDER)
-    return BrightRegions(
-        found.centre,
-        np.stack([-np.sin(found.direction), np.cos(found.direction)], axis=-1),
-        found.length,
-        found.flux,
-        np.bincount(owner, edge.astype(float), len(chosen)) > 0.0,
-        owner,
-        column,
-        row,
-        light,
-        len(pixel) / frame.signal.size,
-    )
+    normal = np.stack([-np.sin(found.direction), np.cos(found.direction)], axis=-1)
+    cut = np.bincount(owner, edge.astype(float), len(chosen)) > 0.0
+    shapes, lit = (found.centre, normal, found.length, found.flux, cut), len(pixel) / frame.signal.size
+    return BrightRegions(*shapes, owner, column, row, light, lit)
 
 
 def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
     """Return the ascending indices of the pixels whose `sums` exceed `threshold` times their noise.
 
-    The noise of a pixel is the square root of its noise variance `floor`, counts^2.
-
-    The argument `least` is the minimum of `floor`.
+    The noise of a pixel is the square root of its variance `floor`, whose minimum is `least`, counts^2.
     """
     pixel = np.flatnonzero(sums > np.float32(threshold * np.sqrt(least)))
     return np.asarray(pixel[sums[pixel] > np.float32(threshold) * np.sqrt(floor[pixel])])
@@ -168,7 +145,6 @@ def _significant_numpy(sums: Float32Array, floor: Float32Array, least: float, th
 
 @compiled_form_of(_significant_numpy)
 def _significant(sums: Float32Array, floor: Float32Array, least: float, threshold: float) -> IntArray:
-    """See `_significant_numpy`."""
     found, count = np.empty(len(sums), dtype=np.int64), 0
     lowest = np.float32(threshold * math.sqrt(least))
     for pixel in range(len(sums)):
@@ -182,8 +158,7 @@ def _significant(sums: Float32Array, floor: Float32Array, least: float, threshol
 _BROAD = 25.0
 # Smallest length (px) of a region that is assumed when its mean width is computed from its area.
 _LEAST_LENGTH = 40.0
-# Side length (px) of a square that fits into the image of a limb or a reflection, but not into that of a
-# star.
+# Side length (px) of a square that fits into the image of a limb or a reflection, but not of a star.
 _SOLID = 31
 # Margin (px) that is excluded around a limb or a reflection.
 _ABOUT = 12
@@ -255,16 +230,11 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     rows, columns = frame.shape
     each = np.tile(response, (rows // 2 + 1, columns // 2 + 1))[:rows, :columns].astype(np.float32)
     signal = frame.signal.reshape(frame.shape) / each
-    return replace(
-        frame,
-        signal=signal.reshape(-1),
-        sums=box_sum(signal).reshape(-1),
-        floor=(frame.floor / np.square(each).reshape(-1)).astype(np.float32),
-    )
+    floor = (frame.floor / np.square(each).reshape(-1)).astype(np.float32)
+    return replace(frame, signal=signal.reshape(-1), sums=box_sum(signal).reshape(-1), floor=floor)
 
 
-# Displacements (px) at which the autocorrelation of a streak's pixels is measured.
-# The displacement zero is omitted, because pixel noise adds to the autocorrelation there.
+# Displacements (px) at which the autocorrelation is measured; pixel noise adds to that at zero.
 _NEAR, _FAR = 1, 3
 # Maximum number of bright regions from which the point-spread width is estimated.
 _MOST_WIDTH_REGIONS = 12
@@ -352,17 +322,11 @@ class Binning:
         covariance = settings.knowledge.covariance
         if covariance is not None:
             covariance = tuple(map(tuple, (np.array(covariance) * np.outer(unit, unit)).tolist()))
-        return replace(
-            settings,
-            psf_sigma=settings.psf_sigma / self.size,
-            line_time=None if settings.line_time is None else settings.line_time * self.size,
-            knowledge=replace(
-                settings.knowledge,
-                centre=settings.knowledge.centre / self.size,
-                line_time=settings.line_time_sigma * self.size,
-                covariance=covariance,
-            ),
-        )
+        line_time = None if settings.line_time is None else settings.line_time * self.size
+        centre, delay = settings.knowledge.centre / self.size, settings.line_time_sigma * self.size
+        knowledge = replace(settings.knowledge, centre=centre, line_time=delay, covariance=covariance)
+        psf_sigma = settings.psf_sigma / self.size
+        return replace(settings, psf_sigma=psf_sigma, line_time=line_time, knowledge=knowledge)
 
     def in_pixels(self, result: MotionResult) -> MotionResult:
         """Return the `result` of a binned frame with its pixel coordinates converted to the full frame."""
@@ -397,27 +361,19 @@ _WIDE = 2.2
 _WIDER = 1.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PreparedFrame:
-    """A frame prepared for the fit, its bright regions, and its point-spread width `sigma` (binned px)."""
-
-    binning: Binning
-    frame: ReducedFrame
-    regions: BrightRegions
-    sigma: float
+_Prepared = tuple[Binning, ReducedFrame, BrightRegions, float]
+"""A frame prepared for the fit, its bright regions, and its point-spread width (binned px)."""
 
 
 def prepare_frame(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
-) -> PreparedFrame:
-    """Return the frame, binned for the configured point-spread width or for a much larger measured width.
-
-    `saturation` is the smallest count at which a pixel is saturated.
-    """
+) -> _Prepared:
+    """Return the frame, binned for the configured point-spread width or for a much larger measured width."""
     prepared = _prepared(pixels, pinhole, saturation, settings, settings.psf_sigma)
-    if prepared.binning.size > 1:
+    binning, frame, regions, _ = prepared
+    if binning.size > 1:
         return prepared
-    sigma = measured_psf_sigma(prepared.frame, prepared.regions)
+    sigma = measured_psf_sigma(frame, regions)
     if sigma is None or sigma <= max(_WIDE, _WIDER * settings.psf_sigma):
         return prepared
     return _prepared(pixels, pinhole, saturation, settings, sigma)
@@ -425,7 +381,7 @@ def prepare_frame(
 
 def _prepared(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
-) -> PreparedFrame:
+) -> _Prepared:
     """Return the frame, binned for a point spread with the standard deviation `sigma`, px."""
     binning = Binning.suited(pinhole, sigma)
     frame = reduce_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
@@ -435,4 +391,4 @@ def _prepared(
         if clear is not None:
             frame = clear
             regions = find_bright_regions(clear, settings.threshold_sigmas, _MOST_REGIONS)
-    return PreparedFrame(binning, frame, regions, sigma / binning.size)
+    return binning, frame, regions, sigma / binning.size

@@ -19,8 +19,7 @@ import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_product, select
 from knightcube.compiled import compiled_form_of, loop_helper
-from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
+from knightcube.vision.camera.lens import FOURTH_AS, CameraKnowledge, CameraModel, Lens, Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Variance (px^2) of a uniform distribution over one pixel."""
@@ -32,12 +31,8 @@ class Vibration:
     """Small rotation of a vibrating camera, a sum of k sinusoids of the time in units of the exposure.
 
     The contribution of a sinusoid to the rotation vector at the time t is `sine` sin(2 pi `frequency` t) +
-    `cosine` (cos(2 pi `frequency` t) - 1), which is zero at mid-exposure.
-
-    Attributes:
-        frequency: frequency of each sinusoid (k,), cycles per exposure.
-        sine: amplitudes of the sines (k, 3), rad.
-        cosine: amplitudes of the cosines (k, 3), rad.
+    `cosine` (cos(2 pi `frequency` t) - 1), which is zero at mid-exposure. The frequencies (k,) are in cycles
+    per exposure, and the amplitudes (k, 3) in rad.
     """
 
     frequency: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -56,12 +51,8 @@ class Vibration:
 
     def with_frequency(self, frequency: float) -> Vibration:
         """Return the vibration with one more sinusoid of zero amplitude."""
-        nothing = np.zeros((1, 3))
-        return Vibration(
-            np.append(self.frequency, frequency),
-            np.concatenate([self.sine, nothing]),
-            np.concatenate([self.cosine, nothing]),
-        )
+        amplitudes = (np.concatenate([each, np.zeros((1, 3))]) for each in (self.sine, self.cosine))
+        return Vibration(np.append(self.frequency, frequency), *amplitudes)
 
     def rotation(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the rotation vector (3, m) at `time` (m,), rad, or its first or second time derivative."""
@@ -82,11 +73,9 @@ class Vibration:
 class CameraMotion:
     """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
-    Attributes:
-        rate: angular rate at mid-exposure (3,), rad per exposure, excluding the vibration.
-        acceleration: angular acceleration at mid-exposure (3,), rad per exposure^2, excluding the vibration.
-        higher_terms: known coefficients of t^3, t^4, ... in the rotation vector (k, 3), rad.
-        vibration: vibration of the camera, whose rotation vector adds to the other terms.
+    The vibration is added to the smooth motion, which is described by its rate (3,), rad per exposure, and
+    angular acceleration (3,) at mid-exposure, and by the known coefficients `higher_terms` (k, 3), rad, of
+    t^3, t^4, ... in the rotation vector.
     """
 
     rate: FloatArray
@@ -180,6 +169,86 @@ class CameraMotion:
         return out * (time * time * time, time * time, time)[derivative]
 
 
+# Number of iterations for the inversion of the distortion, which is about 1 % of the image radius.
+_INVERSIONS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class DistortedPinhole(Pinhole):
+    """A pinhole camera with small calibration errors: image centre, focal length and cubic distortion.
+
+    The inherited methods project without distortion. Only the functions `paths` and `positions` apply it: a
+    displacement (x, y) of the image centre (`shift`, px), a relative error of the focal length (`scale`), and
+    the cubic distortion at the corner, as a fraction of the corner's distance from the centre.
+    """
+
+    shift: tuple[float, float]
+    scale: float
+    cubic: float
+
+    @classmethod
+    def of(cls, lens: Lens) -> DistortedPinhole:
+        """Return the pinhole camera with the image centre and the radial distortion of `lens`.
+
+        The second distortion term is approximated by a cubic term and a change of scale (least squares over
+        the image).
+        """
+        middle = lens.ideal.centre
+        square = (math.hypot(*middle) / lens.focal_length) ** 2
+        constant, quadratic = FOURTH_AS
+        last = lens.k2 * square**2
+        shift = lens.centre[0] - middle[0], lens.centre[1] - middle[1]
+        cubic = lens.k1 * square + quadratic * last
+        return cls(lens.columns, lens.rows, lens.focal_length, shift, constant * last, cubic)
+
+    def binned(self, columns: int, rows: int, size: int) -> DistortedPinhole:
+        """Return the camera of `columns` x `rows` bins of `size` x `size` px."""
+        shift = self.shift[0] / size, self.shift[1] / size
+        return DistortedPinhole(columns, rows, self.focal_length / size, shift, self.scale, self.cubic)
+
+    @property
+    def _per_square(self) -> float:
+        return self.cubic / float(np.hypot(*self.centre)) ** 2
+
+    def distorted(self, points: FloatArray) -> FloatArray:
+        """Return the image positions (m, 2), px, with lens distortion, of ideal `points` (m, 2), px."""
+        away = points - np.array(self.centre)
+        grown = self.scale + self._per_square * np.sum(away**2, axis=1, keepdims=True)
+        return np.asarray(points + np.array(self.shift) + grown * away)
+
+    def undistorted(self, points: FloatArray) -> FloatArray:
+        """Return the ideal positions (m, 2), px, of image `points` (m, 2), px, that have lens distortion."""
+        shifted = points - np.array(self.centre) - np.array(self.shift)
+        away = shifted
+        for _ in range(_INVERSIONS):
+            away = shifted / (1.0 + self.scale + self._per_square * np.sum(away**2, axis=1, keepdims=True))
+        return np.asarray(away + np.array(self.centre))
+
+    def jacobian(self, points: FloatArray) -> FloatArray:
+        """Return the Jacobian (m, 2, 2) of the lens distortion at ideal `points` (m, 2) px."""
+        away = points - np.array(self.centre)
+        grown = 1.0 + self.scale + self._per_square * np.sum(away**2, axis=1)
+        outer = away[:, :, None] * away[:, None, :]
+        return np.asarray(grown[:, None, None] * np.eye(2) + 2.0 * self._per_square * outer)
+
+    def curvature(self, points: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Return the acceleration (m, 2), px per exposure^2, of image points due to the distortion.
+
+        The ideal `points` (m, 2), px, move with a constant `velocity` (m, 2), px per exposure.
+        """
+        away = points - np.array(self.centre)
+        closing = np.sum(away * velocity, axis=1, keepdims=True)
+        square = np.sum(velocity**2, axis=1, keepdims=True)
+        return np.asarray(2.0 * self._per_square * (2.0 * closing * velocity + square * away))
+
+
+def streak_pinhole(camera: CameraModel, knowledge: CameraKnowledge) -> Pinhole:
+    """Return the camera model of the streak fit; it includes the distortion only of an estimated lens."""
+    if knowledge.covariance is None or not isinstance(camera, Lens):
+        return camera.ideal
+    return DistortedPinhole.of(camera)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StarPaths:
     """Position (m, 2), velocity (m, 2) and acceleration (m, 2) of m points on the paths of stars.
@@ -204,13 +273,12 @@ PointsAtLines = tuple[FloatArray, FloatArray, FloatArray]
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
     """Return points at `time` (m,) on the paths of stars that are at `stars` (m, 2), px, at mid-exposure."""
-    arguments = _ideal_arguments(pinhole, motion, stars, time)
-    if motion.vibration.exists:
-        position, velocity, acceleration = _paths_of(arguments[0], motion, *arguments[4:])
-    else:
-        position, velocity, acceleration = _ideal_paths(*arguments)
+    view, terms, ideal, time = _ideal_arguments(pinhole, motion, stars, time)
+    shaken = motion.vibration.exists
+    found = _paths_of(view, motion, ideal, time) if shaken else _ideal_paths(view, terms, ideal, time)
     if not isinstance(pinhole, DistortedPinhole):
-        return StarPaths(position, velocity, acceleration)
+        return StarPaths(*found)
+    position, velocity, acceleration = found
     jacobian = pinhole.jacobian(position)
     bent = (jacobian @ acceleration[..., None])[..., 0] + pinhole.curvature(position, velocity)
     return StarPaths(pinhole.distorted(position), (jacobian @ velocity[..., None])[..., 0], bent)
@@ -218,11 +286,11 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
     """Return the positions (m, 2), px, of the points that `paths` returns, but in less time."""
-    arguments = _ideal_arguments(pinhole, motion, stars, time)
-    if motion.vibration.exists:
-        points = _positions_of(arguments[0], motion, *arguments[4:])
-    else:
-        points = _ideal_positions(*arguments)
+    view, terms, ideal, time = _ideal_arguments(pinhole, motion, stars, time)
+    shaken = motion.vibration.exists
+    points = (
+        _positions_of(view, motion, ideal, time) if shaken else _ideal_positions(view, terms, ideal, time)
+    )
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
 
 
@@ -254,70 +322,53 @@ def sensitivities_and_velocity(
     exact. The derivatives with respect to the acceleration have an error of second order in the rotation
     angle, and are zero unless the acceleration is fitted (`growing`).
     """
-    arguments = _ideal_arguments(pinhole, motion, stars, time)
+    view, terms, ideal, time = _ideal_arguments(pinhole, motion, stars, time)
     if motion.vibration.exists:
-        change, pace = _sensitivities_of(arguments[0], motion, *arguments[4:], growing)
+        change, pace = _sensitivities_of(view, motion, ideal, time, growing)
     else:
-        change, pace = _ideal_sensitivities(*arguments, growing)
+        change, pace = _ideal_sensitivities(view, terms, ideal, time, growing)
     if isinstance(pinhole, DistortedPinhole):
-        jacobian = pinhole.jacobian(_positions_of(arguments[0], motion, *arguments[4:]))
+        jacobian = pinhole.jacobian(_positions_of(view, motion, ideal, time))
         change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
         # Positions at mid-exposure include distortion, so that their derivatives need the inverse Jacobian.
-        change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(arguments[4]))
+        change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(ideal))
     return change, pace
 
 
 _View = tuple[float, float, float]
 """Focal length and image centre (x, y) of a pinhole, px."""
-_Arguments = tuple[_View, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+_Terms = tuple[FloatArray, FloatArray, FloatArray]
+"""Rate (3,), acceleration (3,) and higher terms (k, 3) of a motion without vibration."""
 
 
 def _ideal_arguments(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray
-) -> _Arguments:
-    """Return view, rate, acceleration, higher terms, undistorted `stars` (m, 2) and `time` (m,)."""
+) -> tuple[_View, _Terms, FloatArray, FloatArray]:
+    """Return view, terms of the motion, undistorted `stars` (m, 2) and `time` (m,), as contiguous arrays."""
     if isinstance(pinhole, DistortedPinhole):
         stars = pinhole.undistorted(stars)
-    terms = motion.rate, motion.acceleration, motion.higher_terms
-    rate, acceleration, higher = (np.ascontiguousarray(term) for term in terms)
-    view = (pinhole.focal_length, *pinhole.centre)
-    return view, rate, acceleration, higher, np.ascontiguousarray(stars), np.ascontiguousarray(time)
+    each = motion.rate, motion.acceleration, motion.higher_terms, stars, time
+    rate, acceleration, higher, stars, time = (np.ascontiguousarray(one) for one in each)
+    return (pinhole.focal_length, *pinhole.centre), (rate, acceleration, higher), stars, time
 
 
-# The compiled forms do not include a vibration, because few frames show a vibration. The numpy forms compute
-# with arrays of m vectors (..., 3, m), in which each component is contiguous, and return transposed views of
-# these arrays.
+# The compiled forms do not include a vibration, which is rare. The numpy forms compute with arrays of m
+# vectors (..., 3, m), and return transposed views. None of these functions applies the distortion.
 
 
 def _positions_of(view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the positions (m, 2), px, at `time` (m,) of `stars` (m, 2), px, without distortion."""
+    """Return the positions (m, 2), px, at `time` (m,) of `stars` (m, 2), px."""
     v = _rotated(_rotation_until(motion, time), _directions(view, stars))
     return _pixels(view, v[:2] / v[2])
 
 
-def _ideal_positions_numpy(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
-) -> FloatArray:
-    """See `_positions_of`."""
-    return _positions_of(view, CameraMotion(rate, acceleration, higher), stars, time)
+def _ideal_positions_numpy(view: _View, terms: _Terms, stars: FloatArray, time: FloatArray) -> FloatArray:
+    return _positions_of(view, CameraMotion(*terms), stars, time)
 
 
 @compiled_form_of(_ideal_positions_numpy)
-def _ideal_positions(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
-) -> FloatArray:
-    """See `_ideal_positions_numpy`."""
-    out = np.empty((2, len(time)))
+def _ideal_positions(view: _View, terms: _Terms, stars: FloatArray, time: FloatArray) -> FloatArray:
+    out, (rate, acceleration, higher) = np.empty((2, len(time))), terms
     if len(higher) == 0 and _is_small(rate, acceleration, time):
         for m in range(len(time)):
             turn, w, change = _motion_at(rate, acceleration, time[m])
@@ -334,44 +385,31 @@ def _ideal_positions(
 def _paths_of(
     view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the position, velocity and acceleration (m, 2) of `stars` (m, 2), px, without distortion."""
+    """Return the position, velocity and acceleration (m, 2) of `stars` (m, 2), px."""
     v = _rotated(_rotation_until(motion, time), _directions(view, stars))
     w = _rate(motion, time)
     velocity = _cross(v, w)  # -omega x v
     bent = _cross(velocity, w)
     if not motion.constant:
         bent += _cross(v, motion.acceleration[:, None] + motion.higher(time, 2))
-    focal = view[0]
     inverse = 1.0 / v[2]
     there = v[:2] * inverse
     pace = (velocity[:2] - there * velocity[2]) * inverse
     bend = (bent[:2] - there * bent[2] - 2.0 * pace * velocity[2]) * inverse
-    return _pixels(view, there), (focal * pace).T, (focal * bend).T
+    return _pixels(view, there), (view[0] * pace).T, (view[0] * bend).T
 
 
 def _ideal_paths_numpy(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
+    view: _View, terms: _Terms, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `_paths_of`."""
-    return _paths_of(view, CameraMotion(rate, acceleration, higher), stars, time)
+    return _paths_of(view, CameraMotion(*terms), stars, time)
 
 
 @compiled_form_of(_ideal_paths_numpy)
 def _ideal_paths(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
+    view: _View, terms: _Terms, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `_ideal_paths_numpy`."""
-    out = np.empty((6, len(time)))
+    out, (rate, acceleration, higher) = np.empty((6, len(time))), terms
     if len(higher) == 0 and _is_small(rate, acceleration, time):
         # The compiled form of the branch for small rotations uses the processor's vector instructions.
         for m in range(len(time)):
@@ -391,7 +429,7 @@ def _ideal_paths(
 def _sensitivities_of(
     view: _View, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (m, 2, 8) and velocities (m, 2) without distortion."""
+    """Return the derivatives (m, 2, 8) and velocities (m, 2)."""
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(view, stars))
     there = v[:2] / v[2]
@@ -421,30 +459,16 @@ def _sensitivities_of(
 
 
 def _ideal_sensitivities_numpy(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
-    growing: bool,
+    view: _View, terms: _Terms, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """See `_sensitivities_of`."""
-    return _sensitivities_of(view, CameraMotion(rate, acceleration, higher), stars, time, growing)
+    return _sensitivities_of(view, CameraMotion(*terms), stars, time, growing)
 
 
 @compiled_form_of(_ideal_sensitivities_numpy)
 def _ideal_sensitivities(
-    view: _View,
-    rate: FloatArray,
-    acceleration: FloatArray,
-    higher: FloatArray,
-    stars: FloatArray,
-    time: FloatArray,
-    growing: bool,
+    view: _View, terms: _Terms, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """See `_ideal_sensitivities_numpy`."""
-    focal = view[0]
+    focal, (rate, acceleration, higher) = view[0], terms
     out, velocity = np.zeros((len(time), 2, 8)), np.empty((len(time), 2))
     for m in range(len(time)):
         t = time[m]
@@ -681,12 +705,9 @@ def _rotated(rotation: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray)
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
-    """Exposure delays of the rows of a detector with a rolling or global shutter.
+    """Exposure delays of the rows of a detector, in units of the exposure time; 0 for a global shutter.
 
-    Attributes:
-        delay_per_row: delay from one row to the next, in units of the exposure time. For a global shutter,
-            the delay is 0.
-        middle: index of the row whose mid-exposure is at time zero.
+    The mid-exposure of the row with the index `middle` is at time zero.
     """
 
     delay_per_row: float = 0.0
@@ -717,10 +738,8 @@ class Course:
     The pixels of the frame determine the rate and the linear change of the rate. Higher-order terms, for
     example of a step of the rate, are better known from the navigation filter and are held fixed in the fit.
 
-    Attributes:
-        terms: coefficients of t, t^2, ... in the rotation vector since mid-exposure (k, 3), in camera axes,
-            rad.
-        sigma: standard deviation of the rate, multiplied by the exposure, rad.
+    The `terms` (k, 3), rad, are the coefficients of t, t^2, ... in the rotation vector since mid-exposure, in
+    camera axes. The standard deviation `sigma`, rad, is that of the rate, multiplied by the exposure.
     """
 
     terms: FloatArray
@@ -760,8 +779,7 @@ class StreakScene:
         stars: positions of the n stars at mid-exposure (n, 2), px.
         light: flux of each star over the exposure (n,), counts.
         sky: sky level around each star relative to the frame's background (n,), counts per pixel.
-        trusted: whether each star contributes to motion and point spread (n,). For a star that does not
-            contribute, only flux, position and sky level are fitted.
+        trusted: whether each star contributes to motion and point spread (n,).
     """
 
     motion: CameraMotion
@@ -770,6 +788,12 @@ class StreakScene:
     light: FloatArray
     sky: FloatArray
     trusted: BoolArray
+
+    @classmethod
+    def of(cls, motion: CameraMotion, sigma: float, stars: FloatArray, light: FloatArray) -> StreakScene:
+        """Return a scene of trusted stars, with the point spread `sigma` (px) without pixel convolution."""
+        count, width = len(stars), float(np.hypot(sigma, 0.29))
+        return cls(motion, width, stars, light, np.zeros(count), np.ones(count, dtype=np.bool_))
 
     @property
     def sigma(self) -> float:
@@ -798,8 +822,7 @@ def exposure_bounds(
     times = np.tile([-0.5, 0.5], (len(stars), 1))
     if shutter.delay_per_row == 0.0:
         return times
-    # The row in which a streak ends depends on the end time, which is found by fixed-point iteration.
-    # The iteration for the end time converges, because a star crosses few rows during the delay of one row.
+    # The end time and the row in which the streak ends are found by fixed-point iteration.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]
@@ -830,15 +853,6 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
     return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=1))
 
 
-# Largest distance (px) across the streak between two segments of one streak.
-_CHAIN_ASIDE = 1.3
-# Smallest and largest angle between the centres of two segments of one streak, relative to the rotation
-# angle.
-_CHAIN_APART = (0.55, 1.7)
-# Largest flux ratio of two segments of one streak.
-_CHAIN_RATIO = 2.5
-
-
 def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the angles (n,), rad, of `stars` (n, 2), px, from the rotation axis, and their azimuths (n,)."""
     axis = motion.rotation / max(float(np.linalg.norm(motion.rotation)), 1e-12)
@@ -851,26 +865,6 @@ def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> t
 def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
     """Return the absolute differences (n, m), at most pi, between azimuths (n,) and (m,), all in rad."""
     return np.asarray(np.abs(np.remainder(azimuth[:, None] - other + np.pi, 2.0 * np.pi) - np.pi))
-
-
-def chained_stars(
-    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
-) -> BoolArray:
-    """Return whether each of the first `judged` stars seems to be only a segment of a streak, (judged,).
-
-    The n stars have the positions `stars` (n, 2), px, and the fluxes `light` (n,), counts.
-
-    If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
-    on one circle about the rotation axis, and each short streak fits its pixels as well as a complete streak.
-    Different stars rarely form a chain of equal segments by chance.
-    """
-    polar, azimuth = polar_angles(pinhole, motion, stars)
-    rotations = azimuth_differences(azimuth[:judged], azimuth)
-    rotations = rotations / max(float(np.linalg.norm(motion.rotation)), 1e-12)
-    aside = np.abs(polar[:judged, None] - polar) * pinhole.focal_length
-    ratio = light[:judged, None] / np.maximum(light, 1e-9)
-    joined = (aside < _CHAIN_ASIDE) & (rotations > _CHAIN_APART[0]) & (rotations < _CHAIN_APART[1])
-    return np.asarray((joined & (ratio < _CHAIN_RATIO) & (ratio > 1.0 / _CHAIN_RATIO)).any(axis=1))
 
 
 def near_streaks(

@@ -35,22 +35,21 @@ from knightcube.vision.streaks.geometry import (
     path_lengths,
     paths,
     positions,
+    sensitivities,
 )
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
     SHARED,
     Evaluation,
     Solution,
-    StarEstimates,
     consistent_stars,
+    estimates_of,
     evaluate,
     light_of,
     solve,
-    star_estimates,
-    step_significance,
-    stepped,
+    star_equations,
 )
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 # Number of processed pixels per frame after which no further motion is fitted. A fit in progress is always
 # completed. The work on one frame can therefore reach twice the limit.
@@ -86,13 +85,11 @@ _LONGEST_STEP = 3.0
 # Displacement (px) of a streak end after which the pixels of the fit windows are selected again.
 _DRIFT = 2.0
 # Displacement (px) in the first iteration, of a star without effect on the motion, above which pixels are
-# selected again. Later iterations ignore the often poorly known displacements of stars without effect on the
-# motion.
+# selected again. Later iterations ignore these displacements, which are often poorly known.
 _FAINT_DRIFT = 3.2
 # Change of the angular acceleration, relative to the rotation, above which the pixels are selected again.
 _GROWN = 0.1
-# Step of the shared parameters (standard deviations) below which the fit has converged. The last step of the
-# fit is applied, so that the remaining error is of second order in the step.
+# Step of the shared parameters (standard deviations) below which the fit, after this step, has converged.
 SETTLED = 0.4
 # Largest ratio of the lengths of a step and the preceding step that counts as progress of the fit.
 _LEAST_PROGRESS = 0.7
@@ -121,8 +118,7 @@ class IterationLimits:
         clipped: whether pixels with residuals far beyond the noise are excluded from the fit.
         tolerance: largest step (px) of a streak end or of the width at which the fit is converged.
         settled: largest step (standard deviations) of the shared parameters at which the fit is converged.
-        conjugate: maximum number of conjugate-gradient iterations, which account for the coupling of stars on
-            shared pixels.
+        conjugate: maximum number of conjugate-gradient iterations for the coupling of stars.
         patience: number of iterations before the first check of the fit's progress.
     """
 
@@ -143,17 +139,10 @@ LAST = IterationLimits(7, clipped=True, tolerance=0.003, settled=SETTLED, conjug
 class FitProblem:
     """A frame with the camera data and settings for a fit of motion and stars.
 
-    Attributes:
-        frame: the frame.
-        pinhole: projection of the camera.
-        shutter: exposure delay between the rows of the detector.
-        settings: settings of the estimator.
-        sigma: initial standard deviation of the point spread, px.
-        growing: whether the angular acceleration is fitted, so that the rate may change.
-        sense: direction (3,) along which the rotation vector must have a positive component; None for either
-            sense.
-        course: motion from the navigation filter, or None if it is unknown or nearly uniform.
-        work: computing work spent on this frame so far.
+    The initial standard deviation of the point spread is `sigma`, px. If the fit is `growing`, the angular
+    acceleration is fitted. The rotation vector must have a positive component along `sense` (3,), unless
+    `sense` is None. The `course` is the motion from the navigation filter, or None if it is unknown or nearly
+    uniform. The `work` is the computing work spent on this frame so far.
     """
 
     frame: ReducedFrame
@@ -189,17 +178,11 @@ class FitProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakFit:
-    """A fitted scene with the normal equations of the last step.
+    """A fitted scene with the solution and the normal equations of the last step.
 
-    Attributes:
-        scene: the fitted scene.
-        solution: last step.
-        evaluation: normal equations of the last step.
-        last_step: last step of the shared parameters, in standard deviations. The last step is 0 if the fit
-            is converged.
-        windows: fitted pixels.
-        free: mask (SHARED,) of the parameters that were fitted, among the parameters common to all stars.
-        hidden: stars on the fitted pixels that were subtracted instead of fitted; None without any.
+    The last step of the shared parameters, in standard deviations, is 0 if the fit is converged. The mask
+    `free` (SHARED,) selects the fitted parameters among the shared parameters. The stars `hidden` on the
+    fitted pixels were subtracted instead of fitted; None without any.
     """
 
     scene: StreakScene
@@ -213,18 +196,26 @@ class StreakFit:
     def grows(self) -> bool:
         """Return whether the rate changes significantly, by a score test of the constant rate.
 
-        The test accounts for the scatter of the accelerations of individual stars (Hotelling's T-squared
-        test).
+        If the scatter of the stars' estimates exceeds their noise, the significance is computed from the
+        scatter (Hotelling's T-squared test). Therefore, a single blended star cannot make the step of the
+        shared parameters significant.
         """
         # In most cases, an approximation without the coupling of stars on shared pixels is sufficient.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
                 return False
-            agreed, stars = step_significance(self.evaluation, solution.shared)
+            each = star_equations(self.evaluation, solution.shared != 0.0)
+            if each is None:
+                return False
+            part = solution.shared[each.kept]
+            asked, due = each.score @ part, np.einsum("i,nij,j->n", part, each.information, part)
+            stars = int(np.count_nonzero(due > 0.0))
             freedom = stars - _GROWTHS
             if freedom < 1:
                 return False
+            spread = float(np.sum((asked - due) ** 2)) * stars / max(stars - 1, 1)
+            agreed = float(due.sum()) ** 2 / max(float(due.sum()), spread, 1e-300)
             limit = float(fdtri(_GROWTHS, freedom, 1.0 - _BY_CHANCE)) * _GROWTHS * (stars - 1) / freedom
             if agreed <= share * limit:
                 return False
@@ -250,7 +241,7 @@ def iterate(
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
             return None
-        scene, wanted = stepped(scene, solution, camera.pinhole, _LONGEST_STEP)
+        scene, wanted = _stepped(scene, solution, camera.pinhole)
         valid = 0.3 < scene.width < _WIDEST and scene.width <= widest
         valid &= bool(np.all(np.isfinite(scene.stars)))
         if not valid or not np.linalg.norm(scene.motion.rotation) <= np.pi:
@@ -261,9 +252,8 @@ def iterate(
             last_step = 0.0
             break
         # Two consecutive steps of the fit in the same direction also count as progress.
-        onward = (
-            float(np.sum(solution.shared * before / np.maximum(np.diag(solution.covariance), 1e-30))) > 0.0
-        )
+        variance = np.maximum(np.diag(solution.covariance), 1e-30)
+        onward = float(np.sum(solution.shared * before / variance)) > 0.0
         if turn >= how.patience and wanted > _LEAST_PROGRESS * previous and not onward:
             break
         previous, before = wanted, solution.shared
@@ -278,6 +268,34 @@ def iterate(
     if solution is None or evaluation is None:
         return None
     return StreakFit(scene, solution, evaluation, last_step, whole, free)
+
+
+def _stepped(scene: StreakScene, solution: Solution, pinhole: Pinhole) -> tuple[StreakScene, float]:
+    """Return the scene after a step of the fit that is limited to `_LONGEST_STEP` px at each streak end.
+
+    The second returned value is the largest displacement (px) of a streak end by the unlimited step, or the
+    change (px) of the point-spread width if that is larger.
+    """
+    stars, time = np.tile(scene.stars, (2, 1)), np.repeat([-0.5, 0.5], len(scene.stars))
+    growing = bool(solution.shared[3:6].any())
+    change = sensitivities(pinhole, scene.motion, stars, time, growing)
+    along = change[:, :, :6] @ solution.shared[:6]
+    ends = float(np.hypot(along[:, 0], along[:, 1]).max(initial=0.0))
+    share = min(1.0, _LONGEST_STEP / max(ends, 1e-9), 0.3 * scene.width / max(abs(solution.shared[6]), 1e-9))
+    step = solution.alone * share
+    far = np.hypot(step[:, 0], step[:, 1])
+    step[:, :2] *= np.minimum(1.0, _LONGEST_STEP / np.maximum(far, 1e-9))[:, None]
+    shared = share * solution.shared
+    turn, growth = scene.motion.rate + shared[:3], scene.motion.acceleration + shared[3:6]
+    after = replace(
+        scene,
+        motion=replace(scene.motion, rate=turn, acceleration=growth),
+        width=scene.width + float(shared[6]),
+        stars=scene.stars + step[:, :2],
+        light=np.maximum(scene.light + step[:, 2], 0.3 * scene.light),
+        sky=scene.sky + step[:, 3],
+    )
+    return after, max(ends, abs(float(solution.shared[6])))
 
 
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
@@ -327,9 +345,8 @@ _LEAST_VALID = 0.7
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants of the exposure at which the rotation angle is evaluated.
 _INSTANTS = 65
-# Lower limit of a star's speed, relative to the mean speed, in the computation of the expected intensity. The
-# intensity is inversely proportional to the speed, but the point spread keeps it finite where the star is
-# nearly at rest.
+# Lower limit of a star's speed, relative to the mean speed, in the expected intensity, which the point
+# spread keeps finite where the star is nearly at rest.
 _SLOW = 0.5
 # Minimum intensity beyond a streak end that counts as a trail, relative to the streak's mean intensity.
 _TRAIL = 0.08
@@ -422,9 +439,8 @@ def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
     time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
     each = np.repeat(scene.stars, _WITHIN, axis=0)
     mean, deviation = brightness(camera, scene.motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
-    rate = np.clip(scene.motion.relative_rate(time.reshape(-1)), _SLOW, None).reshape(
-        len(each), _WITHIN_SAMPLES
-    )
+    rate = np.clip(scene.motion.relative_rate(time.reshape(-1)), _SLOW, None)
+    rate = rate.reshape(len(each), _WITHIN_SAMPLES)
     expected = np.repeat(expected_brightness(scene.light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
     known = np.isfinite(mean) & (expected > _LEAST_SIGNIFICANCE * deviation)
     dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
@@ -450,23 +466,21 @@ def brightness(
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
     position, velocity = np.ascontiguousarray(there.position.T), np.ascontiguousarray(there.velocity.T)
     shape = pinhole.columns, pinhole.rows
-    return _band_means(position, velocity, frame.signal, frame.floor, frame.bad, shape, samples)
+    return _band_means(position, velocity, (frame.signal, frame.floor, frame.bad), shape, samples)
+
+
+_FramePixels = tuple[Float32Array, Float32Array, BoolArray]
+"""Signal, floor and bad pixels of `ReducedFrame`, as flat arrays."""
 
 
 def _band_means_numpy(
-    position: FloatArray,
-    velocity: FloatArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    bad: BoolArray,
-    shape: tuple[int, int],
-    samples: int,
+    position: FloatArray, velocity: FloatArray, frame: _FramePixels, shape: tuple[int, int], samples: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return means and standard errors (n,) of `brightness` for positions and velocities (2, n * samples).
 
-    The frame has the `shape` columns and rows, and the flat arrays `signal`, `floor` and `bad`.
+    The frame has the `shape` columns and rows.
     """
-    columns, rows = shape
+    (columns, rows), (signal, floor, bad) = shape, frame
     way = velocity / np.maximum(np.hypot(velocity[0], velocity[1]), 1e-3)
     x = np.rint(position[0] - _ASIDE[:, None] * way[1]).astype(np.int64)
     y = np.rint(position[1] + _ASIDE[:, None] * way[0]).astype(np.int64)
@@ -487,16 +501,9 @@ def _band_means_numpy(
 
 @compiled_form_of(_band_means_numpy)
 def _band_means(
-    position: FloatArray,
-    velocity: FloatArray,
-    signal: Float32Array,
-    floor: Float32Array,
-    bad: BoolArray,
-    shape: tuple[int, int],
-    samples: int,
+    position: FloatArray, velocity: FloatArray, frame: _FramePixels, shape: tuple[int, int], samples: int
 ) -> tuple[FloatArray, FloatArray]:
-    """See `_band_means_numpy`."""
-    columns, rows = shape
+    (columns, rows), (signal, floor, bad) = shape, frame
     segments = position.shape[1] // samples
     mean, deviation = np.empty(segments), np.empty(segments)
     for n in range(segments):
@@ -530,8 +537,7 @@ _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 # Difference (px) between the length errors of two streaks below which these errors count as equal.
 _ALIKE = 3.0
-# Minimum ratio of the number of streaks with a wrong length to the number with the correct length, for a
-# correction.
+# Minimum ratio of the numbers of streaks with a wrong and with the correct length, for a correction.
 _MORE = 2
 # Largest relative change of the rate for which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5
@@ -602,18 +608,15 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     return replace(scene, motion=motion, stars=moved)
 
 
-# Largest change of the rate over the exposure, relative to the rate at mid-exposure. For a motion that starts
-# or ends at rest, the relative change of the rate is 2.
+# Largest change of the rate relative to the mid-exposure rate; it is 2 for a motion from or to rest.
 _MOST_CHANGE = 2.2
-# Deviation (standard deviations) from the motion of the majority of stars above which a star is excluded from
-# the motion fit.
+# Deviation (standard deviations) from the majority above which a star is excluded from the motion fit.
 _TRUST_SIGMAS = 3.5
 # Model error (px) of the ends of a streak, assumed when the motions of the stars are compared.
 _END_FLOOR = 0.01
 # Model error (px) of the width of a streak, assumed when the motions of the stars are compared.
 _WIDTH_FLOOR = 0.002
-# Distance between two streaks below which they are fitted together, as a multiple of half the width of a
-# strip.
+# Distance (half strip widths) between two streaks below which they are fitted together.
 _NEAR = 1.4
 # Displacement (px) of the streak ends during the fit above which the search for faint stars is repeated.
 _FAR = 6.0
@@ -621,15 +624,13 @@ _FAR = 6.0
 _MOST_REPEATS = 2
 # Relative error of the modelled counts of a subtracted star on a pixel.
 _SUBTRACTION_ERROR = 0.35
-# Maximum total number of pixels in all fit windows, which limits memory and time. A pixel that lies in
-# several fit windows counts once for each of these windows.
+# Maximum total number of pixels in all fit windows, counted once per window, for memory and time.
 _MOST_PIXELS = 60_000
 # Fraction of the maximum number of pixels for a fit of only the brightest streaks and their neighbours.
 _BRIGHTEST_SHARE = 0.5
 # Minimum number of bright streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10
-# Minimum significance (standard deviations) of a detected faint star in the search on the pixels of bright
-# streaks. Undetected faint stars would shift the ends of the bright streaks.
+# Minimum significance (standard deviations) of a faint star that could shift the ends of bright streaks.
 _HIDDEN_SIGMAS = 4.5
 # Number of stars subtracted from the frame in one batch, which limits the memory.
 _AT_ONCE = 16
@@ -679,17 +680,20 @@ def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
     settings, before = camera.settings, first.scene
     if before.motion.accelerates:
         camera = replace(camera, growing=True)
-    faint = _find_along(camera, first)
+    camera.work.passed(camera.frame.signal.size)
+    light = light_of(camera.pinhole, camera.shutter, before, first.windows)
+    modelled, sigmas = (first.windows.pixels, light), min(_HIDDEN_SIGMAS, settings.faint_sigmas)
+    most = settings.most_faint
+    faint = find_faint(camera.frame, modelled, camera.pinhole, before.motion, sigmas, most)
+    stars = mid_exposure_positions(camera.pinhole, before.motion, camera.shutter, faint.stars)
+    faint = replace(faint, stars=stars)
     whole = before.with_stars(faint.stars, faint.light)
     order = np.argsort(-whole.light, kind="stable")
     bright, rest = order[: settings.most_stars], order[settings.most_stars :]
     scene, others = whole.select(bright), whole.select(rest)
     scene = replace(scene, trusted=np.ones(len(bright), dtype=np.bool_))
-    near = np.flatnonzero(
-        near_streaks(
-            camera.pinhole, scene.motion, others.stars, scene.stars, _NEAR * settings.reach * scene.width
-        )
-    )
+    distance = _NEAR * settings.reach * scene.width
+    near = np.flatnonzero(near_streaks(camera.pinhole, scene.motion, others.stars, scene.stars, distance))
     fitted = others.select(near[: settings.most_neighbours])
     scene = scene.with_stars(fitted.stars, fitted.light)
     beyond = others.select(near[settings.most_neighbours :])
@@ -700,22 +704,6 @@ def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
     rest = rest[rest >= len(before.light)] - len(before.light)
     rest = rest[faint.significance[rest] >= settings.faint_sigmas]
     return done, FaintStars(faint.stars[rest], faint.light[rest], faint.significance[rest])
-
-
-def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
-    """Return the faint streaks along the motion of the fit `first` that are not included in this fit."""
-    settings, motion = camera.settings, first.scene.motion
-    camera.work.passed(camera.frame.signal.size)
-    light = light_of(camera.pinhole, camera.shutter, first.scene, first.windows)
-    faint = find_faint(
-        camera.frame,
-        (first.windows.pixels, light),
-        camera.pinhole,
-        motion,
-        min(_HIDDEN_SIGMAS, settings.faint_sigmas),
-        settings.most_faint,
-    )
-    return replace(faint, stars=mid_exposure_positions(camera.pinhole, motion, camera.shutter, faint.stars))
 
 
 def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> StreakFit | None:
@@ -793,18 +781,17 @@ def _excessive(motion: CameraMotion) -> bool:
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
     """Return which stars in the motion fit agree with the majority, or all of them if too few agree."""
-    estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
+    equations = star_equations(rough.evaluation, camera.free)
     before = rough.scene.trusted
-    if estimates is None:
+    if equations is None:
         return before
+    change, deviation = estimates_of(equations, rough.scene)
     had = np.flatnonzero(before)
     length = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
     turn = float(np.linalg.norm(rough.scene.motion.rotation))
     angle = _END_FLOOR * turn / max(float(np.median(length)), 1.0)
     floors = np.array([angle, angle, angle, _WIDTH_FLOOR])
-    agree = consistent_stars(
-        StarEstimates(estimates.change[had], estimates.deviation[had]), floors, _TRUST_SIGMAS
-    )
+    agree = consistent_stars(change[had], deviation[had], floors, _TRUST_SIGMAS)
     if np.count_nonzero(agree) < max(camera.settings.least_stars, len(had) // 3):
         return before
     after = before.copy()

@@ -4,36 +4,42 @@ The weight of a pixel is the inverse of the variance that the model predicts. Th
 converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled
 flux of all stars, so that streaks may cross. The four parameters of each star are eliminated from the
 equations, which leaves the shared parameters (rate, acceleration, width). Stars that share pixels are
-coupled, and a few conjugate-gradient iterations account for the coupling.
+coupled, and a few conjugate-gradient iterations account for the coupling. The equations without the coupling
+are the preconditioner.
 
 Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
 than the image of a single star, and the flux of a neighbouring star shifts the ends of a streak. Blended
 stars are excluded from the fit of the motion, because their estimates disagree with the majority.
+
+A vector of all parameters consists of the s parameters common to all stars, followed by a further parameters
+for each of the n stars.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks import coupled_stars, streak_model
-from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows, residuals
+from knightcube.vision.streaks import streak_model
+from knightcube.vision.streaks.fit_windows import BlockPixels, FitWindows
 from knightcube.vision.streaks.frame import MEDIAN_ERROR
-from knightcube.vision.streaks.geometry import Shutter, StreakScene, sensitivities
+from knightcube.vision.streaks.geometry import Shutter, StreakScene
 
 SHARED = 7
 """Number of parameters that all stars share: rate (3), acceleration (3) and point-spread width (1)."""
 ALONE = 4
 """Number of parameters of a single star: x, y, flux and sky level."""
 
-# Constants of `fit_windows.residuals` that the compiled functions of this module use.
+# Margin (standard deviations) between the modelled counts and saturation below which a pixel is excluded. The
+# modelled counts are used, because a selection by the measured counts would be biased by their noise.
 _MARGIN = 3.0
+# Allowance for model errors in the exclusion of outliers, relative to the modelled counts of a pixel.
 _UNRESOLVED = 0.1
 # Number of blocks of pixels processed in one matrix product, small enough for the processor's cache.
 _AT_ONCE = 128
@@ -47,13 +53,12 @@ PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """The normal equations for the shared parameters and the stars of a scene.
+    """The normal equations for the shared parameters and the n stars of a scene.
 
     Attributes:
         information: Fisher information (n, SHARED + ALONE, SHARED + ALONE) from the pixels of each star, on
             the shared parameters and on the parameters of that star.
-        gradient: gradient (n, SHARED + ALONE) of the log-likelihood of each star's pixels, with respect to
-            the shared parameters and the parameters of that star.
+        gradient: gradient (n, SHARED + ALONE) of the log-likelihood with respect to the same parameters.
         chi2: chi-square of the residuals on the pixels of each star (n,).
         pixels: number of fitted pixels of each star (n,).
         crowds: derivatives of the modelled counts on the pixels that several stars share.
@@ -70,18 +75,12 @@ class Evaluation:
     kept: list[BoolArray]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SharedPixels:
+class SharedPixels(NamedTuple):
     """Derivatives of the modelled counts at the e pixels that several stars share, sorted by block of pixels.
 
-    Attributes:
-        star: index of the star of each block of pixels (b,).
-        matrix: coefficients (b, i, SHARED + ALONE) that combine the i images of each of b blocks into the
-            derivatives with respect to each parameter.
-        first: index of the first shared pixel of each block (b,).
-        slot: index of each pixel in the list of all pixels that several stars share (e,).
-        weight: inverse variance of the counts of each of the e shared pixels (e,).
-        images: values of the i images that are combined into the derivatives, at the e shared pixels (i, e).
+    The coefficients `matrix` (b, i, SHARED + ALONE) combine i `images` (i, e) into derivatives for
+    the parameters of the `star` of each block (b,). Each block has a `first` shared pixel (b,). Each pixel
+    has a `slot` (e,) in the list of all shared pixels, and a `weight` (e,), its inverse variance.
     """
 
     star: IntArray
@@ -97,8 +96,8 @@ def evaluate(
 ) -> Evaluation:
     """Return the normal equations of `scene` on the pixels of its fit windows.
 
-    The residual limit `clip` for outlier pixels is described in `BlockPixels.residual`. The flag `growing`
-    states whether the angular acceleration is fitted.
+    The residual limit `clip` for outlier pixels is that of `residuals`. The flag `growing` states whether the
+    angular acceleration is fitted.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows)
@@ -108,10 +107,16 @@ def evaluate(
     spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
     total = windows.total(streak_light, spot_light)
     n, size = len(scene.stars), SHARED + ALONE
-    out = Evaluation(
-        np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n), [], windows.shared, []
-    )
-    matrix = _block_coefficients(pinhole, shutter, scene, windows, growing)
+    sums = np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n)
+    out = Evaluation(*sums, [], windows.shared, [])
+    # The coefficients `matrix` combine the images of a block into the derivatives of the counts.
+    long, light = scene.stars[windows.long], scene.light[of_block, None, None]
+    geometry = streak_model.coefficients(pinhole, scene.motion, shutter, long, strips, growing)
+    matrix = np.zeros((len(strips.star), streak_model.IMAGES, size))
+    matrix[:, :, :6] = geometry[:, :, :6] * light
+    matrix[:, 5, 6] = light[:, 0, 0]
+    matrix[:, :, 7:9] = geometry[:, :, 6:] * light
+    matrix[:, 0, 9] = matrix[:, 6, 10] = 1.0
     matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
     _add(out, of_block, windows.on_strips, images, matrix, total, clip)
     spot_images = _spot_images(scene, windows, spots, change)
@@ -135,33 +140,13 @@ def model_images(
 
     The last image of each long streak is not initialised. It is a buffer for the residuals.
     """
-    long, spot = scene.stars[windows.long], scene.stars[windows.spot]
-    images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
-    spots, change = streak_model.spot_derivatives(
-        pinhole, scene.motion, shutter, spot, scene.sigma, windows.patches
+    camera, long, spot = (
+        (pinhole, scene.motion, shutter),
+        scene.stars[windows.long],
+        scene.stars[windows.spot],
     )
-    return images, spots, change
-
-
-def _block_coefficients(
-    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
-) -> FloatArray:
-    """Return coefficients (b, IMAGES, SHARED + ALONE) that combine images into derivatives of the counts.
-
-    The derivatives are with respect to the shared parameters and the parameters of the star of each block.
-    """
-    strips = windows.strips
-    light = scene.light[windows.long[strips.star]]
-    geometry = streak_model.coefficients(
-        pinhole, scene.motion, shutter, scene.stars[windows.long], strips, growing
-    )
-    matrix = np.zeros((len(strips.star), streak_model.IMAGES, SHARED + ALONE))
-    matrix[:, :, :6] = geometry[:, :, :6] * light[:, None, None]
-    matrix[:, 5, 6] = light
-    matrix[:, :, 7:9] = geometry[:, :, 6:] * light[:, None, None]
-    matrix[:, 0, 9] = 1.0
-    matrix[:, 6, 10] = 1.0
-    return matrix
+    images = streak_model.images(*camera, long, scene.width, windows.strips)
+    return images, *streak_model.spot_derivatives(*camera, spot, scene.sigma, windows.patches)
 
 
 def _add(
@@ -176,7 +161,7 @@ def _add(
     """Add the contributions of blocks of pixels, in the order of their stars, to the normal equations.
 
     The last of the `images` of each block of pixels is filled with the residuals of the modelled counts
-    `total` of all fitted pixels. The residual limit `clip` is that of `fit_windows.residuals`.
+    `total` of all fitted pixels.
     """
     blocks, count = images.shape[:2]
     if not blocks:
@@ -184,15 +169,48 @@ def _add(
         return
     flat = images.reshape(blocks, count, -1)
     weight = np.empty((blocks, flat.shape[2]), dtype=np.float32)
-    slot, inside = view.slot.reshape(weight.shape), view.inside.reshape(weight.shape)
-    floor, ceiling = view.floor.reshape(weight.shape), view.ceiling.reshape(weight.shape)
-    levels = view.signal.reshape(weight.shape), floor, ceiling
-    sums = out.information, out.gradient, out.chi2, out.pixels
+    shape, sums = weight.shape, (out.information, out.gradient, out.chi2, out.pixels)
+    slot, inside, signal = view.slot.reshape(shape), view.inside.reshape(shape), view.signal.reshape(shape)
+    pixels = slot, inside, signal, view.floor.reshape(shape), view.ceiling.reshape(shape)
     limits = float(view.gain), float(clip)
-    _sum_products(*sums, weight, flat, star, matrix, total, slot, inside, levels, limits)
+    _sum_products(*sums, weight, flat, (star, matrix), total, pixels, limits)
     out.kept.append((weight > 0.0).reshape(view.inside.shape))
     if len(view.crowded):
-        out.crowds.append(_shared_pixels(star, view, weight, flat, matrix))
+        block, drawn = _at_pixels(flat, view.crowded)
+        first = np.flatnonzero(np.diff(block, prepend=-1))
+        held = block[first]
+        crowded = weight.reshape(-1)[view.crowded]
+        out.crowds.append(SharedPixels(star[held], matrix[held], first, view.common, crowded, drawn))
+
+
+_Pixels = tuple[IntArray, BoolArray, Float32Array, Float32Array, Float32Array]
+"""Slot, inside, signal, floor and ceiling of `BlockPixels`."""
+
+
+def residuals(
+    total: Float32Array, pixels: _Pixels, limits: tuple[float, float]
+) -> tuple[Float32Array, Float32Array]:
+    """Return weights and residuals of pixels for the modelled counts `total` of all fitted pixels.
+
+    The weight is the inverse variance, or 0 for an excluded pixel. The `limits` are the gain and the clip.
+    Pixels whose residuals exceed `clip` standard deviations plus a tenth of the modelled counts are excluded;
+    `clip` 0 excludes none.
+    """
+    (slot, inside, signal, floor, ceiling), (gain, clip) = pixels, limits
+    model = total.take(slot)
+    variance = np.maximum(model, np.float32(0.0))
+    variance *= np.float32(1.0 / gain)
+    variance += floor
+    residual = signal - model
+    deviation = np.sqrt(variance)
+    good = inside & (model + np.float32(_MARGIN) * deviation < ceiling)
+    if clip > 0.0:
+        deviation *= np.float32(clip)
+        deviation += np.float32(_UNRESOLVED) * model
+        good &= np.abs(residual) <= deviation
+    weight = np.where(good, np.float32(1.0) / variance, np.float32(0.0))
+    residual[~good] = 0.0
+    return weight, residual
 
 
 def _sum_products_numpy(
@@ -202,23 +220,20 @@ def _sum_products_numpy(
     pixels: FloatArray,
     weight: Float32Array,
     images: Float32Array,
-    star: IntArray,
-    matrix: FloatArray,
+    of_blocks: tuple[IntArray, FloatArray],
     total: Float32Array,
-    slot: IntArray,
-    inside: BoolArray,
-    levels: tuple[Float32Array, Float32Array, Float32Array],
+    of_pixels: _Pixels,
     limits: tuple[float, float],
 ) -> None:
     """Add weighted products of the images of b blocks of p pixels to the normal equations of their stars.
 
     The weights (b, p), and the residuals in the last of the `images` (b, i + 1, p), are computed from the
     modelled counts `total` of all fitted pixels. Products of the residual with the other images give the
-    gradient, and the squared residual gives chi-square. Coefficients `matrix` (b, i, SHARED + ALONE) combine
-    the images into derivatives. The tuple `levels` contains signal, floor and ceiling of `BlockPixels`. The
-    tuple `limits` contains the arguments gain and clip of `fit_windows.residuals`.
+    gradient, and the squared residual gives chi-square. The pair `of_blocks` contains the star of each block
+    (b,), and coefficients (b, i, SHARED + ALONE) that combine the images into derivatives.
     """
-    weight[:], images[:, -1] = residuals(total, slot, inside, *levels, *limits)
+    star, matrix = of_blocks
+    weight[:], images[:, -1] = residuals(total, of_pixels, limits)
     blocks, count = images.shape[:2]
     gram = np.empty((blocks, count, count))
     for begin in range(0, blocks, _AT_ONCE):
@@ -241,16 +256,13 @@ def _sum_products(
     pixels: FloatArray,
     weight: Float32Array,
     images: Float32Array,
-    star: IntArray,
-    matrix: FloatArray,
+    of_blocks: tuple[IntArray, FloatArray],
     total: Float32Array,
-    slot: IntArray,
-    inside: BoolArray,
-    levels: tuple[Float32Array, Float32Array, Float32Array],
+    of_pixels: _Pixels,
     limits: tuple[float, float],
 ) -> None:
-    """See `_sum_products_numpy`."""
-    (signal, floor, ceiling), (gain, clip) = levels, limits
+    (star, matrix), (gain, clip) = of_blocks, limits
+    slot, inside, signal, floor, ceiling = of_pixels
     blocks, count, size = images.shape
     gram, weighted = np.empty((count, count)), np.empty(size, dtype=np.float32)
     model, least = np.empty(size, dtype=np.float32), np.float32(0.0)
@@ -287,11 +299,11 @@ def _sum_products(
 
 
 @loop_helper
-def _scalar_product(a: Float32Array, b: Float32Array) -> np.floating[Any]:
-    """Return the scalar product of two arrays of equal length."""
-    total: np.floating[Any] = np.float32(0.0)
-    for p in range(len(a)):
-        total += a[p] * b[p]
+def _scalar_product(a: Any, b: Any) -> Any:
+    """Return the scalar product of two arrays (m,) of one type, in this type."""
+    total = a.dtype.type(0.0)
+    for k in range(len(a)):
+        total += a[k] * b[k]
     return total
 
 
@@ -317,17 +329,6 @@ def _add_block(information: FloatArray, gradient: FloatArray, gram: FloatArray, 
                     information[q, r] += along[i] * matrix[i, r]
 
 
-def _shared_pixels(
-    star: IntArray, view: BlockPixels, weight: Float32Array, images: Float32Array, matrix: FloatArray
-) -> SharedPixels:
-    """Return the derivatives of the modelled counts on the pixels that belong to several stars."""
-    block, drawn = _at_pixels(images, view.crowded)
-    first = np.flatnonzero(np.diff(block, prepend=-1))
-    held = block[first]
-    weights = weight.reshape(-1)[view.crowded]
-    return SharedPixels(star[held], matrix[held], first, view.common, weights, drawn)
-
-
 def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
     """Return the indices (e,) of the blocks that contain e pixels, and the values (i, e) of i images there.
 
@@ -347,7 +348,6 @@ def _at_pixels_numpy(images: Float32Array, crowded: IntArray) -> tuple[IntArray,
 
 @compiled_form_of(_at_pixels_numpy)
 def _at_pixels(images: Float32Array, crowded: IntArray) -> tuple[IntArray, Float32Array]:
-    """See `_at_pixels_numpy`."""
     _, count, size = images.shape
     block, drawn = np.empty_like(crowded), np.empty((count - 1, len(crowded)), dtype=np.float32)
     for e in range(len(crowded)):
@@ -380,11 +380,7 @@ def _spot_images(
 class Solution:
     """One Gauss-Newton step of the fit, and the covariance of the parameters.
 
-    Attributes:
-        shared: step of the parameters that all stars share (SHARED,).
-        alone: step of the parameters of each single star (n, ALONE).
-        eliminated: normal equations for the shared parameters alone, in which the coupling of stars by shared
-            pixels is neglected.
+    The step consists of changes of the shared parameters (SHARED,) and of each star's own (n, ALONE).
     """
 
     shared: FloatArray
@@ -412,16 +408,12 @@ class Solution:
         return joint
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EliminatedEquations:
+class EliminatedEquations(NamedTuple):
     """Normal equations for the shared parameters alone, in which coupling by shared pixels is neglected.
 
-    Attributes:
-        kept: indices of the k fitted parameters among the shared parameters (k,).
-        own: inverse (n, ALONE, ALONE) of the block of the information matrix for the parameters of each star.
-        gain: product of `own` and the block of the information matrix that couples k shared and each star's
-            own parameters (n, k, ALONE).
-        inner: covariance of the k fitted shared parameters (k, k).
+    The indices `kept` (k,) are those of the fitted shared parameters, whose covariance (k, k) is `inner`. For
+    each star, `own` (n, ALONE, ALONE) is the inverse of its block of the information matrix, and `gain`, with
+    the shape (n, k, ALONE), the product of `own` and the block that couples shared and own parameters.
     """
 
     kept: IntArray
@@ -455,8 +447,7 @@ def _eliminated_numpy(information: FloatArray, kept: IntArray) -> tuple[FloatArr
     alone = information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # For a star without fitted pixels, the diagonal element of the flux is set to 1, so that the star's block
-    # is invertible.
+    # For a star without fitted pixels, the element of the flux is set to 1, so that the block is invertible.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
     root = np.sqrt(np.einsum("nii->ni", alone))
     outer = root[:, :, None] * root[:, None, :]
@@ -471,7 +462,6 @@ def _eliminated_numpy(information: FloatArray, kept: IntArray) -> tuple[FloatArr
 
 @compiled_form_of(_eliminated_numpy)
 def _eliminated(information: FloatArray, kept: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `_eliminated_numpy`."""
     n, count = len(information), len(kept)
     own, gain = np.empty((n, ALONE, ALONE)), np.empty((n, count, ALONE))
     normal, unit, root = np.zeros((count, count)), np.empty((ALONE, 2 * ALONE)), np.empty(ALONE)
@@ -521,8 +511,7 @@ def _invert(pair: FloatArray) -> None:
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
     """Return the step of all parameters towards maximum likelihood, or None if the equations are singular.
 
-    The coupling of stars by shared pixels is included by at most `rounds` conjugate-gradient iterations. If
-    `rounds` is 0, the coupling of stars by shared pixels is neglected.
+    The coupling of stars by shared pixels is included by at most `rounds` conjugate-gradient iterations.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
@@ -542,8 +531,7 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
         return None
     out = np.empty((3, 3))
     for k in range(3):
-        # The equations are scaled so that the solution is of order one and the same tolerance is valid for
-        # all frames.
+        # The equations are scaled so that the same tolerance is valid for all frames.
         unit = np.zeros(SHARED + ALONE * len(evaluation.chi2))
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         out[k] = _coupled(evaluation, eliminated, free, unit, rounds)[:3] / unit[k]
@@ -551,78 +539,246 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
 
 
 def _coupled(
-    evaluation: Evaluation,
+    evaluation: Evaluation, eliminated: EliminatedEquations, free: BoolArray, right: FloatArray, rounds: int
+) -> FloatArray:
+    """Return the solution of the coupled normal equations, see `solution`."""
+    first, second = (*evaluation.crowds, _NO_CROWD, _NO_CROWD)[:2]
+    crowds, common = (first, second), evaluation.shared
+    return solution(evaluation.information, crowds, common, eliminated, free, right, rounds)
+
+
+# Squared residual norm, relative to the squared norm of the first step, at which conjugate gradients stop.
+_CONVERGED = 1e-2
+
+_NONE = np.zeros(0, np.int64)
+_NO_LIGHT = np.zeros(0, np.float32), np.zeros((1, 0), np.float32)
+_NO_CROWD = SharedPixels(_NONE, np.zeros((0, 1, 1)), _NONE, _NONE, *_NO_LIGHT)
+"""The shared pixels, without elements, of stars that do not share pixels."""
+_Crowds = tuple[SharedPixels, SharedPixels]
+
+
+def _solution_numpy(
+    information: FloatArray,
+    crowds: _Crowds,
+    common: int,
     eliminated: EliminatedEquations,
     free: BoolArray,
     right: FloatArray,
     rounds: int,
 ) -> FloatArray:
-    """Return the solution of the coupled normal equations, see `coupled_stars.solution`."""
-    crowds = [(of.star, of.matrix, of.first, of.slot, of.weight, of.images) for of in evaluation.crowds]
-    first, second = (*crowds, coupled_stars.NO_CROWD, coupled_stars.NO_CROWD)[:2]
-    alone = eliminated.kept, eliminated.own, eliminated.gain, eliminated.inner
-    return coupled_stars.solution(
-        evaluation.information, PRIOR, (first, second), evaluation.shared, alone, free, right, rounds
-    )
+    x = _without_coupling(eliminated, right, len(free))
+    if rounds == 0:
+        return x
+
+    def product(vector: FloatArray) -> FloatArray:
+        return _product(information, crowds, common, free, vector)
+
+    residual = right - product(x)
+    z = _without_coupling(eliminated, residual, len(free))
+    direction, size, first = z, float(residual @ z), abs(float(right @ x))
+    for _ in range(rounds):
+        if size <= _CONVERGED * first:
+            break
+        image = product(direction)
+        length = size / float(direction @ image)
+        x = x + length * direction
+        residual = residual - length * image
+        z = _without_coupling(eliminated, residual, len(free))
+        size, before = float(residual @ z), size
+        direction = z + size / before * direction
+    return x
 
 
-def stepped(
-    scene: StreakScene, solution: Solution, pinhole: Pinhole, longest: float
-) -> tuple[StreakScene, float]:
-    """Return the scene after a step of the fit that is limited to `longest` px at each streak end.
+def _without_coupling(eliminated: EliminatedEquations, right: FloatArray, shared: int) -> FloatArray:
+    """Return the solution of the equations without coupling of stars, with `shared` shared parameters."""
+    kept, own, gain, inner = eliminated
+    alone = right[shared:].reshape(gain.shape[0], -1)
+    step = inner @ (right[kept] - np.einsum("nij,nj->i", gain, alone))
+    out = np.zeros_like(right)
+    out[kept] = step
+    out[shared:] = (np.einsum("nij,nj->ni", own, alone) - step @ gain).reshape(-1)
+    return out
 
-    The second returned value is the largest displacement (px) of a streak end by the unlimited step, or the
-    change (px) of the point-spread width if that is larger.
+
+def _product(
+    information: FloatArray, crowds: _Crowds, common: int, free: BoolArray, parameters: FloatArray
+) -> FloatArray:
+    """Return the product of the information matrix of the whole scene with a vector of parameters.
+
+    The coupling of a star is the change of the modelled counts on its shared pixels due to all other stars.
     """
-    n = len(scene.stars)
-    growing = bool(solution.shared[3:6].any())
-    change = sensitivities(
-        pinhole, scene.motion, np.tile(scene.stars, (2, 1)), np.repeat([-0.5, 0.5], n), growing
-    )
-    along = change[:, :, :6] @ solution.shared[:6]
-    ends = float(np.hypot(along[:, 0], along[:, 1]).max(initial=0.0))
-    share = min(1.0, longest / max(ends, 1e-9), 0.3 * scene.width / max(abs(solution.shared[6]), 1e-9))
-    step = solution.alone * share
-    far = np.hypot(step[:, 0], step[:, 1])
-    step[:, :2] *= np.minimum(1.0, longest / np.maximum(far, 1e-9))[:, None]
-    shared = share * solution.shared
-    turn, growth = scene.motion.rate + shared[:3], scene.motion.acceleration + shared[3:6]
-    after = replace(
-        scene,
-        motion=replace(scene.motion, rate=turn, acceleration=growth),
-        width=scene.width + float(shared[6]),
-        stars=scene.stars + step[:, :2],
-        light=np.maximum(scene.light + step[:, 2], 0.3 * scene.light),
-        sky=scene.sky + step[:, 3],
-    )
-    return after, max(ends, abs(float(solution.shared[6])))
+    n, shared = len(information), len(free)
+    alone = parameters[shared:].reshape(n, -1)
+    vector = np.concatenate([np.broadcast_to(parameters[:shared], (n, shared)), alone], axis=1)
+    out = (information @ vector[..., None])[..., 0]
+    change, lights = np.zeros(common), []
+    held = [crowd for crowd in crowds if len(crowd[0])]
+    for star, matrix, first, slot, _, images in held:
+        mixture = (matrix @ vector[star][..., None])[..., 0].T.astype(np.float32)
+        block = np.repeat(np.arange(len(first)), np.diff(first, append=len(slot)))
+        lights.append(np.einsum("ie,ie->e", mixture.take(block, axis=1), images))
+        change += np.bincount(slot, lights[-1], common)
+    for (star, matrix, first, slot, weight, images), light in zip(held, lights, strict=True):
+        weighted = weight * (change[slot] - light).astype(np.float32)
+        slope = np.add.reduceat(images * weighted, first, axis=1).T.astype(np.float64)
+        np.add.at(out, star, (slope[:, None] @ matrix)[:, 0])
+    total = np.where(free, out[:, :shared].sum(axis=0), 0.0)
+    return np.concatenate([total, (out[:, shared:] + PRIOR * alone).reshape(-1)])
+
+
+@compiled_form_of(_solution_numpy)
+def solution(
+    information: FloatArray,
+    crowds: _Crowds,
+    common: int,
+    eliminated: EliminatedEquations,
+    free: BoolArray,
+    right: FloatArray,
+    rounds: int,
+) -> FloatArray:
+    """Return the vector of parameters (s + n a,) that solves the coupled normal equations.
+
+    The arguments are the information of `Evaluation`, the shared pixels of strips and of patches, the number
+    of shared pixels (`common`), the solution without coupling (`eliminated`), the mask (s,) of the fitted
+    shared parameters, the right-hand side (s + n a,), and the maximum number of iterations. With 0 `rounds`,
+    the coupling is neglected.
+    """
+    x, image, z = np.empty_like(right), np.empty_like(right), np.empty_like(right)
+    light = np.empty(len(crowds[0][3]) + len(crowds[1][3]), dtype=np.float32)
+    scratch = np.empty(common), light, np.empty((2, *information.shape[:2]))
+    _solve_alone(eliminated, right, len(free), x)
+    if rounds == 0:
+        return x
+    _multiply(information, crowds, free, x, scratch, image)
+    residual = right - image
+    _solve_alone(eliminated, residual, len(free), z)
+    direction, size, first = z.copy(), _scalar_product(residual, z), abs(_scalar_product(right, x))
+    for _ in range(rounds):
+        if size <= _CONVERGED * first:
+            break
+        _multiply(information, crowds, free, direction, scratch, image)
+        length = size / _scalar_product(direction, image)
+        for k in range(len(x)):
+            x[k] += length * direction[k]
+            residual[k] -= length * image[k]
+        _solve_alone(eliminated, residual, len(free), z)
+        before = size
+        size = _scalar_product(residual, z)
+        for k in range(len(x)):
+            direction[k] = z[k] + size / before * direction[k]
+    return x
+
+
+@loop_helper
+def _solve_alone(eliminated: EliminatedEquations, right: FloatArray, shared: int, out: FloatArray) -> None:
+    """Set `out` to the result of `_without_coupling`."""
+    kept, own, gain, inner = eliminated
+    alone, left = own.shape[1], np.empty(len(kept))
+    for i in range(len(kept)):
+        left[i] = right[kept[i]]
+    for star in range(len(own)):
+        of_star = right[shared + alone * star : shared + alone * (star + 1)]
+        for i in range(len(kept)):
+            left[i] -= _scalar_product(gain[star, i], of_star)
+    out[:] = 0.0
+    for i in range(len(kept)):
+        out[kept[i]] = _scalar_product(inner[i], left)
+    for star in range(len(own)):
+        begin = shared + alone * star
+        of_star = right[begin : begin + alone]
+        for j in range(alone):
+            out[begin + j] = _scalar_product(own[star, j], of_star)
+            for i in range(len(kept)):
+                out[begin + j] -= out[kept[i]] * gain[star, i, j]
+
+
+@loop_helper
+def _multiply(
+    information: FloatArray,
+    crowds: _Crowds,
+    free: BoolArray,
+    parameters: FloatArray,
+    scratch: tuple[FloatArray, Float32Array, FloatArray],
+    product: FloatArray,
+) -> None:
+    """Set `product` to the result of `_product`.
+
+    The scratch arrays (common,), (e,) for e shared pixels of all stars, and (2, n, s + a) are overwritten.
+    """
+    change, light, vectors = scratch
+    vector, out, shared, alone, begin = vectors[0], vectors[1], len(free), ALONE, 0
+    for star in range(len(information)):
+        vector[star, :shared] = parameters[:shared]
+        vector[star, shared:] = parameters[shared + alone * star : shared + alone * (star + 1)]
+        for i in range(shared + alone):
+            out[star, i] = _scalar_product(information[star, i], vector[star])
+    change[:] = 0.0
+    for crowd in crowds:
+        _add_changes(crowd, vector, light[begin : begin + len(crowd[3])], change)
+        begin += len(crowd[3])
+    begin = 0
+    for crowd in crowds:
+        _add_coupling(crowd, change, light[begin : begin + len(crowd[3])], out)
+        begin += len(crowd[3])
+    product[:shared] = 0.0
+    for star in range(len(out)):
+        for k in range(shared):
+            product[k] += out[star, k] if free[k] else 0.0
+        for k in range(alone):
+            place = shared + alone * star + k
+            product[place] = out[star, shared + k] + PRIOR[k] * parameters[place]
+
+
+@loop_helper
+def _add_changes(crowd: SharedPixels, vector: FloatArray, light: Float32Array, change: FloatArray) -> None:
+    """Set `light` (e,) to the change of each star's counts due to the parameter step `vector` (n, s + a).
+
+    The changes of all stars on the same pixel are added to `change`.
+    """
+    star, matrix, first, slot, _, images = crowd
+    light[:] = 0.0
+    for b in range(len(first)):
+        stop = first[b + 1] if b + 1 < len(first) else len(slot)
+        for i in range(len(images)):
+            share = np.float32(_scalar_product(matrix[b, i], vector[star[b]]))
+            _add_scaled(light[first[b] : stop], share, images[i, first[b] : stop])
+    for e in range(len(slot)):
+        change[slot[e]] += light[e]
+
+
+@loop_helper
+def _add_coupling(crowd: SharedPixels, change: FloatArray, light: Float32Array, out: FloatArray) -> None:
+    """Add the effect of other stars to the product `out` (n, s + a); `light` is overwritten."""
+    star, matrix, first, slot, weight, images = crowd
+    for e in range(len(slot)):
+        light[e] = weight[e] * (change[slot[e]] - light[e])
+    for b in range(len(first)):
+        stop = first[b + 1] if b + 1 < len(first) else len(slot)
+        for i in range(len(images)):
+            slope = float(_scalar_product(light[first[b] : stop], images[i, first[b] : stop]))
+            _add_scaled(out[star[b]], slope, matrix[b, i])
+
+
+@loop_helper
+def _add_scaled(total: Any, factor: Any, values: Any) -> None:
+    for k in range(len(total)):
+        total[k] += factor * values[k]
 
 
 # Fisher information of a star, relative to the most informative star, below which the star is ignored.
 _NOTHING = 1e-9
 # Smallest used eigenvalue of a star's information matrix, relative to its largest eigenvalue.
 _KNOWN = 1e-4
-# Minimum effective number of stars for an estimate of the scatter between stars.
-# The effective number of stars is smaller than the number of stars if the weights are unequal.
+# Minimum effective number of stars (smaller for unequal weights) for an estimate of their scatter.
 _LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StarEstimates:
-    """Estimates of k parameter changes from each of n stars, and their standard deviations, both (n, k)."""
-
-    change: FloatArray
-    deviation: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class StarEquations:
-    """Normal equations of each star for the shared parameters, after elimination of the star's parameters.
+    """Normal equations of each star for k fitted shared parameters, after elimination of its own parameters.
 
-    Attributes:
-        kept: indices of the k fitted parameters among the shared parameters (k,).
-        information: information matrix of each star for the k fitted parameters (n, k, k).
-        score: gradient (n, k) of each star's log-likelihood with respect to the k fitted parameters.
+    The indices `kept` (k,) are those of the fitted parameters. The equations consist of the information
+    matrix (n, k, k) and the gradient (n, k) of the log-likelihood of each star (`score`).
     """
 
     kept: IntArray
@@ -630,17 +786,12 @@ class StarEquations:
     score: FloatArray
 
 
-def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) -> StarEstimates | None:
-    """Return the estimate from each individual star, or None if the equations are singular."""
-    alone = star_equations(evaluation, free)
-    return None if alone is None else estimates_of(alone, scene)
-
-
-def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
-    """Return, for each star, its estimate of three rate components and of the point-spread width.
+def estimates_of(alone: StarEquations, scene: StreakScene) -> tuple[FloatArray, FloatArray]:
+    """Return estimates (n, 4) of three rate components and the point-spread width from each of n stars.
 
     The rate components are along the rotation axis and along two vectors normal to it. Each estimate is the
-    difference from the value in `scene`, in rad per exposure for the rate and in px for the width.
+    difference from the value in `scene`, in rad per exposure for the rate and in px for the width. The second
+    array (n, 4) contains the standard deviations of the estimates.
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
@@ -650,26 +801,8 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
     information = np.einsum("ai,nij,aj->na", directions, alone.information, directions)
     informed = information > _NOTHING * information.max(axis=0)
     information = np.where(informed, information, _NOTHING * information.max(axis=0) + 1e-300)
-    return StarEstimates(
-        np.where(informed, alone.score @ directions.T / information, 0.0), 1.0 / np.sqrt(information)
-    )
-
-
-def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
-    """Return the squared significance of a `step` of the shared parameters, and the number of stars.
-
-    If the scatter of the stars' estimates exceeds their noise, the significance is computed from the scatter.
-    Therefore, a single blended star cannot make a step significant.
-    """
-    alone = star_equations(evaluation, step != 0.0)
-    if alone is None:
-        return 0.0, 0
-    part = step[alone.kept]
-    asked, due = alone.score @ part, np.einsum("i,nij,j->n", part, alone.information, part)
-    count = int(np.count_nonzero(due > 0.0))
-    spread = float(np.sum((asked - due) ** 2)) * count / max(count - 1, 1)
-    total = float(due.sum())
-    return total**2 / max(total, spread, 1e-300), count
+    change = np.where(informed, alone.score @ directions.T / information, 0.0)
+    return change, 1.0 / np.sqrt(information)
 
 
 def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | None:
@@ -684,37 +817,36 @@ def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | N
     return StarEquations(kept, schur, score)
 
 
-def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
-    """Return which stars' estimates lie within `sigmas` standard deviations of the weighted median, (n,).
+def consistent_stars(
+    estimates: FloatArray, deviations: FloatArray, floors: FloatArray, sigmas: float
+) -> BoolArray:
+    """Return which stars' estimates (n, k) all lie within `sigmas` deviations of the weighted medians, (n,).
 
-    A star is accepted only if its estimates of all k parameters lie within `sigmas` standard deviations. The
-    model errors `floors` (k,) are added in quadrature to the standard deviations.
+    The model errors `floors` (k,) are added in quadrature to the standard `deviations` (n, k).
     """
-    agree = np.ones(len(estimates.change), dtype=np.bool_)
-    for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):
+    agree = np.ones(len(estimates), dtype=np.bool_)
+    for change, deviation, floor in zip(estimates.T, deviations.T, floors, strict=True):
         spread = np.hypot(deviation, floor)
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # A star that is more accurate than all others is not rejected, because the uncertainty of the median
-        # is included.
+        # The error of the median is included, so that a star more accurate than all others is not rejected.
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
 
 
-def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
-    """Return the chi-square per degree of freedom of the differences between the stars `which` (n,)."""
-    change, weight = estimates.change[which], estimates.deviation[which] ** -2
+def disagreement(change: FloatArray, deviation: FloatArray) -> float:
+    """Return the chi-square per degree of freedom of differences between the stars' estimates (n, k)."""
     if len(change) < 3:
         return 1.0
+    weight = deviation**-2
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
     # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # Even without excess scatter, the largest of several reduced chi-squares exceeds 1 by about one standard
-    # deviation.
+    # Without excess scatter, the largest of several reduced chi-squares exceeds 1 by one standard deviation.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
 
 

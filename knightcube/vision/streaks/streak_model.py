@@ -34,7 +34,7 @@ exact for a star at rest.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -42,6 +42,7 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
 from knightcube.compiled import compiled_form_of, loop_helper
 from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.fit_windows import LINES, Patches, Strips, path_distances
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
     PointsAtLines,
@@ -52,13 +53,11 @@ from knightcube.vision.streaks.geometry import (
     sensitivities,
     sensitivities_and_velocity,
 )
-from knightcube.vision.streaks.path_pixels import LINES, Patches, Strips, path_distances, pixel_rows
 
 # Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
 _SLOWEST = 1e-3
 
-# Gauss-Legendre nodes and weights for one short segment of a star's path.
-# One quadrature node per point-spread width gives a relative accuracy of 1e-4.
+# Gauss-Legendre quadrature of a path segment; one node per point-spread width is accurate to 1e-4.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
 # Length of a path segment for the quadrature, in point-spread widths.
 _PIECE_WIDTHS = 8.0
@@ -127,8 +126,7 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # The part of the path near the patch is extended by one sample at both ends. If a path is never near its
-    # patch of pixels, the path over the complete exposure is divided.
+    # The part near the patch is extended by one sample; a path that is never near is divided completely.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -167,8 +165,7 @@ IMAGES = 7
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the end does not affect the intensity.
 _ENDS = 5.5
-# Largest distance (point-spread widths), measured along a path, between a pixel and the point where the path
-# crosses the line of this pixel.
+# Largest distance (point-spread widths) along a path between a pixel and the crossing of its line.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in units of the exposure time.
 _STEP = 1e-4
@@ -177,71 +174,53 @@ _KURTOSIS = -1.0 / 120.0
 
 
 def images(
-    pinhole: Pinhole,
-    motion: CameraMotion,
-    shutter: Shutter,
-    stars: FloatArray,
-    width: float,
-    strips: Strips,
-    more: int = 0,
+    pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, stars: FloatArray, width: float, strips: Strips
 ) -> Float32Array:
-    """Return images (b, IMAGES + more, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
+    """Return images (b, IMAGES + 1, LINES, k) whose combinations model `stars` (n, 2), px, of unit flux.
 
-    The argument `width` is the width w of the point spread, px. The last `more` images are not initialised;
-    the calling function sets them.
+    The argument `width` is the width w of the point spread, px. The last image of each block is not
+    initialised; the calling function sets it.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
-    out = np.empty((len(strips.star), IMAGES + more, *strips.index.shape[1:]), dtype=np.float32)
+    out = np.empty((len(strips.star), IMAGES + 1, *strips.index.shape[1:]), dtype=np.float32)
     delay = float(shutter.delay_per_row), float(shutter.middle)
-    _draw(out, strips.corner, strips.step, strips.time, path.at_lines(shape), width, delay)
+    _draw(out, (strips.corner, strips.step, strips.time), path.at_lines(shape), width, delay)
     return out
 
 
+_BlockLines = tuple[IntArray, IntArray, FloatArray]
+"""Corner, step and time of `Strips`."""
+
+
 def _draw_numpy(
-    out: Float32Array,
-    corner: IntArray,
-    step: IntArray,
-    time: FloatArray,
-    points: PointsAtLines,
-    width: float,
-    delay: tuple[float, float],
+    out: Float32Array, lines: _BlockLines, points: PointsAtLines, width: float, delay: tuple[float, float]
 ) -> None:
     """Compute the basis images `out` (b, .., LINES, k) from the points at which paths cross lines of pixels.
 
     The arrays `points` are those of `StarPaths.at_lines`. The argument `delay` contains two values: the
     exposure delay from row to row, and the row without delay.
     """
-    position, velocity, acceleration = points
+    (corner, step, time), (position, velocity, acceleration) = lines, points
     speed = np.maximum(np.hypot(velocity[0], velocity[1]), _SLOWEST)
     tangent = velocity / speed
     # The variable `gained` is the star's acceleration along its path, px per exposure^2.
     gained = np.sum(acceleration * tangent, axis=0)
     bend = (acceleration[1] * tangent[0] - acceleration[0] * tangent[1]) / speed**2
     centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
+    there, way = position.transpose(1, 2, 0), tangent.transpose(1, 2, 0)
+    crossings = _Crossings(corner, step, there, way, time, centre, speed, gained, bend)
     for first in range(0, len(out), _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
-        lines = _Crossings(
-            corner[part],
-            step[part],
-            position[:, part].transpose(1, 2, 0),
-            tangent[:, part].transpose(1, 2, 0),
-            time[part],
-            centre[part],
-            speed[part],
-            gained[part],
-            bend[part],
-        )
-        _draw_part(out[part], lines, width, Shutter(*delay))
+        _draw_part(out[part], _Crossings._make(each[part] for each in crossings), width, Shutter(*delay))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Crossings:
+class _Crossings(NamedTuple):
     """Points at which paths cross the lines of b blocks of pixels (b, LINES).
 
-    The first pixels and the steps are defined in `Strips`. Position and unit tangent are arrays (b, LINES,
-    2). Time, speed, acceleration along the path (`gained`) and curvature (`bend`) are arrays (b, LINES), and
-    the time at the centre of each block an array (b, 1).
+    The first pixels and the steps are those of `Strips`. Position and unit tangent have the shape (b, LINES,
+    2), and the time at the centre of each block (b, 1). The acceleration along the path is `gained`, and the
+    curvature `bend`.
     """
 
     corner: IntArray
@@ -321,7 +300,8 @@ def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Sh
     rolling = shutter.delay_per_row != 0.0
     delay = np.zeros((len(along), 1, 1), dtype=np.float32)
     if rolling:
-        delay = shutter.delay(pixel_rows(lines.corner, lines.step, along.shape[2]))
+        rows = lines.corner[:, :, 1, None] + np.arange(along.shape[2]) * lines.step[:, 1, None, None]
+        delay = shutter.delay(rows.astype(np.float32))
     for end, image in ((-0.5, 3), (0.5, 4)):
         sign = -1.0 if end > 0.0 else 1.0
         closest = sign * (crossing - end) - np.max(sign * delay[..., [0, -1]], axis=-1)
@@ -352,24 +332,17 @@ def _ends(out: Float32Array, along: Float32Array, lines: _Crossings, shutter: Sh
 
 @compiled_form_of(_draw_numpy)
 def _draw(
-    out: Float32Array,
-    corner: IntArray,
-    step: IntArray,
-    time: FloatArray,
-    points: PointsAtLines,
-    width: float,
-    delay: tuple[float, float],
+    out: Float32Array, lines: _BlockLines, points: PointsAtLines, width: float, delay: tuple[float, float]
 ) -> None:
-    """See `_draw_numpy`."""
-    position, velocity, acceleration = points
-    blocks, _, lines, count = out.shape
-    pixels, bits = np.empty((4, lines * count)), np.empty(lines * count, dtype=np.int64)
+    (corner, step, time), (position, velocity, acceleration) = lines, points
+    blocks, _, line_count, count = out.shape
+    pixels, bits = np.empty((4, line_count * count)), np.empty(line_count * count, dtype=np.int64)
     exponential = bits.view(np.float64)
-    paces = np.empty((lines, 5))
+    paces = np.empty((line_count, 5))
     for b in range(blocks):
-        centre = 0.5 * (time[b, lines // 2 - 1] + time[b, lines // 2])
+        centre = 0.5 * (time[b, line_count // 2 - 1] + time[b, line_count // 2])
         by_x, by_y = step[b, 0], step[b, 1]
-        for i in range(lines):
+        for i in range(line_count):
             speed = max(math.sqrt(velocity[0, b, i] ** 2 + velocity[1, b, i] ** 2), _SLOWEST)
             tx, ty = velocity[0, b, i] / speed, velocity[1, b, i] / speed
             bent_x, bent_y = acceleration[0, b, i], acceleration[1, b, i]
@@ -385,8 +358,8 @@ def _draw(
             profile = narrow, _BELL / (width * speed), square
             _endless_line(pixels, i * count, count, first, each, (bend, thinning, shift), profile)
         _exponential(pixels[2], bits, exponential)
-        _fill(out[b].reshape(out.shape[1], lines * count), pixels, exponential)
-        for i in range(lines):
+        _fill(out[b].reshape(out.shape[1], line_count * count), pixels, exponential)
+        for i in range(line_count):
             part = slice(i * count, (i + 1) * count)
             late, later = paces[i, 4], paces[i, 4] + by_y * delay[0] * (count - 1)
             reach = (_ENDS + _OBLIQUE) * width / paces[i, 0]
@@ -395,9 +368,9 @@ def _draw(
                 if 0.5 + sign * (paces[i, 2] - edge) < reach:
                     _from_end(pixels[:, part], paces[i], width, sign, by_y * delay[0])
                     _exponential(pixels[2, part], bits[part], exponential[part])
-                    ended = out[b].reshape(out.shape[1], lines * count)[:, part]
+                    ended = out[b].reshape(out.shape[1], line_count * count)[:, part]
                     _draw_end(ended, pixels[3, part], exponential[part], width, sign, paces[i])
-        _draw_moments(out[b].reshape(out.shape[1], lines * count), pixels, width)
+        _draw_moments(out[b].reshape(out.shape[1], line_count * count), pixels, width)
 
 
 @loop_helper
@@ -434,12 +407,11 @@ def _endless_line(
 ) -> None:
     """Compute four values for each of `count` pixels on a line across an infinite streak, from `begin`.
 
-    The values are distance across the path, distance along the path from the centre of the block, exponent of
-    the profile, and factor of the profile. The values `first` are the distances (px) of the first pixel,
-    across and along the path, from the point at which the path crosses the line. The values `each` are the
-    changes of the two distances from pixel to pixel. The values `path` are the curvature, the acceleration
-    along the path divided by the squared speed, and the distance of the line from the centre. The values
-    `profile` are the inverse squared width, the maximum, and the relative correction for the fourth cumulant.
+    The values are the distances across the path and along it from the centre of the block, and exponent and
+    factor of the profile. The distances across and along the path from the crossing are `first` (px) for the
+    first pixel, and change by `each` from pixel to pixel. The values `path` are the curvature, the
+    acceleration along the path divided by the squared speed, and the distance of the line from the centre.
+    The `profile` is the inverse squared width, the maximum, and the correction for the fourth cumulant.
     """
     across, ahead, by_across, by_ahead = first[0], first[1], each[0], each[1]
     bend, thinning, shift = path
@@ -468,10 +440,9 @@ def _fill(out: Float32Array, pixels: FloatArray, exponential: FloatArray) -> Non
 def _from_end(pixels: FloatArray, pace: FloatArray, width: float, sign: float, later: float) -> None:
     """Compute the distances `pixels[3]` (point-spread widths) of a line of pixels from one streak end.
 
-    The variable `sign` is 1 for the start and -1 for the stop of the exposure. The argument `pace` contains
-    five values: the speed of the star, its acceleration along the path, the time at which it crosses the
-    line, the difference of this time from that of the centre of the block, and the exposure delay of the
-    first pixel. The delay increases by `later` from pixel to pixel.
+    The `sign` is 1 for the start and -1 for the stop of the exposure. The `pace` contains the speed of the
+    star, its acceleration along the path, the time at which it crosses the line, also relative to the centre
+    of the block, and the exposure delay of the first pixel, which increases by `later` from pixel to pixel.
     """
     speed, gained, time, end = pace[0], pace[1], pace[2], -0.5 * sign
     shift = (time - pace[3] - end - pace[4]) * speed - 0.5 * gained * (time - end) ** 2
@@ -550,16 +521,13 @@ def _mixtures_numpy(change: FloatArray, velocity: FloatArray, spread: IntArray) 
     """Return the result (b, IMAGES, 8) of `coefficients`, computed from the derivatives of star positions.
 
     The derivatives `change` (m, 2, 8) and the velocities (m, 2) are given at four groups of instants: shortly
-    before the star crosses the centre of each block, shortly after this, at the starts of exposures, and at
-    the stops of exposures. The array `spread` (b,) contains the index of each block among the starts, which
-    is also its index among the stops.
+    before and shortly after the star crosses the centre of each block, and at the starts and the stops of
+    exposures. The array `spread` (b,) contains the index of each block among the starts and the stops.
     """
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]
-    shift, side = (
-        (change[:, 0] * tx + change[:, 1] * ty) / speed[:, None],
-        change[:, 1] * tx - change[:, 0] * ty,
-    )
+    shift = (change[:, 0] * tx + change[:, 1] * ty) / speed[:, None]
+    side = change[:, 1] * tx - change[:, 0] * ty
     blocks, ends = len(spread), len(change) // 2 - len(spread)
     cuts = [blocks, 2 * blocks, 2 * blocks + ends]
     shift_a, shift_b, shift_first, shift_last = np.split(shift, cuts)
@@ -576,7 +544,6 @@ def _mixtures_numpy(change: FloatArray, velocity: FloatArray, spread: IntArray) 
 
 @compiled_form_of(_mixtures_numpy)
 def _mixtures(change: FloatArray, velocity: FloatArray, spread: IntArray) -> FloatArray:
-    """See `_mixtures_numpy`."""
     blocks, ends = len(spread), len(change) // 2 - len(spread)
     out = np.zeros((blocks, IMAGES, 8))
     for b in range(blocks):

@@ -10,17 +10,18 @@ streak ends and along the streaks limit the errors from point spread and vibrati
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri
 
 from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray
-from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
+from knightcube.vision.streaks.fit_windows import SLOWEST
 from knightcube.vision.streaks.geometry import (
     PIXEL_VARIANCE,
     CameraMotion,
+    DistortedPinhole,
     StreakScene,
     path_lengths,
     positions,
@@ -52,10 +53,8 @@ _LEAST_SENSITIVITY = 0.02
 class Displacement:
     """RMS displacement (px) of streaks, or of their ends, that would cause the residuals of the fit.
 
-    Attributes:
-        shown: significant part of the displacement, px, computed after two standard deviations of chi-square
-            are subtracted.
-        chance: upper limit of the displacement, px, computed from chi-square plus one standard deviation.
+    The significant part `shown` is computed after two standard deviations of chi-square are subtracted, and
+    the upper limit `chance` from chi-square plus one standard deviation.
     """
 
     shown: float
@@ -101,17 +100,12 @@ def _displacement(
         return None
     beyond = float(np.sum(squares[on], dtype=np.float64)) - count * usual
     chance = float(np.sqrt(2.0 * count))
-    return Displacement(
-        float(np.sqrt(max(beyond - 2.0 * chance, 0.0) / information)),
-        float(np.sqrt((max(beyond, 0.0) + chance) / information)),
-    )
+    shown = float(np.sqrt(max(beyond - 2.0 * chance, 0.0) / information))
+    return Displacement(shown, float(np.sqrt((max(beyond, 0.0) + chance) / information)))
 
 
-# Instants (relative to mid-exposure, in units of the exposure time) at which paths with and without lens
-# error are compared.
+# Instants (exposures since mid-exposure) at which paths with and without lens error are compared.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
-# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
-_SLOWEST = 1e-3
 # Indices of rate and star position among the parameters of `geometry.sensitivities`.
 _RATE_AND_POSITION = np.array([0, 1, 2, 6, 7])
 # Probability that a calibration error is corrected although the camera has none.
@@ -123,12 +117,9 @@ class CalibrationCorrection:
     """Effect of camera calibration errors on the shared parameters of the fit.
 
     Attributes:
-        step: correction of the k fitted shared parameters (k,). The correction is 0 if the calibration errors
-            are not significant.
-        added: increase of the covariance (k, k) due to calibration errors, compared with an exactly known
-            camera.
-        described: part of `added` (k, k) that is due to calibration errors with a specified standard
-            deviation.
+        step: correction of the k fitted parameters (k,), 0 if the calibration errors are not significant.
+        added: increase of the covariance (k, k), compared with an exactly known camera.
+        described: part of `added` (k, k) due to calibration errors with a specified standard deviation.
         score: gradient of the log-likelihood of each star after the correction (n, k).
         error: most likely values of the m calibration errors, in standard deviations (m,).
     """
@@ -150,17 +141,11 @@ def correct(
 ) -> CalibrationCorrection | None:
     """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
 
-    Args:
-        information: Fisher information of each star on k shared parameters (n, k, k), after elimination of
-            the star's own parameters.
-        score: gradient (n, k) of each star's log-likelihood with respect to the k shared parameters.
-        apparent: change (n, k, m) of each star's estimate of k shared parameters due to each of m calibration
-            errors of one standard deviation. Calibration errors whose standard deviation is specified precede
-            the other calibration errors.
-        spread: variance of the scatter of the stars, relative to their noise.
-        described: number of calibration errors whose standard deviation is specified.
-        counted: calibration errors that the fit has already corrected, in standard deviations (m,). The
-            estimated calibration errors are in addition to the errors `counted`.
+    The information (n, k, k) and the score (n, k) are those of `StarEquations`. The scatter of the stars has
+    the variance `spread`, relative to their noise. Each of m calibration errors of one standard deviation
+    changes each star's estimate by `apparent` (n, k, m); errors with a specified standard deviation come
+    first, and are `described` in number. The estimated errors are in addition to the errors `counted` (m,),
+    in standard deviations, which the fit has already corrected.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -212,21 +197,22 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
     time, stars = np.repeat(_INSTANTS, n), np.tile(scene.stars, (len(_INSTANTS), 1))
     sensitive, velocity = sensitivities_and_velocity(camera.pinhole, scene.motion, stars, time, growing=False)
     place = positions(camera.pinhole, scene.motion, stars, time)
-    shift = _error_displacements(camera.pinhole, errors, place, velocity / exposure)
-    speed = np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), _SLOWEST)
+    away, corner = place - np.array(camera.pinhole.centre), np.hypot(*camera.pinhole.centre)
+    cubic = away * (np.sum(away**2, axis=1, keepdims=True) / corner**2)
+    moves = [away, np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]), cubic, velocity / exposure * away[:, 1:]]
+    shift = np.stack([np.broadcast_to(move, away.shape) for move in moves], axis=-1) @ errors
+    speed = np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), SLOWEST)
     tangent = velocity / speed
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     ends = np.abs(time) == 0.5
-    change, displaced = (
-        np.concatenate(
-            [
-                np.einsum("pi,pij->pj", normal, of).reshape(len(_INSTANTS), n, -1),
-                np.einsum("pi,pij->pj", tangent[ends], of[ends]).reshape(2, n, -1),
-            ]
-        ).swapaxes(0, 1)
-        for of in (sensitive[:, :, _RATE_AND_POSITION], shift)
-    )
-    return np.asarray((np.linalg.pinv(change) @ displaced)[:, :3])
+
+    def determined(of: FloatArray) -> FloatArray:
+        across = np.einsum("pi,pij->pj", normal, of).reshape(len(_INSTANTS), n, -1)
+        along = np.einsum("pi,pij->pj", tangent[ends], of[ends]).reshape(2, n, -1)
+        return np.concatenate([across, along]).swapaxes(0, 1)
+
+    change = determined(sensitive[:, :, _RATE_AND_POSITION])
+    return np.asarray((np.linalg.pinv(change) @ determined(shift))[:, :3])
 
 
 def _error_root(camera: FitProblem) -> FloatArray:
@@ -246,26 +232,9 @@ def _error_root(camera: FitProblem) -> FloatArray:
     return np.diag(sizes)[:, sizes > 0.0]
 
 
-def _error_displacements(
-    pinhole: Pinhole, errors: FloatArray, place: FloatArray, velocity: FloatArray
-) -> FloatArray:
-    """Return the displacements (p, 2, m), px, of stars due to each of m calibration errors (5, m)."""
-    away = place - np.array(pinhole.centre)
-    corner = np.hypot(*pinhole.centre)
-    moves = [
-        away,
-        np.array([[1.0, 0.0]]),
-        np.array([[0.0, 1.0]]),
-        away * (np.sum(away**2, axis=1, keepdims=True) / corner**2),
-        velocity * away[:, 1:],
-    ]
-    return np.stack([np.broadcast_to(move, away.shape) for move in moves], axis=-1) @ errors
-
-
 def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     """Return `camera` with a lens that has calibration errors `error` (m,), given in standard deviations."""
-    # The last row of the calibration errors is omitted. It contains the errors of the line time, which is not
-    # a property of the lens.
+    # The last row contains the errors of the line time, which is not a property of the lens.
     change = _error_root(camera)[:4] @ error
     pinhole = camera.pinhole
     if isinstance(pinhole, DistortedPinhole):
@@ -297,20 +266,13 @@ _PROFILE_ERROR = 0.05
 _MOST_IMPROVEMENT = 100.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PathLight:
+class _PathLight(NamedTuple):
     """Sums over the pixels of a streak that determine chi-square for any intensity along its path.
 
-    The symbols in the sums are d for the counts of a pixel, w for the weight of the pixel, and g for the
-    point-spread profile across the path.
-
-    Attributes:
-        places: distances along the path (k,), px, from the point at which the image of the star is at rest.
-        square: sums of w g^2 over the pixels nearest to each of the k `places` (k,).
-        cross: sums of w g d over the pixels nearest to each of the k `places` (k,).
-        plain: (k,) sums of w g.
-        moments: sums of w, w d and w d^2 over all pixels of the streak.
-        pixels: number of pixels.
+    The distances along the path (k,), px, are counted from the point at which the image of the star is at
+    rest. With the counts d and the weight w of a pixel, and the point-spread profile g across the path, the
+    sums are those of w g^2 (`square`), w g d (`cross`) and w g (`plain`) over the pixels nearest to each
+    point, and those of w, w d and w d^2 (`moments`) over all pixels.
     """
 
     places: FloatArray
@@ -373,10 +335,8 @@ def _path_light(
     bright = np.maximum(data, 0.0)
     weight = 1.0 / (frame.floor[index] + bright / frame.gain + (_PROFILE_ERROR * bright) ** 2)
     across = np.exp(-0.5 * apart / width**2)
-    square, cross, plain = (
-        np.bincount(nearest, weight * each, len(places)).astype(float)
-        for each in (across**2, across * data, across)
-    )
+    terms = across**2, across * data, across
+    square, cross, plain = (np.bincount(nearest, weight * each, len(places)).astype(float) for each in terms)
     moments = float(np.sum(weight)), float(weight @ data), float(weight @ data**2)
     return _PathLight(places, square, cross, plain, moments, len(index))
 
@@ -404,23 +364,19 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient iterations in the computation of the covariance.
 _CONJUGATE = 12
-# Largest number of stars for which a test of their agreement is impossible, and the factor by which the
-# variance is then increased.
+# Largest number of stars whose agreement cannot be tested, and the factor that then increases the variance.
 _UNCHECKED = (2, 4.0)
 # Relative difference between fitted and configured point-spread variance below which it is neglected.
 _SAME_SPREAD = 0.02
-# Ratio of the error of a streak end to the square root of the difference between the fitted and the
-# configured point-spread variance.
+# Ratio of a streak end's error to the root of the difference of fitted and configured PSF variance.
 _END_SHARE = 1.0
 # Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
 # Ratio of the uncertainty of the streak ends to the significant displacement that explains their residuals.
 _END_SHOWN = 1.5
-# Ratio of the uncertainty of the streak ends to the upper limit of their displacement, which is computed from
-# the residuals.
+# Ratio of the uncertainty of the streak ends to the upper limit of their displacement.
 _END_CHANCE = 0.5
-# Ratio of the error of the streak ends (px) to the vibration common to all streaks, given in px across the
-# streaks or as relative change of brightness.
+# Ratio of the streak ends' error (px) to the vibration across (px) or along (relative) all streaks.
 _END_COMMON = 25.0
 # Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
@@ -428,8 +384,7 @@ _MOST_LENSES = 3
 _SMALL_ERROR = 0.2
 # Relative uncertainty of the rotation due to lens errors above which the lens is always corrected.
 _WORTHWHILE = 0.002
-# Ratio of the covariance to the covariance from noise above which model errors must be the cause (three
-# sigma).
+# Ratio of covariance to noise covariance above which model errors are the cause (three sigma).
 _BEYOND_NOISE = 9.0
 
 
@@ -438,7 +393,7 @@ class RotationUncertainty:
     """The rotation over the exposure and its uncertainty.
 
     Attributes:
-        rotation: rotation vector over the exposure (3,), corrected for significant calibration errors, rad.
+        rotation: rotation vector (3,), corrected for significant calibration errors, rad.
         covariance: (3, 3) rad^2.
         model_error: uncertainty from model errors, relative to the rotation. If the type of shutter is
             unspecified, its uncertainty is included only in the covariance.
@@ -476,44 +431,31 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
         spread *= _UNCHECKED[1]
     residuals = residuals_of_fit(camera, whole)
     common_motion = find_common_motion(camera, whole.scene, residuals)
-    end = np.hypot(
-        _end_uncertainty(residuals, whole.scene, settings.psf_sigma, result.misfit),
-        _END_COMMON * max(common_motion.across, common_motion.along),
-    )
-    ends = float(np.sqrt(2.0) * end / result.length)
+    end = _end_uncertainty(residuals, whole.scene, settings.psf_sigma, result.misfit)
+    shaken = _END_COMMON * max(common_motion.across, common_motion.along)
+    ends = float(np.sqrt(2.0) * np.hypot(end, shaken) / result.length)
     # If the fit did not converge, the uncertainty includes its last step.
     covariance = noise * spread * (1.0 + last.last_step**2)
-    # An error common to all streak ends changes the rotation angle.
-    # The uncertainty of the rotation axis is assumed to equal that of the angle.
+    # The error common to all streak ends changes the rotation angle; that of the axis is assumed equal.
     longer = ends**2 * float(rotation @ rotation)
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
     covariance = covariance + spread * vibration_covariance(camera, whole.scene, residuals)
     sides = side_displacement(residuals, whole.scene)
-    return RotationUncertainty(
-        rotation,
-        covariance,
-        float(np.sqrt(unmodelled / (rotation @ rotation))),
-        common_motion,
-        0.0 if sides is None else sides.shown,
-    )
+    model_error, aside = float(np.sqrt(unmodelled / (rotation @ rotation))), sides.shown if sides else 0.0
+    return RotationUncertainty(rotation, covariance, model_error, common_motion, aside)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LensEffect:
     """Effect of calibration errors on the rotation over the exposure, as in `CalibrationCorrection`.
 
+    The correction `step` (3,), rad, and the covariances (3, 3), rad^2, are those of the rotation vector. The
+    `error` (m,) remains after the correction of `counted` (m,) by the fit, both in standard deviations.
+
     Attributes:
-        step: correction of the rotation vector over the exposure (3,), rad.
-        added: covariance of the rotation vector that calibration errors add (3, 3), rad^2.
-        described: part of `added` (3, 3) from calibration errors whose standard deviation is specified,
-            rad^2.
         spread: variance of the scatter of the stars, relative to their noise.
-        error: estimated calibration errors that remain after the correction of `counted`, in standard
-            deviations (m,).
-        counted: calibration errors that the fit has already corrected, in standard deviations (m,); None
-            without any.
         seen: whether the calibration errors estimated from the stars are significant.
     """
 
@@ -592,8 +534,7 @@ def _lens_effect(
 
 def _scatter(equations: StarEquations, scene: StreakScene) -> float:
     """Return the variance of the scatter of the stars, relative to their noise."""
-    everyone: BoolArray = np.ones(len(scene.light), dtype=np.bool_)
-    return max(disagreement(estimates_of(equations, scene), everyone), contradiction(equations))
+    return max(disagreement(*estimates_of(equations, scene)), contradiction(equations))
 
 
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:

@@ -18,15 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knightcube.astro.arrays import Float32Array, FloatArray, IntArray
+from knightcube.vision.streaks.fit_windows import LINES, SLOWEST
 from knightcube.vision.streaks.geometry import StreakScene, Vibration, image_flow, path_lengths, paths
 from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit
-from knightcube.vision.streaks.normal_equations import model_images
-from knightcube.vision.streaks.path_pixels import LINES
+from knightcube.vision.streaks.normal_equations import model_images, residuals
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Addition to the residual threshold for another star's flux, relative to the brightest modelled pixel of the
-# same line.
+# Addition to this threshold, relative to the brightest modelled pixel of the same line.
 _FOREIGN_SHARE = 0.6
 
 
@@ -35,13 +34,11 @@ class StreakResiduals:
     """Residuals of the streaks that determine the motion, on b blocks of pixels.
 
     Attributes:
-        star: for each block of pixels (b,), the index of its star in the scene.
-        time: time at which the star crosses each line of pixels (b, LINES), relative to mid-exposure, in
-            units of the exposure time.
-        images: images that are combined to model a streak, on lines of k pixels, (b, IMAGES, LINES, k) for b
-            blocks.
-        weight: inverse variance of each pixel of the b blocks (b, LINES, k), 0 for excluded pixels.
-        residual: measured minus modelled counts of each pixel of the b blocks (b, LINES, k).
+        star: index in the scene of the star of each block (b,).
+        time: time at which the star crosses each line of pixels (b, LINES), exposures since mid-exposure.
+        images: images that are combined to model a streak, on lines of k pixels (b, IMAGES, LINES, k).
+        weight: inverse variance of each pixel (b, LINES, k), 0 for excluded pixels.
+        residual: measured minus modelled counts of each pixel (b, LINES, k).
     """
 
     star: IntArray
@@ -60,7 +57,9 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
     peak = light.max(axis=2, keepdims=True, initial=0.0)
     light += scene.sky[of_block, None, None].astype(np.float32)
     spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
-    weight, residual = windows.on_strips.residual(windows.total(light, spot_light), 0.0)
+    view = windows.on_strips
+    pixels = view.slot, view.inside, view.signal, view.floor, view.ceiling
+    weight, residual = residuals(windows.total(light, spot_light), pixels, (view.gain, 0.0))
     with np.errstate(divide="ignore"):
         foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
     weight[foreign] = 0.0
@@ -80,9 +79,7 @@ _SIGNIFICANT = 4.0
 class CommonMotion:
     """RMS vibration common to all streaks (deviation from the smooth motion), or 0 if not significant.
 
-    Attributes:
-        across: displacement of the streaks across their paths, px.
-        along: relative change of brightness along the streaks.
+    The streaks are displaced across their paths, px, and their brightness changes relatively along them.
     """
 
     across: float = 0.0
@@ -144,8 +141,7 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
 
 # Number of time bins for the fit of a vibration, and half the time that they cover, in exposures.
 _FINE_BINS, _RANGE = 512, 0.56
-# Prior standard deviation (px) of the amplitude of a vibration, and of the errors of position, rate and
-# acceleration.
+# Prior standard deviation (px) of a vibration, and of the errors of position, rate and acceleration.
 _USUAL, _LOOSE = 1.0, 10.0
 # Lowest frequency of a vibration, and step between trial frequencies, in cycles per exposure.
 _LOWEST, _GRID = 0.75, 0.2
@@ -161,8 +157,7 @@ _MOST_STEPS, _CONVERGED = 4, 0.02
 _MOST_DETUNED = 0.3
 # Largest accepted amplitude of a vibration, px.
 _LARGEST = 2.5
-# Ratio of the error of the rotation over the exposure to the amplitude that is lost by averaging over the
-# point spread.
+# Ratio of the rotation's error to the amplitude that is lost by averaging over the point spread.
 _LOST_SHARE = 2.0
 # Start and end of the exposure, relative to mid-exposure and in units of the exposure time.
 _ENDS = np.array([-0.5, 0.5])
@@ -195,7 +190,8 @@ def fit_vibration(
         if len(vibration.frequency) == _MOST_SINUSOIDS:
             return fit
         sums = _rotation_sums(camera, fit.scene, residuals_of_fit(camera, fit))
-        frequency = _strongest_frequency(sums, vibration, _highest_frequency(camera, fit.scene))
+        highest = _median_length(camera, fit.scene) / (_SHORTEST_WAVE * fit.scene.width)
+        frequency = _strongest_frequency(sums, vibration, highest)
         if frequency is None:
             return fit if vibration.exists else None
         motion = replace(fit.scene.motion, vibration=vibration.with_frequency(frequency))
@@ -223,20 +219,12 @@ def _median_length(camera: FitProblem, scene: StreakScene) -> float:
     return float(np.median(path_lengths(camera.pinhole, scene.motion.smooth, scene.stars[scene.trusted])))
 
 
-def _highest_frequency(camera: FitProblem, scene: StreakScene) -> float:
-    """Return the highest frequency that the streaks resolve, in cycles per exposure."""
-    return _median_length(camera, scene) / (_SHORTEST_WAVE * scene.width)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _RotationSums:
-    """Normal equations of four rotation vectors in each of b time bins.
+    """Normal equations of rotation, rate, and rotations at start and end, in each of b time bins.
 
-    Attributes:
-        time: middle of each bin (b,), relative to mid-exposure, in units of the exposure time.
-        information: Fisher information (b, 4, 3, 4, 3) of rotation, rate and rotations at start and end.
-        score: gradient (b, 4, 3) of the log-likelihood.
-        focal_length: focal length, px.
+    The equations consist of the Fisher information (b, 4, 3, 4, 3) and the gradient (b, 4, 3) of the
+    log-likelihood (`score`). The middles of the bins (b,) are in exposures since mid-exposure.
     """
 
     time: FloatArray
@@ -260,7 +248,7 @@ def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals
     """
     time, star = left.time.reshape(-1), np.repeat(left.star, LINES)
     path = paths(camera.pinhole, scene.motion, scene.stars[star], time)
-    speed = np.maximum(np.hypot(*path.velocity.T), _SLOWEST)
+    speed = np.maximum(np.hypot(*path.velocity.T), SLOWEST)
     tangent = path.velocity / speed[:, None]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     flow = image_flow(camera.pinhole, path.position)
@@ -280,16 +268,10 @@ def _rotation_sums(camera: FitProblem, scene: StreakScene, left: StreakResiduals
     order = np.argsort(place, kind="stable")
     first = np.searchsorted(place[order], np.arange(_FINE_BINS))
     of_line = np.einsum("lia,lij,ljb->liajb", design, gram, design, optimize=True)
-    return _RotationSums(
-        _RANGE * (2.0 * (np.arange(_FINE_BINS) + 0.5) / _FINE_BINS - 1.0),
-        _sums_from(of_line[order], first),
-        _sums_from((design * score[..., None])[order], first),
-        camera.pinhole.focal_length,
-    )
-
-
-# Lower limit (px per exposure) of a star's speed, which avoids divisions by zero.
-_SLOWEST = 1e-3
+    middles = _RANGE * (2.0 * (np.arange(_FINE_BINS) + 0.5) / _FINE_BINS - 1.0)
+    information = _sums_from(of_line[order], first)
+    gradient = _sums_from((design * score[..., None])[order], first)
+    return _RotationSums(middles, information, gradient, camera.pinhole.focal_length)
 
 
 def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
@@ -300,11 +282,10 @@ def _sums_from(values: FloatArray, first: IntArray) -> FloatArray:
 
 
 def _functions(values: FloatArray, slopes: FloatArray, at_ends: FloatArray) -> FloatArray:
-    """Return n functions of time as one array (n, b, 4) of four values in each of b time bins.
+    """Return n functions of time as an array (n, b, 4) of four values in each of b time bins.
 
-    The four elements of the last axis are the value of the function in a bin, its derivative in the bin, and
-    its values at the start and at the end of the exposure. The values at the start and the end are repeated
-    for all bins.
+    The values are those of the function and its derivative in the bin, and of the function at the start and
+    at the end of the exposure.
     """
     ends = np.broadcast_to(at_ends[:, None], (*values.shape, 2))
     return np.concatenate([values[..., None], slopes[..., None], ends], axis=2)
@@ -371,15 +352,10 @@ def _improved(sums: _RotationSums, vibration: Vibration) -> tuple[Vibration, Flo
     common to all stars are estimated together with the vibration.
     """
     k, time = len(vibration.frequency), sums.time
-    functions = [
-        _powers(time),
-        _waves(vibration.frequency, time),
-        _detuned_waves(vibration.frequency, time),
-    ]
+    functions = [_powers(time), _waves(vibration.frequency, time), _detuned_waves(vibration.frequency, time)]
     information, score = sums.normal_equations(np.concatenate(functions))
     n = 9 + 6 * k
-    # The last k parameters are the changes of the frequencies. The functions of the frequency changes are
-    # scaled by the previous amplitudes.
+    # The last k parameters are the changes of the frequencies, scaled by the previous amplitudes.
     chosen = np.zeros((len(score), n + k))
     chosen[:n, :n] = np.eye(n)
     amplitudes = np.stack([vibration.sine, vibration.cosine])

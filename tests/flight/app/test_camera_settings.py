@@ -14,7 +14,7 @@ from flight.app.flight import horizon_camera_settings, imaging_settings, lens_kn
 from flight.loop.state import Learned
 from flight.schema.devices import Camera, CameraAccuracy, ObjectTracking, StarTrackerSection, WideCamera
 from flight.schema.document import ConfigError
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 
 S = 1_000_000_000
 

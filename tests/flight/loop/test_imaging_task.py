@@ -29,8 +29,7 @@ from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, SolveStatus
 from knightcube.vision.startracker.survey import FrameKind
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, LikelihoodSettings, StreakStatus
 
 S = 1_000_000_000
 MS = 1_000_000

@@ -13,7 +13,7 @@ from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, r
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.startracker.survey import DetectionSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.support.scenes import catalogue
 

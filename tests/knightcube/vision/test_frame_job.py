@@ -24,8 +24,7 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.flight.loop.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 

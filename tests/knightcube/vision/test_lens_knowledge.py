@@ -27,10 +27,13 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
 )
 from knightcube.vision.startracker.survey import FrameKind
-from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
-from knightcube.vision.streaks.geometry import CameraMotion, positions
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
+from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, positions
+from knightcube.vision.streaks.streak_result import (
+    FrameMotion,
+    LikelihoodSettings,
+    MotionResult,
+    StreakStatus,
+)
 
 DESCRIBED = Pinhole(640, 480, 1800.0)
 KNOWN = CameraKnowledge(centre=3.0, distortion=0.006)

@@ -17,7 +17,7 @@ from knightcube.vision.lens_knowledge import MatchedFrame
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from knightcube.vision.star_tracker import StarTracker
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from knightcube.vision.sun import find_sun
 from sim_hal.earth_camera import render
 from sim_hal.star_camera import StarCameraModel

@@ -11,8 +11,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
-from sim_hal.earth_camera import EarthCameraModel, EarthScene
-from sim_hal.earth_camera.scene import visible_share
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, visible_share
 from tests.support.earth_truth import limb_directions, limb_truth, sun_point
 
 View = Literal["sunlit", "terminator", "dark", "any"]

@@ -9,13 +9,18 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Lens
-from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene, nadir, render
-from sim_hal.earth_camera.image import expected_radiance, scatter_centre
-from sim_hal.earth_camera.scene import (
+from sim_hal.earth_camera import (
+    Atmosphere,
+    EarthCameraModel,
+    EarthScene,
     albedo,
     darkening,
+    expected_radiance,
     look,
+    nadir,
     radiance,
+    render,
+    scatter_centre,
     towards_sun,
     transmission,
     visible_share,

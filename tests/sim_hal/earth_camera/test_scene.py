@@ -14,9 +14,22 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS, semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
-from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene, nadir
-from sim_hal.earth_camera.image import expected_radiance, pixel_rays
-from sim_hal.earth_camera.scene import CLOUD, CLOUD_SHARE, LAND_SHARE, OCEAN, TOP, albedo, look, near_earth
+from sim_hal.earth_camera import (
+    CLOUD,
+    CLOUD_SHARE,
+    LAND_SHARE,
+    OCEAN,
+    TOP,
+    Atmosphere,
+    EarthCameraModel,
+    EarthScene,
+    albedo,
+    expected_radiance,
+    look,
+    nadir,
+    near_earth,
+    pixel_rays,
+)
 from tests.sim_hal.earth_camera.scenes import limb_scene, pointing, random_direction, random_scene
 from tests.support.earth_truth import APPARENT_LIMB_HEIGHT, limb_directions, limb_truth
 

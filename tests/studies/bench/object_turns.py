@@ -20,7 +20,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.vision.objects.detect import detect
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.rso import EXPOSURE, FASTEST, MARGIN_PX, MATCH_PX, SLOWEST, Sky, ends_error
 from tests.studies.command import Seed, Table, command

@@ -27,8 +27,7 @@ from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.pace import warm_call
 from tests.support.scenes import FIELD, RandomSlew, Scene, usable

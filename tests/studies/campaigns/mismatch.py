@@ -28,8 +28,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.pace import warm_call
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection

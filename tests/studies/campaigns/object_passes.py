@@ -38,7 +38,7 @@ from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasuremen
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.geometry import CameraMotion
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.support.object_passes import Pass, a_pass
 from tests.support.scenes import catalogue

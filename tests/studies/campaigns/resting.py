@@ -32,7 +32,7 @@ from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.startracker.survey import DetectionSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.mismatch import WRONG_SIGMAS, detected

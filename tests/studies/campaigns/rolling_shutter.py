@@ -19,8 +19,7 @@ import numpy as np
 from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.scenes import turn_of
 from tests.support.row_exposure import RowScene, row_scene

@@ -15,7 +15,7 @@ from knightcube.reference.corner_streaks import StreakSettings
 from knightcube.vision.objects.detect import ObjectReport, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.pace import warm_call
 from tests.support.scenes import SAMPLES, catalogue

@@ -29,8 +29,7 @@ from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import RatePrior, SolveSettings
 from knightcube.vision.startracker.survey import DetectionSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.imperfections import IMPERFECTIONS
 from tests.studies.campaigns.mismatch import LEAST_USABLE, attitudes_of, detected, seen_stars

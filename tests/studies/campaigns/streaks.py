@@ -29,8 +29,7 @@ from knightcube.reference.corner_streaks import DETECTOR_NAMES, DetectorName, St
 from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.support.attitude_errors import attitude_error, error_in_pixels
 from tests.support.scenes import BRIGHTEST, FIELD, Scene, faintest, noise_floor, slew, usable

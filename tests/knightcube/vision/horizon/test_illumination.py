@@ -21,8 +21,7 @@ from knightcube.vision.horizon.illumination import (
 )
 from knightcube.vision.horizon.limb import MEAN_RADIUS, LimbView, mean_sphere
 from knightcube.vision.horizon_camera_job import SUNLIT_COUNTS
-from sim_hal.earth_camera import EarthScene, render
-from sim_hal.earth_camera.image import EarthCameraModel
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from sim_hal.emulators.camera import SPOILT
 
 PINHOLE = Pinhole.from_field_of_view(128, 128, math.radians(80.0))

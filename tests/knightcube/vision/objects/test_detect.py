@@ -37,10 +37,9 @@ from knightcube.vision.objects.detect import (
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import StarLight
 from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
-from knightcube.vision.objects.streak_images import star_path
+from knightcube.vision.objects.streak_images import star_paths
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.star_camera import SourceTrack
 from tests.flight.loop.passing import passed
 from tests.knightcube.vision.objects.space_objects import (
@@ -142,8 +141,7 @@ def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg:
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 @pytest.mark.parametrize(
-    ("along", "across", "expected"),
-    [(6.0, 0.0, (False, True, True)), (0.0, 6.0, (True, False, True))],
+    ("along", "across", "expected"), [(6.0, 0.0, (False, True, True)), (0.0, 6.0, (True, False, True))]
 )
 def test_each_indicator_sees_its_own_part_of_a_motion(
     theta_deg: float, along: float, across: float, expected: tuple[bool, bool, bool]
@@ -519,7 +517,7 @@ def test_a_line_that_another_star_continues_may_begin_a_star() -> None:
     """
     pinhole = _FRAME_CAMERA.pinhole
     image = np.zeros((512, 512))
-    first, second = (star_path(_PLACE, _ROTATION, start, pinhole) for start in (0.5, -0.3))
+    first, second = star_paths(np.stack([_PLACE] * 2), _ROTATION, np.array([0.5, -0.3]), pinhole)
     for path in (first, second):
         add_object(image, _FRAME_CAMERA, path, 3.0, 0.5)
     pixels = read_out(_FRAME_CAMERA, image, 0.5, np.random.default_rng(3))

@@ -50,7 +50,7 @@ def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | 
     light = np.maximum(signal, 0.0)
     weight = 1.0 / np.sqrt(_NOISE**2 + light + (0.1 * light) ** 2)
     mask = np.ones(signal.shape, dtype=np.bool_)
-    return Patch(signal, weight, _NOISE, _CORNER, mask, ((0.0, 0.0), (0.0, 0.0)), 1.0)
+    return Patch(signal, weight, _NOISE, _CORNER, mask, np.zeros(4), 1.0)
 
 
 def test_overlapping_stars_leave_an_empty_residual() -> None:
@@ -79,13 +79,13 @@ def test_a_line_across_a_star_remains_with_its_ends() -> None:
     The star covers the middle of the streak, and the ends are located by all remaining light of the streak.
     """
     ends = np.array([[230.2, 226.4], [255.7, 253.1]])
-    middle = _CAMERA.pinhole.unit_vectors(np.array([[240.3, 238.7]]))[0]
     image = np.zeros((512, 512))
-    deposit(image, star_path(middle, _ROTATION, 0.5, _CAMERA.pinhole), 60_000.0, 1.0)
+    path = star_path(np.array([240.3, 238.7]), _ROTATION, _CAMERA.pinhole)
+    deposit(image, path, 60_000.0, 1.0)
     deposit(image, ends[0] + np.linspace(0, 1, 801)[:, None] * np.diff(ends, axis=0), 40_000.0, 1.0)
     noisy = 500.0 + image + np.random.default_rng(3).normal(0.0, np.sqrt(_NOISE**2 + image))
     segmented = segment_frame(np.rint(noisy).astype(np.uint16), EndpointSettings())
-    patch = cut_patch(segmented, segmented.regions, 0, 1.0, 1.0, 65_535.0)
+    patch = cut_patch(segmented, 0, 1.0, 1.0, 65_535.0)
     stars, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
     line = brightest_left(patch, left)
     assert line is not None
@@ -126,8 +126,7 @@ def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) ->
 
     The star's streak has 50 px, and the object has 15,000 counts.
     """
-    middle = _CAMERA.pinhole.unit_vectors(np.array([[245.0, 240.0]]))[0]
-    path = star_path(middle, _ROTATION, 0.5, _CAMERA.pinhole)
+    path = star_path(np.array([245.0, 240.0]), _ROTATION, _CAMERA.pinhole)
     ends = np.array([[240.0, 225.0], [252.0, 255.0]])
     image = np.zeros((512, 512))
     deposit(image, path, 40_000.0, 1.0)
@@ -138,7 +137,7 @@ def test_an_object_in_a_region_exceeds_the_expected_chi_square(crossed: bool) ->
     light = StarLight(segmented, path[[0, -1]], _ROTATION, _CAMERA.pinhole, 1.0, 1.0, 65_535.0)
     label = segmented.regions.labels[240, 245]
     row, column = np.nonzero(segmented.regions.labels == label)
-    patch = cut_patch(segmented, segmented.regions, 0, 1.0, 1.0, 65_535.0)
+    patch = cut_patch(segmented, 0, 1.0, 1.0, 65_535.0)
     _, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
     for excess in (light.excess(np.stack([column, row], axis=-1)), patch.excess(left)):
         assert (excess > 1000.0) if crossed else (excess < 200.0)

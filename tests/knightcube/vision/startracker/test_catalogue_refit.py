@@ -19,7 +19,7 @@ from knightcube.vision.startracker.solve import (
     solve_motion,
 )
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
 

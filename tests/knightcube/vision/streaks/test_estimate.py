@@ -12,13 +12,18 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import CameraKnowledge, Lens
-from knightcube.vision.streaks.estimate import estimate_motion, estimate_rate
-from knightcube.vision.streaks.faint_stars import find_faint, frame_angles, sharper_widths
+from knightcube.vision.streaks.estimate import chained_stars, estimate_motion, estimate_rate
+from knightcube.vision.streaks.faint_stars import find_faint
+from knightcube.vision.streaks.first_guess import frame_angles, sharper_widths
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Course, Shutter, StreakScene, chained_stars
+from knightcube.vision.streaks.geometry import CameraMotion, Course, Shutter, StreakScene
 from knightcube.vision.streaks.joint_fit import FitProblem, true_ends, unbroken
-from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import (
+    LikelihoodSettings,
+    MotionResult,
+    StreakStatus,
+    knowledge_of_pinhole,
+)
 from sim_hal.star_camera import StarCameraModel, scatter_hot_pixels
 from tests.flight.loop.passing import passed
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky, taken, turn_of

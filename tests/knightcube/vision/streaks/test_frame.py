@@ -21,8 +21,7 @@ from knightcube.vision.streaks.frame import (
     without_glare,
     without_mosaic,
 )
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky
 
 _SHAPE = (60, 90)

@@ -9,8 +9,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.streaks import geometry
-from knightcube.vision.streaks.distorted_pinhole import DistortedPinhole
-from knightcube.vision.streaks.geometry import CameraMotion, paths, positions, sensitivities
+from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, paths, positions, sensitivities
 from tests.support.compiled_forms import assert_forms_agree
 
 _LENS = DistortedPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
@@ -68,7 +67,7 @@ def test_the_compiled_paths_equal_those_in_numpy(
     rate: FloatArray, acceleration: FloatArray, higher: FloatArray
 ) -> None:
     time = np.append(_TIME[1:], 0.0)
-    arguments = (2903.0, 511.5, 411.5), rate, acceleration, higher, _STARS, time
+    arguments = (2903.0, 511.5, 411.5), (rate, acceleration, higher), _STARS, time
     assert_forms_agree(geometry._ideal_positions, *arguments)
     assert_forms_agree(geometry._ideal_paths, *arguments)
     for growing in (False, True):

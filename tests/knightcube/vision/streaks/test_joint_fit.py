@@ -12,7 +12,7 @@ from knightcube.vision.streaks.fit_windows import window_areas
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, positions
 from knightcube.vision.streaks.joint_fit import FitProblem, find_light_ends, stretched
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
 
 _STARS = 16

@@ -10,8 +10,7 @@ import numpy as np
 from knightcube.vision.camera.lens import CameraKnowledge, Lens
 from knightcube.vision.streaks.estimate import estimate_motion, estimate_rate
 from knightcube.vision.streaks.geometry import Course
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult
 from sim_hal.star_camera import scatter_hot_pixels
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky, taken, turn_of
 from tests.support.recorded_results import check

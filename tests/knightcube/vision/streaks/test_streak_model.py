@@ -8,7 +8,7 @@ import pytest
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.fit_windows import cut_windows
+from knightcube.vision.streaks.fit_windows import LINES, cut_patches, cut_strips, cut_windows
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
@@ -19,7 +19,6 @@ from knightcube.vision.streaks.geometry import (
     sensitivities_and_velocity,
 )
 from knightcube.vision.streaks.normal_equations import light_of
-from knightcube.vision.streaks.path_pixels import LINES, cut_patches, cut_strips
 from knightcube.vision.streaks.streak_model import IMAGES
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 from tests.support.compiled_forms import assert_forms_agree
@@ -46,7 +45,7 @@ def _modelled(
     """Return the covered pixels, the modelled counts, and the derivatives (9, ...) of the counts."""
     stars, width = star[None], float(np.sqrt(sigma**2 + 1.0 / 12.0))
     strips = cut_strips(_PINHOLE, motion, stars, np.array([[-0.5, 0.5]]), 5.0 * width)
-    images = streak_model.images(_PINHOLE, motion, Shutter(), stars, width, strips).astype(float)
+    images = streak_model.images(_PINHOLE, motion, Shutter(), stars, width, strips)[:, :IMAGES].astype(float)
     mixture = streak_model.coefficients(_PINHOLE, motion, Shutter(), stars, strips)
     changes = np.einsum("bijk,bip->pbjk", images, mixture)
     frames = np.zeros((10, 320 * 320))
@@ -223,13 +222,6 @@ def test_the_compiled_images_equal_those_in_numpy(
     strips = cut_strips(_PINHOLE, motion, stars, np.tile([-0.45, 0.5], (2, 1)), 4.1)
     points = paths(_PINHOLE, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
     out = np.zeros((len(strips.star), IMAGES + 1, *strips.index.shape[1:]), dtype=np.float32)
-    arguments = (
-        out,
-        strips.corner,
-        strips.step,
-        strips.time,
-        points.at_lines(strips.time.shape),
-        1.3,
-        (delay, 160.0),
-    )
+    lines, at_lines = (strips.corner, strips.step, strips.time), points.at_lines(strips.time.shape)
+    arguments = out, lines, at_lines, 1.3, (delay, 160.0)
     assert_forms_agree(streak_model._draw, *arguments, relative=3e-5, interpreted=growth == 0.0)

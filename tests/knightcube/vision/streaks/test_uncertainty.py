@@ -15,13 +15,8 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, sensitivities
 from knightcube.vision.streaks.joint_fit import FitProblem, brightest_fit
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.uncertainty import (
-    apparent_rates,
-    correct,
-    end_displacement,
-    side_displacement,
-)
+from knightcube.vision.streaks.streak_result import LikelihoodSettings
+from knightcube.vision.streaks.uncertainty import apparent_rates, correct, end_displacement, side_displacement
 from knightcube.vision.streaks.vibration import StreakResiduals
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky, turn_of

@@ -12,8 +12,7 @@ from knightcube.astro.quaternion import from_rotation_vector, multiply, to_rotat
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.geometry import CameraMotion, Vibration, paths
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from tests.support.supersampled import Optics, Sky, light
 
 _PINHOLE = Pinhole.from_field_of_view(560, 560, np.radians(7.0))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from knightcube.vision.streaks.faint_stars import cumulative_sums, polar_grid, running_sums
 from knightcube.vision.streaks.geometry import CameraMotion
-from knightcube.vision.streaks.polar_grid import cumulative_sums, polar_grid, running_sums
 from tests.knightcube.vision.streaks.scenes import CAMERA, turn_of
 
 _CASES = [(90.0, 100.0), (30.0, 60.0), (12.0, 60.0), (6.0, 150.0), (0.0, 40.0)]
