@@ -48,8 +48,9 @@ from knightcube.vision.objects.detect import lengths, olae_residuals, slopes, st
 from knightcube.vision.objects.streak_ends import centre_of_rotation, measure_streaks, segment_frame
 from sim_hal.settings import Simulation
 from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns import campaign
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky
-from tests.studies.campaigns.streaks import PERCENTS, STREAKS_THESIS, THESIS, THETAS_DEG
+from tests.studies.campaigns.streaks import PERCENTS, THESIS, THETAS_DEG
 from tests.studies.command import command
 from tests.support.flights import fly
 from tests.support.scenes import FIELD, YEAR, slew
@@ -201,7 +202,7 @@ def draw_accuracies(folder: Path, runs: int) -> Figure:
 
 def accuracies(folder: Path, runs: int) -> list[dict[str, Any]]:
     """Return the cells of the campaign `streaks-thesis`, which is run or resumed in a folder."""
-    facts = fly_campaign(STREAKS_THESIS, runs, STREAKS_SEED, folder, progress=True).facts
+    facts = fly_campaign(campaign("streaks-thesis"), runs, STREAKS_SEED, folder, progress=True).facts
     found: list[dict[str, Any]] = facts["cells"]
     return found
 

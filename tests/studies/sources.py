@@ -57,7 +57,7 @@ INDEX = (
     ("Michalski, centroids and solvers, AIM", "bench solve_methods; sources image-matching"),
     ("Michalski, identification", "campaigns lost-in-space; sources cosine-limits"),
     ("Meller et al., section 3.2.1", "(pytest tests/knightcube/reference/test_horizon.py)"),
-    ("Meller et al., section 4", "campaigns coverage"),
+    ("Meller et al., section 4", "(campaigns coverage, at commit 5e5e847b)"),
 )
 """Tables and figures of the source documents, with the study that makes each."""
 
@@ -93,10 +93,10 @@ def table_4_4(runs: int, seed: int) -> Rows:
     """Return Table 4.4: correct, overlapping and false detections of ten orbits, and the rate errors."""
     cases = [
         case
-        for case in rso_orbits.RSO_ORBITS.cases(runs, seed)
+        for case in rso_orbits.cases(runs, seed)
         if case.parameters["magnitude"] == rso_orbits.TABLE_MAGNITUDE
     ]
-    facts = rso_orbits.RSO_ORBITS.summarise([rso_orbits.run(case) for case in cases], _NO_FOLDER).facts
+    facts = rso_orbits.summarise([rso_orbits.run(case) for case in cases], _NO_FOLDER).facts
     skies = [facts["skies"][name] for name in (f"brightest {BRIGHTEST}", "whole")]
     rows = [["correct / overlapping / false", "thesis", "7,000 brightest stars", "all stars to V 8.5"]]
     names = ("centre of rotation", "magnitude of rotation", "combined indicator")

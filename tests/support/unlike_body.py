@@ -26,6 +26,21 @@ def configured(name: str) -> tuple[OrbitConfig, Simulation]:
     return as_orbit(configuration.load(path)), section
 
 
+def released(world: Simulation, seed: int, place_deg: float, speed: float) -> Simulation:
+    """Return a world with another seed, position in the orbit and rate (rad/s) at the release.
+
+    The GPS receiver has a fix after a second.
+    """
+    assert world.free_body is not None
+    body = configuration.replace(
+        world.free_body,
+        orbit=configuration.replace(world.free_body.orbit, true_anomaly_deg=place_deg),
+        release=configuration.replace(world.free_body.release, speed=speed),
+    )
+    receiver = configuration.replace(world.orbit_devices, gps_start=1.0)
+    return configuration.replace(world, seed=seed, free_body=body, orbit_devices=receiver)
+
+
 def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
     """Return a configuration without cameras, which a tumbling satellite does not use."""
     return configuration.replace(config, duration=duration, camera=None, wide_cameras=())

@@ -10,7 +10,6 @@ IMU, and how often control was lost.
 from __future__ import annotations
 
 import tempfile
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,13 +20,14 @@ from flight.link import events
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.telemetry import Run
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
+from tests.studies.campaigns.statistics import grouped
 from tests.support.flights import demo_config, demo_world, fly
 
 DURATION = 20.0
@@ -121,15 +121,11 @@ def estimate_beyond(flown: Run) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], Fl
     return (off_rate > SIGMAS) | (off_angle > SIGMAS), times
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row of results for each fault."""
-    del folder
-    by_fault: dict[str, list[Result]] = defaultdict(list)
-    for result in results:
-        by_fault[f"{result['fault']}{'' if result['span'] is None else ' for 3'}"].append(result)
     facts: dict[str, Any] = {"faults": {}}
-    for name, own in by_fault.items():
-        row = {
+    for name, own in grouped(results, "fault", "span").items():
+        facts["faults"][name] = {
             "flights": len(own),
             "beyond_s": max(one["beyond_s"] for one in own),
             "beyond_after_end_s": max(one["beyond_after_end_s"] for one in own),
@@ -138,7 +134,6 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
             "control_lost": sum(one["control_lost"] for one in own),
             "found_s": max((one["found_s"] for one in own if one["found_s"] is not None), default=None),
         }
-        facts["faults"][name] = row
     facts["flights"] = len(results)
     facts["beyond"] = sum(
         max(one["beyond_s"], one["beyond_after_end_s"]) >= LONGEST_BEYOND for one in results
@@ -151,13 +146,3 @@ def _first(event: Any, names: Sequence[str], name: str, after: float) -> float |
     """Return the mission time (s) of the first event named `name` after a given time, or None."""
     at = event["time_ns"][np.array([one == name for one in names], bool)] / SECOND_NS - after
     return min(at[at >= 0.0].tolist(), default=None)
-
-
-COIL_FAULTS = Campaign(
-    "coil-faults",
-    "the estimate while a coil does not carry its command",
-    cases,
-    run,
-    summarise,
-    20,
-)

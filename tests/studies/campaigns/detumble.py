@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema.orbit import FieldDetumble
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import FieldAhead
@@ -37,14 +37,7 @@ from sim_hal.description_errors import NO_ERRORS, DescriptionErrors
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.free_body import CRAFTS, DRAG_COEFFICIENT, SOLAR_PRESSURE
 from sim_hal.worlds.orbit import air_flow
-from tests.studies.campaigns.free_flight import (
-    CRAFT,
-    FIX_SIGMA,
-    GYRO_NOISE,
-    SECOND,
-    STILL,
-    FreeFlight,
-)
+from tests.studies.campaigns.free_flight import CRAFT, FIX_SIGMA, GYRO_NOISE, SECOND, STILL, FreeFlight
 
 DIRECTIONS = 2000
 CLOSER, TRIES = (0.06, 0.02, 0.007), 60
@@ -193,12 +186,12 @@ def run(case: Case) -> Result:
             law.sample()
         acting_ns = start_ns + SCHEDULE.settle_ns + SCHEDULE.measure_ns
         end_ns = start_ns + SCHEDULE.period_ns
-        while not law.trusted and acting_ns < end_ns - SAMPLES_NS.step:
+        while not law.detumbler.trusted and acting_ns < end_ns - SAMPLES_NS.step:
             flight.advance(acting_ns)
             law.sample()
             acting_ns += SAMPLES_NS.step
-        if law.trusted:
-            end_ns = max(law.next_pause_ns, acting_ns)
+        if law.detumbler.trusted:
+            end_ns = max(law.detumbler.next_pause_ns, acting_ns)
         act_ns = end_ns - acting_ns
         speed = float(np.linalg.norm(flight.motion.rate))
         cycles = max(LEAST_CYCLES, int(np.ceil(speed * act_ns / SECOND / 0.3)))
@@ -299,28 +292,20 @@ class _Law:
         )
         self._instants = braking.instants
         self._field = FieldAhead()
-        self._law = FieldDetumbler(SCHEDULE, braking, noise, self._expected)
+        self.detumbler = FieldDetumbler(SCHEDULE, braking, noise, self._expected)
 
     def sample(self) -> None:
         flight = self._flight
-        self._law.dipole(flight.time_ns)
+        self.detumbler.dipole(flight.time_ns)
         field = flight.field()
         if flight.generator.uniform() < self._spikes:
             field = field + 1e-4 * flight.generator.standard_normal(3)
         noise = GYRO_NOISE * np.sqrt(40.0) * flight.generator.standard_normal(3)
         gyro = flight.motion.rate + flight.gyro_bias + noise
-        self._law.sample(flight.time_ns, field, gyro if self._knows else None)
-
-    @property
-    def trusted(self) -> bool:
-        return self._law.trusted
-
-    @property
-    def next_pause_ns(self) -> int:
-        return self._law.next_pause_ns
+        self.detumbler.sample(flight.time_ns, field, gyro if self._knows else None)
 
     def dipole(self) -> FloatArray:
-        return self._law.dipole(self._flight.time_ns)
+        return self.detumbler.dipole(self._flight.time_ns)
 
     def _expected(self, _: int) -> FieldPrediction:
         """Return the field predicted along the orbit, in the axes of a coarse attitude or in ICRS."""
@@ -365,13 +350,3 @@ def _cell(mine: Sequence[Result], wanted: float, over_wanted: float) -> dict[str
         "over_least": [float(np.percentile(over, part)) for part in (0.0, 50.0, 95.0)],
         "over_wanted": over_wanted,
     }
-
-
-DETUMBLE = Campaign(
-    "detumble",
-    "a free satellite from 10 deg/s to 0.5 by coils: magnetometer alone, attitude known, inertia unknown",
-    cases,
-    run,
-    summarise,
-    100,
-)

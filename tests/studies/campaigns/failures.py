@@ -23,13 +23,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.pace import warm_call
+from tests.studies.campaigns.statistics import median, squared_sigmas
 from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 
 WRONG_SIGMAS = 6.0
@@ -92,7 +93,7 @@ def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
         verdict = AT_REST if still else found.status.value
         return {"verdict": verdict, "reason": _why_refused(found), "nees": None}
     error = found.rate - scene.rate
-    nees = float(error @ np.linalg.solve(found.covariance, error))
+    nees = squared_sigmas(error, found.covariance)
     vector = float(np.linalg.norm(error)) / size
     wrong = nees > WRONG_SIGMAS**2 and vector > WRONG_SHARE
     suspicious = wrong or nees > WRONG_SIGMAS**2
@@ -124,7 +125,7 @@ def _how_wrong(found: MotionResult, scene: Scene) -> str:
     )
 
 
-def summarise(results: Sequence[Result], out: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the counts, the distribution of NEES, the times, every seed that failed, and the plot."""
     facts = {
         "frames": len(results),
@@ -187,16 +188,6 @@ def _by_turn(results: Sequence[Result]) -> list[dict[str, Any]]:
             continue
         errors = [r["vector"] for r in here if r["nees"] is not None]
         row = {"from": low, "to": high, "frames": len(here), **_counts(here), **_times(here)}
-        row["vector_median"] = float(np.median(errors)) if errors else None
+        row["vector_median"] = median(errors)
         rows.append(row)
     return rows
-
-
-FAILURES = Campaign(
-    "failures",
-    "random frames: right, refused, wrong; NEES and time of the likelihood estimator",
-    cases,
-    run,
-    summarise,
-    1000,
-)

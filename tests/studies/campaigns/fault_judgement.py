@@ -1,11 +1,14 @@
 """Evaluation of a run of campaign `faults` by its log and its true states.
 
-Times are determined from log and truth, not from events alone, because events are rate-limited.
+The tables have the event and the reaction that each fault must cause. A fault counts as reported only by a
+specific event: a stuck coil also causes a tumbling event, but that event does not name the failed part. Where
+the table of events has a reaction, the reaction must follow. Times are determined from log and truth, not
+from events alone, because events are rate-limited.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,8 +19,63 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.faults.catalogue import FaultKind
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.fault_table import COIL_JUDGED, REACTION, own_events, part_of
 from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, demo_world
+
+_STARS = {"stars-refused", "streak-refused", "vision-failed"}
+
+OWN: Mapping[str, frozenset[str]] = {
+    "imu": frozenset(
+        {"imu-silent", "imu-corrupt", "imu-implausible", "imu-line-lost", "imu-refused", "imu-unusable"}
+        | {"gyro-lost"}
+    ),
+    "pwm": frozenset({"coil-fault"}),
+    "bus": frozenset({"coil-fault", "power-fault"}),
+    "monitor": frozenset({"power-fault", "power-doubted", "coil-suspect"}),
+    "coil": frozenset({"coil-broken", "coil-corrected", "coil-suspect"}),
+    "bridge": frozenset({"coil-broken", "coil-suspect"}),
+    "camera": frozenset(
+        {"camera-lost", "camera-frozen", "camera-black", "camera-saturated"}
+        | {"camera-torn", "camera-strange", "camera-late"}
+        | _STARS
+    ),
+    "planner": frozenset({"planner-busy", "planner-failed", "plan-refused", "holding"}),
+    "vision": frozenset({"vision-slow"} | _STARS),
+    "clock": frozenset({"clock-step"}),
+    "disk": frozenset({"log-fault"}),
+}
+"""Events that report a fault of a device."""
+
+COIL_JUDGED = frozenset({"coil-broken", "coil-corrected"})
+"""Events by which a broken coil is isolated, or a reversed one used with its sign changed."""
+
+OWN_OF_KIND: dict[str, frozenset[str]] = {
+    # The packets are valid, but too few or too old for control, so only the event of the stream is reported.
+    "imu: slow": OWN["imu"] | {"stream-poor"},
+    "imu: delayed": OWN["imu"] | {"stream-poor"},
+    "imu: intermittent": OWN["imu"] | {"stream-poor"},
+    "imu: cut": OWN["imu"] | {"stream-poor"},
+}
+"""Events that report a fault, for the kinds of fault that differ from the entries of `OWN`."""
+
+REACTION: Mapping[str, str] = {
+    "imu": "control-lost",
+    "pwm": "coil-fault",
+    "bus": "coil-fault",
+    "coil": "coil-broken",
+    "bridge": "coil-broken",
+}
+"""Event whose reaction in the table of events (coils off, or isolation) must follow."""
+
+
+def part_of(kind: FaultKind) -> str:
+    """Return the device name that the table uses for a fault; the coils of all axes share one row."""
+    return kind.device.partition("-")[0]
+
+
+def own_events(kind: FaultKind) -> frozenset[str]:
+    """Return the names of the events that report a fault."""
+    return OWN_OF_KIND.get(kind.name, OWN[part_of(kind)])
+
 
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
@@ -42,7 +100,24 @@ FEW = 3
 BACK_WITHIN = 2.0
 """Longest recovery time (s) of a device after it responds again."""
 _OUT_OF_REACH = {"nack", "slow", "intermittent"}
-_KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
+EVENT_KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
+
+
+def events_of(flown: Run) -> list[tuple[float, str, str]]:
+    """Return time (s), name and text of each event."""
+    return [(float(e["time_ns"]) * 1e-9, to_text(e["name"]), to_text(e["text"])) for e in flown["event"]]
+
+
+def warnings_in(
+    reported: Sequence[tuple[float, str, str]], at: float, end: float, duration: float
+) -> list[tuple[float, str, str]]:
+    """Return the warnings that a fault from `at` to `end` s can have caused in a flight of `duration` s."""
+    return [
+        (time, name, text)
+        for time, name, text in reported
+        if at - 1e-6 <= time < min(end + REPORTED_WITHIN, duration - CYCLE)
+        and EVENT_KINDS[name].severity is not Severity.INFORMATION
+    ]
 
 
 def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
@@ -50,15 +125,10 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
     at = entry.at or 0.0
     span = DURATION - at if entry.span is None else entry.span
     end = at if kind.momentary else min(at + span, DURATION)
-    reported = [(float(event["time_ns"]) * 1e-9, to_text(event["name"])) for event in flown["event"]]
-    warned = [
-        (time, name)
-        for time, name in reported
-        if at - 1e-6 <= time < min(end + REPORTED_WITHIN, DURATION - CYCLE)
-        and _KINDS[name].severity is not Severity.INFORMATION
-    ]
+    reported = events_of(flown)
+    warned = [(time, name) for time, name, _ in warnings_in(reported, at, end, DURATION)]
     own = [(time, name) for time, name in warned if name in own_events(kind)]
-    reactions = {_KINDS[name].reaction for _, name in warned} - {Reaction.NOTE}
+    reactions = {EVENT_KINDS[name].reaction for _, name in warned} - {Reaction.NOTE}
     control = flown["control"]
     return {
         "at": at,
@@ -73,8 +143,8 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
         "recovered_s": _recovered(flown, kind, at, end, reported),
         "blind_current_a": _blind_current(flown, part_of(kind) == "imu"),
         "largest_current_a": float(np.abs(flown["truth"]["current"]).max()),
-        "task_failed": any(name == "task-failed" for _, name in reported),
-        "service_failing": any(name == "service-failing" for _, name in reported),
+        "task_failed": any(name == "task-failed" for _, name, _ in reported),
+        "service_failing": any(name == "service-failing" for _, name, _ in reported),
         "log_intact": all(log.intact for log in flown.logs.values())
         and len(control) == round(DURATION / CYCLE),
     }
@@ -93,7 +163,7 @@ def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
         return bool((written > DRIVEN).any(axis=1).sum() * CYCLE > 1.0)
     if kind.name == "monitor: wrong":
         asked = written.sum(axis=1)
-        return bool(_differs(asked, (kind.parameters["gain"].default or 0.0) * asked).sum() * CYCLE > 1.0)
+        return bool(differs(asked, (kind.parameters["gain"].default or 0.0) * asked).sum() * CYCLE > 1.0)
     if kind.name == "monitor: delayed":
         return _is_behind(flown, kind, inside)
     if kind.kind == "upset" or device == "camera":
@@ -127,10 +197,10 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
     asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
     behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
-    return bool((_differs(asked, before) & inside).sum() * CYCLE > 1.0)
+    return bool((differs(asked, before) & inside).sum() * CYCLE > 1.0)
 
 
-def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
+def differs(one: FloatArray, other: FloatArray) -> BoolArray:
     """Return whether two supply currents (n,), A, differ by more than readings of the same current can."""
     return np.asarray(np.abs(one - other) > OFF_SURELY + GAIN_ERROR * np.maximum(one, other))
 
@@ -168,7 +238,7 @@ def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
 
 
 def _recovered(
-    flown: Run, kind: FaultKind, at: float, end: float, reported: Sequence[tuple[float, str]]
+    flown: Run, kind: FaultKind, at: float, end: float, reported: Sequence[tuple[float, str, str]]
 ) -> float | None:
     """Return the time (s) from a fault's end until the device's data are valid again.
 
@@ -190,7 +260,7 @@ def _recovered(
                 later = _first(time[finite], float(lost[-1]))
                 found = None if later is None else float(lost[-1]) + later - end
             # This packet is sent four times a second, the housekeeping packet once.
-            known = [t for t, name in reported if name == "power-recovered" and t < DURATION - CYCLE]
+            known = [t for t, name, _ in reported if name == "power-recovered" and t < DURATION - CYCLE]
             back = _first(np.array(known), end)
             if back is not None:
                 found = back if found is None or kind.momentary else min(found, back)
@@ -198,9 +268,9 @@ def _recovered(
             grown = np.flatnonzero(np.diff(house["frames"].astype(int)) > 0) + 1
             found = _first(house["time_ns"][grown] * 1e-9, end)
         case "coil" | "bridge":
-            found = _first(np.array([time for time, name in reported if name in COIL_JUDGED]), at)
+            found = _first(np.array([time for time, name, _ in reported if name in COIL_JUDGED]), at)
         case "disk":
-            found = _first(np.array([time for time, name in reported if name == "log-recovered"]), end)
+            found = _first(np.array([time for time, name, _ in reported if name == "log-recovered"]), end)
         case _:
             pass
     return found

@@ -2,17 +2,16 @@
 
 Each run flies the demonstration's loop for half a minute in one mode. It injects one fault on the device
 lines, at a random time and for a random duration; faults of coils and bridges last to the end. The campaign
-then evaluates the log: whether a specific event reported the fault (`fault_table`), whether the reaction of
-the table followed, how long after the end of the fault the flight recovered, which currents the coils carried
-without measurements, and whether the log is complete. A fault of an unused part (a coil that is not driven, a
-planner without a request) has no effect and counts as not exercised. Exercised faults that no event reported
-are listed with the number of their flight; `refly(seed, number)` repeats a flight.
+then evaluates the log (`fault_judgement`): whether a specific event reported the fault, whether the reaction
+of the table followed, how long after the end of the fault the flight recovered, which currents the coils
+carried without measurements, and whether the log is complete. A fault of an unused part (a coil that is not
+driven, a planner without a request) has no effect and counts as not exercised. Exercised faults that no event
+reported are listed with the number of their flight, which is that of their case.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from sim_hal.faults.catalogue import CATALOGUE, FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.fault_judgement import judge
-from tests.studies.campaigns.fault_table import OWN, part_of
+from tests.studies.campaigns.fault_judgement import OWN, judge, part_of
+from tests.studies.campaigns.statistics import grouped
 from tests.support.flights import DURATION, config_for, demo_config, demo_world, fly
 
 MODES = ("boot", "safe", "detumble", "hold", "slew", "testbed-demo")
@@ -69,11 +68,6 @@ def run(case: Case) -> Result:
     return {"number": case.key, **fly_with(kind, mode, entry, int(rng.integers(1, 2**31)))}
 
 
-def refly(seed: int, number: int) -> Result:
-    """Repeat one flight of the campaign with this seed."""
-    return run(cases(number + 1, seed)[number])
-
-
 def fly_with(kind: FaultKind, mode: str, entry: FaultEntry, seed: int) -> Result:
     """Fly half a minute with one fault."""
     section = configuration.replace(demo_world(), seed=seed, faults=(entry,), coil_field=COIL_FIELD)
@@ -82,16 +76,10 @@ def fly_with(kind: FaultKind, mode: str, entry: FaultEntry, seed: int) -> Result
         return {"fault": kind.name, "mode": mode, **judge(flown, kind, entry)}
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each fault, and all defects found."""
-    del folder
-    by_fault: dict[str, list[Result]] = defaultdict(list)
-    for result in results:
-        by_fault[result["fault"]].append(result)
-    facts: dict[str, Any] = {"runs": len(results), "faults": {}}
-    for name, own in by_fault.items():
-        row = _row(own)
-        facts["faults"][name] = row
+    rows = {name: _row(own) for name, own in grouped(results, "fault").items()}
+    facts: dict[str, Any] = {"runs": len(results), "faults": rows}
     for name in ("task_failed", "service_failing"):
         facts[name] = sum(result[name] for result in results)
     facts["logs_intact"] = sum(result["log_intact"] for result in results)
@@ -134,13 +122,3 @@ def _row(own: Sequence[Result]) -> dict[str, Any]:
 
 def _median_and_worst(values: Sequence[float]) -> list[float] | None:
     return [float(np.median(values)), float(max(values))] if values else None
-
-
-FAULTS = Campaign(
-    "faults",
-    "every fault of the catalogue in every mode at random times",
-    cases,
-    run,
-    summarise,
-    default_runs=1000,
-)

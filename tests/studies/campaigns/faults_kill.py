@@ -26,7 +26,7 @@ import yaml
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
 from flight.loop.state import StateStore, StoredState
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.telemetry import Run, read_run
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import RemoteI2cBus
@@ -268,9 +268,8 @@ def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
     }
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the times for which the coils carried current after kills, and the other results."""
-    del folder
     kills = [kill for result in results for kill in result["kills"]]
     ends = [result["end"] for result in results if result["end"] is not None]
     driven = [kill for kill in kills if kill["current_before_a"] > 0.0]
@@ -298,13 +297,3 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "wall_s_per_kill": sum(result["took_s"] for result in results) / len(kills),
     }
     return summary(facts)
-
-
-FAULTS_KILL = Campaign(
-    "faults-kill",
-    "kill -9 of the flight process at random moments, in real time (use --workers 1)",
-    cases,
-    run,
-    summarise,
-    default_runs=1000,
-)

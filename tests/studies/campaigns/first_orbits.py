@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
+from tests.studies.campaigns.statistics import grouped, squared_sigmas
 from tests.support.short_arcs import LIGHT, circular, flown_states, passing_object
 
 SIGMA = float(0.1 * np.radians(20.0) / 1024)
@@ -54,7 +55,7 @@ def run(case: Case) -> Result:
     off = found.state - true[middle]
     return result | {
         "refused": None,
-        "nees": float(off @ np.linalg.solve(found.covariance, off)),
+        "nees": squared_sigmas(off, found.covariance),
         "covered": bool(found.interval[0] < distance < found.interval[1]),
         "distance_error": found.distance / distance - 1.0,
         "place_error_m": float(np.linalg.norm(off[:3])),
@@ -64,16 +65,12 @@ def run(case: Case) -> Result:
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each arc length: the determined quantities, their normalised errors, their errors."""
-    rows = [_row(arc, [result for result in results if result["arc"] == arc]) for arc in ARCS]
-    for row in rows:
-        if not row["passes"]:
-            continue
-    return summary({"arcs": rows})
+    return summary({"arcs": {arc: _row(own) for arc, own in grouped(results, "arc").items()}})
 
 
-def _row(arc: float, results: list[Result]) -> Result:
+def _row(results: list[Result]) -> Result:
     made = [result for result in results if result["refused"] is None]
-    row: Result = {"arc": arc, "passes": len(results), "orbits": len(made)}
+    row: Result = {"passes": len(results), "orbits": len(made)}
     if not made:
         return row
     spread = 2.576 * float(np.sqrt(12.0 / len(made)))
@@ -95,13 +92,3 @@ def _pass(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         rate = np.degrees(np.linalg.norm(np.cross(direction, relative))) / away
         if 6.7e6 < np.linalg.norm(other[:3]) < 9e6 and 0.05 < rate < 0.6:
             return own, other
-
-
-FIRST_ORBITS = Campaign(
-    "first-orbits",
-    "first orbits of objects from one pass: normalised errors, and arcs that are too short",
-    cases,
-    run,
-    summarise,
-    100,
-)

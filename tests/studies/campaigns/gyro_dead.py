@@ -24,14 +24,14 @@ import numpy as np
 from flight.link import events
 from flight.link.modes import Mode
 from flight.schema import reader as configuration
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.report.orbit import attitude_errors, pointing_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FaultEntry
 from tests.support.flights import demo_config, demo_world, event_names, fly
-from tests.support.unlike_body import configured
+from tests.support.unlike_body import configured, released
 
 LIMIT = math.radians(0.5)
 ORBIT_SECONDS = 1_500.0
@@ -82,20 +82,9 @@ def in_orbit(case: Case) -> Result:
         wide_cameras=(),
         solar_strings=None,
     )
-    body = world.free_body
-    assert body is not None
-    body = configuration.replace(
-        body,
-        orbit=configuration.replace(body.orbit, true_anomaly_deg=given["place_deg"]),
-        release=configuration.replace(body.release, speed=math.radians(given.get("speed_deg", 3.0))),
-    )
-    world = configuration.replace(
-        world,
-        seed=int(np.random.default_rng(case.seed).integers(1, 2**31)),
-        free_body=body,
-        orbit_devices=configuration.replace(world.orbit_devices, gps_start=1.0),
-        faults=(FaultEntry(fault="imu: gyro-dead", at=given["at"]),),
-    )
+    seed = int(np.random.default_rng(case.seed).integers(1, 2**31))
+    world = released(world, seed, given["place_deg"], math.radians(given.get("speed_deg", 3.0)))
+    world = configuration.replace(world, faults=(FaultEntry(fault="imu: gyro-dead", at=given["at"]),))
     with tempfile.TemporaryDirectory() as place:
         return judged_in_orbit(fly(config, Path(place) / "run", section=world), given["at"])
 
@@ -169,9 +158,8 @@ def judged(flown: Run, at: float) -> Result:
     }
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return three rows: testbed flights with camera, testbed flights without it, and orbit flights."""
-    del folder
     rows: list[dict[str, Any]] = []
     for camera in (True, False):
         own = [result for result in results if result.get("camera") is camera]
@@ -188,13 +176,3 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         means = {f"mean_{key}": float(np.mean([one[key] for one in own])) for key in errors[3:]}
         rows.append({"orbit": True, "flights": len(own), **sums, **largest, **means})
     return summary({"rows": rows})
-
-
-GYRO_DEAD = Campaign(
-    "gyro-dead",
-    "steps of the testbed and nadir in orbit without a gyro: steps reached, lost flights, errors, NEES",
-    cases,
-    run,
-    summarise,
-    20,
-)

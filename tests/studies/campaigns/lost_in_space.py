@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.reference.star_identification import METHODS, StarMotion, identify_by_rate
 from knightcube.reference.star_tables import KnownSky, angles
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
 from tests.pace import warm_call
+from tests.studies.campaigns.statistics import median
 from tests.support.star_lists import PIXELS, ListKind, StarList, draw
 
 NOMINAL: dict[str, float] = {
@@ -129,7 +130,7 @@ def verdict(answer: StarMatch, drawn: StarList) -> str:
     return "right" if off < np.deg2rad(_RIGHT_DEG) and named >= _RIGHT_SHARE else "wrong"
 
 
-def summarise(results: Sequence[Result], out: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the table of all methods by axis, and a figure."""
     cells = [
         {"axis": axis, "value": value, **cell(_results_of(results, axis, value))}
@@ -154,17 +155,7 @@ def cell(results: Sequence[Result]) -> dict[str, Any]:
         spent = [r[name]["ms"] for r in results]
         row[name] = {
             **{kind: verdicts.count(kind) for kind in ("right", "wrong", "refused")},
-            "median_ms": float(np.median(spent)) if spent else None,
+            "median_ms": median(spent),
             "p95_ms": float(np.quantile(spent, 0.95)) if spent else None,
         }
     return row
-
-
-LOST_IN_SPACE = Campaign(
-    "lost-in-space",
-    "identification rate of every method against noise, false and missing stars, field, magnitudes",
-    cases,
-    run,
-    summarise,
-    100,
-)

@@ -18,10 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.quaternion import (
     attitude_matrix,
+    conjugate,
     from_rotation_vector,
     multiply,
     normalise,
@@ -32,6 +33,7 @@ from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakSt
 from sim_hal.star_camera import StarCameraModel
 from tests.pace import warm_call
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
+from tests.studies.campaigns.statistics import grouped, largest, mean, median, squared_sigmas
 from tests.support.scenes import FIELD, catalogue, noise_floor
 from tests.support.supersampled import Attitudes, Sky, light
 
@@ -50,7 +52,7 @@ SHAPES = ("sine", "two sines", "decaying", "noise")
 """Time profiles of a vibration. A decaying vibration loses 86 % of its amplitude during the exposure."""
 
 
-def mismatch_cases(runs: int, seed: int) -> list[Case]:
+def cases(runs: int, seed: int) -> list[Case]:
     """Return `runs` random motions of each imperfection and rotation."""
     cells = [(name, percent) for name in IMPERFECTIONS for percent in TURNS]
     found = []
@@ -126,35 +128,40 @@ def wave(
 
 def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
     """Return a case's frame and the true mean rate (3,) rad/s in the camera's frame."""
-    camera, rng, exposure = (
-        StarCameraModel(field_of_view=FIELD),
-        np.random.default_rng(case.seed),
-        case.parameters["exposure"],
-    )
-    stars, directions = catalogue(8.5)
-    for _ in range(_MOST_SKIES):
-        attitudes = attitudes_of(case.parameters, camera, rng)
-        sky = Sky(directions, camera.electrons(stars.magnitude, exposure))
-        near, good = seen_stars(camera, sky, attitudes, exposure)
-        if good >= LEAST_USABLE:
-            break
-    else:
-        raise ValueError(f"no sky in {_MOST_SKIES} with {LEAST_USABLE} usable stars for {case.parameters}")
-    begin, end = attitudes(np.array([-0.5, 0.5]))
-    rate = to_rotation_vector(multiply(end, np.array([-1.0, -1.0, -1.0, 1.0]) * begin)) / exposure
+    camera, rng = StarCameraModel(field_of_view=FIELD), np.random.default_rng(case.seed)
+    exposure = case.parameters["exposure"]
+    _, attitudes, sky = usable_sky(camera, exposure, lambda: case.parameters, rng)
     length = 1.3 * case.parameters["percent"] / 100.0 * camera.columns + 60.0 * case.parameters.get(
         "amplitude", 0.0
     )
     electrons = light(
-        camera.pinhole,
-        imperfection.optics,
-        Sky(directions[near], sky.electrons[near]),
-        attitudes,
-        length,
-        imperfection.line_time / exposure,
-        rng,
+        camera.pinhole, imperfection.optics, sky, attitudes, length, imperfection.line_time / exposure, rng
     )
-    return detected(electrons, imperfection, camera, exposure, rng), np.asarray(rate)
+    return detected(electrons, imperfection, camera, exposure, rng), mean_rate(attitudes, exposure)
+
+
+def usable_sky(
+    camera: StarCameraModel, exposure: float, motion: Callable[[], dict[str, Any]], rng: np.random.Generator
+) -> tuple[dict[str, Any], Attitudes, Sky]:
+    """Return parameters of `motion`, its attitudes, and the stars near a field with enough usable stars.
+
+    Raises ValueError if no drawn field has enough usable stars.
+    """
+    stars, directions = catalogue(8.5)
+    sky = Sky(directions, camera.electrons(stars.magnitude, exposure))
+    for _ in range(_MOST_SKIES):
+        parameters = motion()
+        attitudes = attitudes_of(parameters, camera, rng)
+        near, good = seen_stars(camera, sky, attitudes, exposure)
+        if good >= LEAST_USABLE:
+            return parameters, attitudes, Sky(directions[near], sky.electrons[near])
+    raise ValueError(f"no sky in {_MOST_SKIES} with {LEAST_USABLE} usable stars for {parameters}")
+
+
+def mean_rate(attitudes: Attitudes, exposure: float) -> FloatArray:
+    """Return the mean rate (3,), rad/s, between the attitudes at the ends of an exposure."""
+    begin, end = attitudes(np.array([-0.5, 0.5]))
+    return np.asarray(to_rotation_vector(multiply(end, conjugate(begin))) / exposure)
 
 
 def seen_stars(
@@ -192,13 +199,13 @@ def detected(
     return imperfection.encode(counts)
 
 
-def run_mismatch(case: Case) -> Result:
+def run(case: Case) -> Result:
     """Estimate the motion of one frame of an imperfect camera, and evaluate the result."""
     imperfection = IMPERFECTIONS[case.parameters["row"]]
     return judge(case, *expose(case, imperfection), imperfection)
 
 
-def run_vibration(case: Case) -> Result:
+def vibration_run(case: Case) -> Result:
     """Estimate the motion of one frame of a vibrating body, and evaluate the result."""
     imperfection = IMPERFECTIONS["none"]
     return judge(case, *expose(case, imperfection), imperfection)
@@ -208,12 +215,7 @@ def judge(case: Case, pixels: Image, rate: FloatArray, imperfection: Imperfectio
     """Return status, errors and time of the estimator on a frame; the true `rate` (3,) is also the prior."""
     camera = StarCameraModel(field_of_view=FIELD)
     settings = LikelihoodSettings(
-        **{
-            "gain": camera.gain,
-            "saturation": imperfection.top,
-            "line_time": 0.0,
-            **imperfection.known,
-        }
+        **{"gain": camera.gain, "saturation": imperfection.top, "line_time": 0.0, **imperfection.known}
     )
     exposure = case.parameters["exposure"]
     found, spent = warm_call(
@@ -230,58 +232,30 @@ def judge(case: Case, pixels: Image, rate: FloatArray, imperfection: Imperfectio
     result["misfit"] = found.misfit if np.isfinite(found.misfit) else None
     if found.status is StreakStatus.RATE and found.rate is not None and found.covariance is not None:
         error = found.rate - rate
-        result["nees"] = float(error @ np.linalg.solve(found.covariance, error))
+        result["nees"] = squared_sigmas(error, found.covariance)
         result["share"] = float(np.linalg.norm(error) / np.linalg.norm(rate))
         result["claimed"] = float(np.sqrt(np.trace(found.covariance)) / np.linalg.norm(rate))
     return result
 
 
-def summarise(results: Sequence[Result], out: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return availability and errors of each row, and of all rows together."""
-    rows = list(dict.fromkeys((result["row"], result["percent"]) for result in results))
-    table = [
-        {
-            "row": row,
-            "percent": percent,
-            **_figures([r for r in results if (r["row"], r["percent"]) == (row, percent)]),
-        }
-        for row, percent in rows
-    ]
-    total = _figures(results)
+    rows = {name: _figures(own) for name, own in grouped(results, "row", "percent").items()}
     worst = sorted((r for r in results if r["nees"] is not None), key=lambda r: -r["nees"])[:10]
-    return summary({"rows": table, "all": total, "worst": worst})
+    return summary({"rows": rows, "all": _figures(results), "worst": worst})
 
 
 def _figures(results: Sequence[Result]) -> dict[str, Any]:
     answers = [r for r in results if r["nees"] is not None]
     nees, share = np.array([r["nees"] for r in answers]), np.array([r["share"] for r in answers])
-    some = len(answers) > 0
     return {
         "frames": len(results),
         "answers": len(answers),
-        "worst_sigmas": float(np.sqrt(nees.max())) if some else None,
-        "nees": float(nees.mean()) if some else None,
-        "worst_share": float(share.max()) if some else None,
-        "claimed": float(np.median([r["claimed"] for r in answers])) if some else None,
+        "worst_sigmas": largest(np.sqrt(nees)),
+        "nees": mean(nees),
+        "worst_share": largest(share),
+        "claimed": median([r["claimed"] for r in answers]),
         "beyond_sigmas": int(np.count_nonzero(nees > WRONG_SIGMAS**2)),
         "beyond_share": int(np.count_nonzero(share > WRONG_SHARE)),
         "milliseconds": float(np.median([r["milliseconds"] for r in results])),
     }
-
-
-MISMATCH = Campaign(
-    "mismatch",
-    "cameras unlike the model: availability and honesty of the rate, by imperfection",
-    mismatch_cases,
-    run_mismatch,
-    summarise,
-    20,
-)
-VIBRATION = Campaign(
-    "vibration",
-    "a body that shakes during the exposure: availability and honesty of the rate",
-    vibration_cases,
-    run_vibration,
-    summarise,
-    200,
-)

@@ -23,11 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
 from sim_hal.earth_camera import nadir, render
 from tests.pace import warm_call
 from tests.sim_hal.earth_camera.scenes import random_scene
+from tests.studies.campaigns.statistics import grouped, largest, mean, rms, squared_sigmas
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings, random_air
 
 VIEWS = ("sunlit", "terminator")
@@ -79,7 +80,7 @@ def run(case: Case) -> Result:
         **result,
         "error_deg": (size := float(np.degrees(np.linalg.norm(error)))),
         "verdict": WRONG if size > WRONG_DEG or found.nadir.direction @ truth < 0.0 else RIGHT,
-        "nees": float(error @ np.linalg.solve(found.nadir.tangent_covariance, error)),
+        "nees": squared_sigmas(error, found.nadir.tangent_covariance),
         "sigma_deg": float(np.degrees(found.nadir.sigma)),
         "edges": found.nadir.used,
         "residual_px": found.nadir.residual,
@@ -88,14 +89,9 @@ def run(case: Case) -> Result:
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the table of both views with both atmospheres, and the list of notable frames."""
-    rows = [
-        {"view": view, "air": air, **row(of)}
-        for air in AIRS
-        for view in VIEWS
-        if (of := [r for r in results if (r["view"], r["air"]) == (view, air)])
-    ]
-    poor = [r for r in results if _worth_a_line(r)]
-    return summary({"views": rows, "to_look_at": poor})
+    views = {name: row(own) for name, own in grouped(results, "view", "air").items()}
+    notable = [r for r in results if r["verdict"] != RIGHT or r["nees"] > 20.0 or r["warnings"]]
+    return summary({"views": views, "to_look_at": notable})
 
 
 def row(results: Sequence[Result]) -> dict[str, Any]:
@@ -108,27 +104,12 @@ def row(results: Sequence[Result]) -> dict[str, Any]:
         "frames": len(results),
         **{kind: verdicts[kind] for kind in (RIGHT, WRONG)},
         **{kind.value: verdicts[kind.value] for kind in HorizonStatus if kind is not HorizonStatus.FOUND},
-        "rms_deg": float(np.sqrt(np.mean(errors**2))) if answers else None,
+        "rms_deg": rms(errors),
         "p99_deg": float(np.quantile(errors, 0.99)) if answers else None,
-        "worst_deg": float(errors.max()) if answers else None,
-        "nees": float(np.mean([r["nees"] for r in answers])) if answers else None,
+        "worst_deg": largest(errors),
+        "nees": mean([r["nees"] for r in answers]),
         "median_ms": float(np.median(spent)),
         "p95_ms": float(np.quantile(spent, 0.95)),
         "most_ms": float(spent.max()),
         "pixels_read": float(np.mean([r["pixels_read"] for r in results])),
     }
-
-
-def _worth_a_line(result: Result) -> bool:
-    """Return whether a frame is listed: its result is wrong, missing, inconsistent or has a warning."""
-    return bool(result["verdict"] != RIGHT or result["nees"] > 20.0 or result["warnings"])
-
-
-NADIR = Campaign(
-    "nadir",
-    "nadir from frames of the Earth's limb, sunlit and with the terminator; counts frames of each",
-    cases,
-    run,
-    summarise,
-    1000,
-)

@@ -18,10 +18,11 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array, lil_array
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from tests.studies.campaigns.object_chase import FASTEST, FIELD, GAP, NEAREST, SIGHTING, ObjectChase
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
+from tests.studies.campaigns.statistics import grouped, mean
 
 _SIDES = 16
 """Number of sides of the polygons that replace circles in the linear programme.
@@ -193,31 +194,20 @@ def run(case: Case) -> Result:
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each craft and band."""
-    facts: Result = {"rows": []}
-    for craft in AUTHORITY:
-        for number, (low, high) in enumerate(BANDS):
-            mine = [r for r in results if r["craft"] == craft and r["band"] == number]
-            found = [r for r in mine if r["found"] is not None]
-            if not found:
-                continue
-            could, others = [r for r in found if r["could"]], [r for r in found if not r["could"]]
-            lost = [r for r in found if "same" in r]
-            row: Result = {"craft": craft, "low": low, "high": high, "flights": len(mine)}
-            row |= {"found": len(found), "could": len(could), "others": len(others)}
-            row |= {"kept": sum(r["kept"] for r in could), "kept_others": sum(r["kept"] for r in others)}
-            row |= {"out": float(np.mean([r["out"] for r in could])) if could else None}
-            row |= {name: float(np.median([r[name] for r in found])) for name in ("least", "most")}
-            row |= {"roll": max(r["roll"] for r in found), "rate": max(r["rate"] for r in found)}
-            row |= {"lost": len(lost), "again": sum(r["same"] for r in lost)}
-            facts["rows"].append(row)
-    return summary(facts)
-
-
-OBJECT_FLIGHTS = Campaign(
-    "object-flights",
-    "objects found and kept in the field by coils alone, beside what authority allows",
-    cases,
-    run,
-    summarise,
-    10,
-)
+    rows: dict[str, Result] = {}
+    for name, mine in grouped(results, "craft", "band").items():
+        found = [r for r in mine if r["found"] is not None]
+        if not found:
+            continue
+        could, others = [r for r in found if r["could"]], [r for r in found if not r["could"]]
+        lost = [r for r in found if "same" in r]
+        low, high = BANDS[mine[0]["band"]]
+        row: Result = {"low": low, "high": high, "flights": len(mine)}
+        row |= {"found": len(found), "could": len(could), "others": len(others)}
+        row |= {"kept": sum(r["kept"] for r in could), "kept_others": sum(r["kept"] for r in others)}
+        row |= {"out": mean([r["out"] for r in could])}
+        row |= {name: float(np.median([r[name] for r in found])) for name in ("least", "most")}
+        row |= {"roll": max(r["roll"] for r in found), "rate": max(r["rate"] for r in found)}
+        row |= {"lost": len(lost), "again": sum(r["same"] for r in lost)}
+        rows[name] = row
+    return summary({"rows": rows})

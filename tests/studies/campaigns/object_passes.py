@@ -17,20 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, tangent_basis
-from knightcube.astro.quaternion import (
-    attitude_matrix,
-    from_matrix,
-    from_rotation_vector,
-    multiply,
-)
-from knightcube.gnc.tracker import (
-    FrameSightings,
-    LineOfSightState,
-    ObjectTracker,
-    TrackSettings,
-)
+from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
+from knightcube.gnc.tracker import FrameSightings, LineOfSightState, ObjectTracker, TrackSettings
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
@@ -40,6 +30,7 @@ from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
+from tests.studies.campaigns.statistics import grouped, mean, rms, squared_sigmas
 from tests.support.object_passes import Pass, a_pass
 from tests.support.scenes import catalogue
 from tests.support.streak_bound import star_information
@@ -217,23 +208,16 @@ def _nees(line: LineOfSightState, frame: _Frame) -> list[float]:
     """Return the NEES of a track's direction and of its rate, each with two degrees of freedom."""
     basis = tangent_basis(line.direction)
     found = []
-    for error, part in (
-        (frame.place - line.direction, slice(0, 3)),
-        (frame.motion - line.rate, slice(3, 6)),
-    ):
+    for error, part in ((frame.place - line.direction, slice(0, 3)), (frame.motion - line.rate, slice(3, 6))):
         across = basis @ error
-        found.append(float(across @ np.linalg.solve(basis @ line.covariance[part, part] @ basis.T, across)))
+        found.append(squared_sigmas(across, basis @ line.covariance[part, part] @ basis.T))
     return found
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each duration and magnitude."""
-    rows = []
-    for length in ("short", "long"):
-        for magnitude in MAGNITUDES:
-            own = [r for r in results if (r["length"], r["magnitude"]) == (length, magnitude)]
-            row = _row(own)
-            rows.append({"length": length, "magnitude": magnitude, **row})
+    shown = [result for result in results if result["magnitude"] is not None]
+    rows = {name: _row(own) for name, own in grouped(shown, "length", "magnitude").items()}
     empty = [result for result in results if result["magnitude"] is None]
     frames = sum(frame["solved"] for result in empty for frame in result["frames"])
     false = sum(result["false_tracks"] for result in results)
@@ -251,17 +235,7 @@ def _row(own: Sequence[Result]) -> Result:
     row: Result = {"passes": len(own), "found": len(found), "judged": len(made)}
     row |= {"frames": sum(len(result["frames"]) for result in own), "seen": len(seen)}
     for name in ("error", "claim", "bound"):
-        row[name] = math.sqrt(float(np.mean([frame[name] ** 2 for frame in seen]))) if seen else None
+        row[name] = rms([frame[name] for frame in seen])
     row["nees"] = np.mean(made, axis=0).tolist() if made else None
     off = [2.0 * (frame["error"] / frame["claim"]) ** 2 for frame in seen]
-    return row | {"sighting_nees": float(np.mean(off)) if off else None}
-
-
-OBJECT_PASSES = Campaign(
-    "object-passes",
-    "passes of objects in rendered frames: errors of sightings and tracks, and false tracks",
-    cases,
-    run,
-    summarise,
-    10,
-)
+    return row | {"sighting_nees": mean(off)}

@@ -15,14 +15,14 @@ from sgp4.api import WGS72, Satrec
 from sgp4.exporter import export_tle
 
 from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from flight.schema.orbit import OrbitConfig, TargetStep
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitEnvironment
-from tests.support.flights import CONFIG
+from tests.support.unlike_body import configured
 
 MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
 DURATION = 100.0
@@ -34,8 +34,6 @@ FRAME_PERIOD = 2.5
 WIDE_OFTEN = {"period": 2.0, "fine_period": 2.0, "max_age": 4.5}
 OLD_DAYS, OLD_OFF = 7.0, 4.0
 """Age (days) of the old element set, and its along-track error (s): 30 km [assumed for a week]."""
-ORBIT = CONFIG.parent / "orbit.yaml"
-TEXT = ORBIT.read_text(encoding="utf-8")
 _JULIAN = 2_440_587.5
 
 
@@ -44,7 +42,7 @@ def config_for(mode: str, elements: str = "", replans: bool = False, wide_often:
 
     If `wide_often`, each horizon camera takes an image every 2 s, even if none is needed.
     """
-    config = _orbit()
+    config, _ = _described()
     assert config.camera is not None
     assert config.gps is not None
     camera = configuration.replace(
@@ -74,7 +72,7 @@ def config_for(mode: str, elements: str = "", replans: bool = False, wide_often:
 
 def world_for(mode: str, seed: int, faults: tuple[FaultEntry, ...]) -> Simulation:
     """Return the world of a flight, with the attitude at release that the mode requires."""
-    section = _world()
+    _, section = _described()
     assert section.free_body is not None
     speed = SPEEDS.get(mode, 0.001)
     release = configuration.replace(section.free_body.release, speed=speed, attitude=release_attitude())
@@ -105,7 +103,7 @@ def release_attitude() -> tuple[float, float, float, float]:
 @cache
 def old_elements() -> tuple[str, str]:
     """Return the configured elements as a week-old set that is wrong by `OLD_OFF` s along the orbit."""
-    config = _orbit()
+    config, _ = _described()
     assert config.elements is not None
     known = Satrec.twoline2rv(*config.elements)
     wanted = TwoLineElements(*config.elements).at(_begin() + OLD_OFF / 86_400.0)
@@ -136,19 +134,12 @@ def old_elements() -> tuple[str, str]:
 
 
 @cache
-def _orbit() -> OrbitConfig:
-    return as_orbit(configuration.load(ORBIT))
-
-
-@cache
-def _world() -> Simulation:
-    section = configuration.simulation_section(TEXT, str(ORBIT), Simulation)
-    assert section is not None
-    return section
+def _described() -> tuple[OrbitConfig, Simulation]:
+    return configured("orbit")
 
 
 def _body() -> FreeBody:
-    section = _world()
+    _, section = _described()
     assert section.free_body is not None
 
     def no_currents() -> FloatArray:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.link.events import EVENTS, EventKind, Severity
 from flight.link.modes import POINTING, Mode
 from flight.link.telemetry.packets import to_text
 from ground.campaigns.runner import Result
@@ -16,25 +15,27 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.faults.catalogue import FaultKind
-from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY
-from tests.studies.campaigns.fault_table import OWN, own_events, part_of
+from tests.studies.campaigns.fault_judgement import (
+    BLIND_GRACE,
+    CYCLE,
+    DRIVEN,
+    FEW,
+    LOOKED,
+    OWN,
+    differs,
+    events_of,
+    own_events,
+    part_of,
+    warnings_in,
+)
 from tests.studies.campaigns.orbit_fault_flights import DURATION
 
-CYCLE = 0.025
-REPORTED_WITHIN = 20.0
-"""Longest time (s) after the end of a fault until its event; later events have another cause."""
-BLIND_GRACE, FIELD_GRACE = 0.1, 5.0
-"""Longest times (s) to zero current: after the last reading, and after the last valid field."""
-ZERO, DRIVEN = 1e-3, 6e-3
-"""Largest current (A) of a coil that is off, and smallest current (A) of a driven coil."""
+FIELD_GRACE = 5.0
+"""Longest time (s) to zero current after the last valid field."""
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 """Largest errors of an acceptable attitude: in claimed standard deviations, and in rad."""
 DIPOLE_PER_AMPERE = 0.648
 """Dipole moment per current (A m^2/A) of the coils of config/orbit.yaml."""
-LOOKED, FEW = 3.0, 3
-"""Time (s) after a bit flip within which an effect is expected, and largest number of missing IMU samples
-that does not count as an effect.
-"""
 LAST = 12.0
 """Duration (s) of the end of a flight, in which the body must meet the requirements of its mode (`works`)."""
 SET_UP = 0.53
@@ -57,20 +58,14 @@ ORBIT_OWN: Mapping[str, frozenset[str]] = {
 }
 """Events that report a fault of a device in orbit, in addition to those of its stream."""
 _STREAMS = {"imu": ("imu", "field"), "magnetometer": ("field",), "gps": ("gps",), "camera": ("camera",)}
-_KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
 _AT_ZERO_COMMAND = ("bridge", "coil", "pwm", "bus")
 """Faults with which a coil may carry current although none is commanded."""
 
 
 def judge(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> Result:
     """Return the evaluation of a fault from `at` to `end` s."""
-    reported = [(float(e["time_ns"]) * 1e-9, to_text(e["name"]), to_text(e["text"])) for e in flown["event"]]
-    warned = [
-        (time, name, text)
-        for time, name, text in reported
-        if at - 1e-6 <= time < min(end + REPORTED_WITHIN, DURATION - CYCLE)
-        and _KINDS[name].severity is not Severity.INFORMATION
-    ]
+    reported = events_of(flown)
+    warned = warnings_in(reported, at, end, DURATION)
     own = [(time, name) for time, name, text in warned if is_own(kind, name, text)]
     return {
         "at": at,
@@ -161,8 +156,7 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
     asked = np.abs(flown["attitude"]["dipole"]).sum(axis=1) / DIPOLE_PER_AMPERE
     behind = round(10.0 * (kind.parameters["delay"].default or 0.0))
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
-    differs = np.abs(asked - before) > OFF_SURELY + GAIN_ERROR * np.maximum(asked, before)
-    return bool((differs & inside).sum() > 10)
+    return bool((differs(asked, before) & inside).sum() > 10)
 
 
 def _long(driven: BoolArray) -> bool:

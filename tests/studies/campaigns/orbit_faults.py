@@ -7,8 +7,7 @@ that is wrong from the start. The campaign checks whether a specific event repor
 body meets the requirements of its mode at the end, and the current of coils that were driven without valid
 data, sensor by sensor (readings, field, attitude). It also checks for how long the coils were driven by an
 attitude whose error exceeded both five claimed standard deviations and 0.1 deg. A fault of an unused part (a
-coil that is not driven, a camera that is idle) counts as not exercised. `refly(seed, number)` repeats one
-flight.
+coil that is not driven, a camera that is idle) counts as not exercised.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from sim_hal.faults.catalogue import CATALOGUE, FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
@@ -74,14 +73,10 @@ def run(case: Case) -> Result:
     name, mode = case.parameters["fault"], case.parameters["mode"]
     rng = np.random.default_rng(case.seed)
     kind, at, span = _when(name, mode, rng)
-    entries = tuple(FaultEntry(fault=text, at=at, span=span) for text in _texts(name))
-    facts = fly_with(kind, mode, entries, int(rng.integers(1, 2**31)), _elements(name))
+    condition = CONDITIONS.get(name, Condition("", (name,)))
+    entries = tuple(FaultEntry(fault=text, at=at, span=span) for text in condition.faults)
+    facts = fly_with(kind, mode, entries, int(rng.integers(1, 2**31)), condition.elements)
     return {"number": case.seed[-1], "fault": name, "mode": mode, **facts}
-
-
-def refly(seed: int, number: int) -> Result:
-    """Repeat one flight of the campaign with this seed."""
-    return run(cases(number + 1, seed)[number])
 
 
 def fly_with(
@@ -102,8 +97,7 @@ def _when(name: str, mode: str, rng: np.random.Generator) -> tuple[FaultKind, fl
 
     The fault starts before the first plan, before the first attitude, or after both.
     """
-    condition = CONDITIONS.get(name)
-    if condition is not None:
+    if name in CONDITIONS:
         device, _, kind = name.partition(": ")
         return FaultKind(device, kind, name, None), 0.0, None
     known = CATALOGUE[name]
@@ -115,19 +109,8 @@ def _when(name: str, mode: str, rng: np.random.Generator) -> tuple[FaultKind, fl
     return known, at, None if lasting else float(rng.uniform(9.0, 16.0))
 
 
-def _texts(name: str) -> tuple[str, ...]:
-    condition = CONDITIONS.get(name)
-    return (name,) if condition is None else condition.faults
-
-
-def _elements(name: str) -> str:
-    condition = CONDITIONS.get(name)
-    return "" if condition is None else condition.elements
-
-
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each fault with a cell for each mode, and all defects found."""
-    del folder
     by_cell: dict[str, dict[str, list[Result]]] = {}
     for result in results:
         by_cell.setdefault(result["fault"], {}).setdefault(result["mode"], []).append(result)
@@ -156,13 +139,3 @@ def _named(result: Result) -> str:
     return (
         f"{result['fault']}, {result['mode']}, {span}, number {result['number']}; {figures}; reported: {said}"
     )
-
-
-ORBIT_FAULTS = Campaign(
-    "orbit-faults",
-    "every fault of an orbit's devices in every mode of the satellite",
-    cases,
-    run,
-    summarise,
-    default_runs=500,
-)

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.rigid_body import BodyErrors
 from sim_hal.description_errors import DescriptionErrors
@@ -41,6 +41,7 @@ from sim_hal.worlds.free_body import CRAFTS
 from tests.studies.campaigns.detumble import description
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, PointingFlight
+from tests.studies.campaigns.statistics import mean, median, rms
 
 REVOLUTION = 5_700.0
 LOST = 60.0
@@ -150,7 +151,7 @@ def _hold(notes: FloatArray, seconds: float) -> Result:
         "worst": float(np.linalg.norm(turns, axis=1).max()),
         "knowledge_rms": float(np.degrees(np.sqrt(np.mean(judged[:, 4] ** 2)))),
         "nees": float(np.mean(judged[:, 5])),
-        "dipole_missing": [_rms(judged[at, 6]) for at in (lit, ~lit)],
+        "dipole_missing": [rms(judged[at, 6]) for at in (lit, ~lit)],
         "mean_square": float(np.mean(judged[:, 8])),
     }
 
@@ -177,10 +178,6 @@ def _arrival(wanted: dict[str, Any], notes: FloatArray) -> Result:
         "end_rms": float(np.sqrt(np.mean(off[-180:] ** 2))),
         "mean_square": float(np.mean(notes[:, 8])),
     }
-
-
-def _rms(values: FloatArray) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
@@ -236,9 +233,9 @@ def _in_heavy_air(mine: Sequence[Result]) -> dict[str, Any]:
         "stars": sum(r["stars"] for r in mine),
         "rejected": sum(r["rejected"] for r in mine),
         "in_a_row": max(r["rejected_in_a_row"] for r in mine),
-        "known": float(np.median([r["knowledge_rms"] for r in judged])) if judged else None,
-        "nees": float(np.mean([r["nees"] for r in judged])) if judged else None,
-        "nadir": float(np.median([r["nadir_rms"] for r in judged])) if judged else None,
+        "known": median([r["knowledge_rms"] for r in judged]),
+        "nees": mean([r["nees"] for r in judged]),
+        "nadir": median([r["nadir_rms"] for r in judged]),
         "nadir_worst_run": max((r["nadir_rms"] for r in judged), default=None),
     }
 
@@ -250,18 +247,8 @@ def _turned(mine: Sequence[Result], watts: float) -> dict[str, Any]:
         "runs": len(mine),
         "lost": sum(r["lost"] for r in mine),
         "arrived": len(times),
-        "median": float(np.median(times)) if times else None,
+        "median": median(times),
         "worst": max(times, default=None),
         "end": float(np.median([r["end_rms"] for r in mine])),
         "milliwatts": 1e3 * watts * float(np.median([r["mean_square"] for r in mine])),
     }
-
-
-ORBIT_POINTING = Campaign(
-    "orbit-pointing",
-    "turns to nadir, Sun and inertial attitudes and their hold by coils alone, all disturbances",
-    cases,
-    run,
-    summarise,
-    20,
-)

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from flight.bodies.orbit.guidance import REST
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import box_areas
 from knightcube.astro.earth.ephemeris import predict
@@ -221,11 +221,7 @@ def cases(runs: int, seed: int) -> list[Case]:
     bodies: list[tuple[str, dict[str, Any]]] = [(str(share), {"share": share}) for share in SHARES]
     bodies.append(("unknown", {"share": UNKNOWN_SHARE, "unknown": True, "learn": FIRST}))
     return [
-        Case(
-            f"{craft}/{run}/{name}",
-            (seed, run),
-            {"craft": craft, "orbit": ("sso", "iss")[run % 2], **body},
-        )
+        Case(f"{craft}/{run}/{name}", (seed, run), {"craft": craft, "orbit": ("sso", "iss")[run % 2], **body})
         for run in range(runs)
         for craft in HORIZON
         for name, body in bodies
@@ -266,8 +262,3 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
                 "worst_heat": float(heat.max()),
             }
     return summary({"slews": slews})
-
-
-ORBIT_SLEWS = Campaign(
-    "orbit-slews", "slews by coils alone of a described and of an unknown body", cases, run, summarise, 40
-)

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.link import events
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.telemetry import read_run
 from hal.buses import system
 from sim_hal.serving.device_link import RemoteI2cBus
@@ -153,9 +153,8 @@ def _reported(folder: Path) -> dict[str, int]:
     return {**found, "guardian": int(lost.sum() + log["suppressed"][lost].sum())}
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the number of reported deaths, the times until the coils were off, and what remained."""
-    del folder
     acts: Counter[str] = sum((Counter(result["acts"]) for result in results), Counter())
     reported = sum(
         (
@@ -178,13 +177,3 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "left": [path for result in results for path in result["left"]],
     }
     return summary(facts)
-
-
-PROCESS_KILL = Campaign(
-    "process-kill",
-    "kill -9 and SIGSTOP of workers, guardian and flight, in real time (use --workers 1)",
-    cases,
-    run,
-    summarise,
-    default_runs=500,
-)

@@ -22,7 +22,7 @@ import numpy as np
 
 from flight.link.process.commanding import Stage
 from flight.link.process.directives import KINDS, Confirm
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from tests.deploy.renewed_board import RenewedBoard
 from tests.deploy.renewed_ends import RenewedEnds, linked_text
 
@@ -150,9 +150,8 @@ def _step(ends: RenewedEnds, rng: np.random.Generator) -> bool:
     return False
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the versions in use after the trials, and the cases that ended wrongly."""
-    del folder
     wrong = [
         result
         for result in results
@@ -165,13 +164,3 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     killed = sum(result["killed"] for result in results)
     facts = {"trials": len(results), "killed": killed, "which": dict(sorted(which.items())), "wrong": wrong}
     return summary(facts)
-
-
-RENEWAL_TRIALS = Campaign(
-    "renewal-trials",
-    "renewals over the link with flaws and kills: the old or the new version flies, and the link answers",
-    cases,
-    run,
-    summarise,
-    default_runs=200,
-)

@@ -1,23 +1,28 @@
-"""Campaign `resting`: attitudes from frames with slow star motion, of cameras that differ from the model.
+"""Campaigns `resting` and `streaked`: attitudes from frames of cameras that differ from the model.
 
 The frames have each of `imperfections.IMPERFECTIONS`, streaks of 0, 1 and 3 px, an exposure of 0.2 s and the
-priors of a flight. `supersampled` renders them. The error of an attitude is given in claimed standard
-deviations (the square root of its NEES). More than 6 counts as confidently wrong. A displaced optical axis,
-or a point spread function with a displaced centroid, rotates all attitudes by the same angle. A flight
-calibrates this rotation, as part of its mounting, with the same stars. In these rows (`SHIFTED`) the median
-error is subtracted, and the prior includes the displaced axis. The row `none` has an exactly known lens; all
-others have the default uncertainty of an uncalibrated lens.
+priors of a flight. The frames of `streaked` have streaks of 10, 20 and 40 px in the centre, and the rotation
+about the boresight is at most that across it. Their additional cameras have rolling shutters of 0, 20 and 30
+us per row, with known and unknown line time. `supersampled` renders the frames.
+
+The error of an attitude is given in claimed standard deviations (the square root of its NEES). More than 6
+counts as confidently wrong. A displaced optical axis, or a point spread function with a displaced centroid,
+rotates all attitudes by the same angle. A flight calibrates this rotation, as part of its mounting, with the
+same stars. In these rows (`SHIFTED`) the median error is subtracted, and the prior includes the displaced
+axis. The row `none` has an exactly known lens; all others have the default uncertainty of an uncalibrated
+lens.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import (
     attitude_matrix,
@@ -36,12 +41,22 @@ from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.mismatch import WRONG_SIGMAS, detected
+from tests.studies.campaigns.statistics import grouped, largest, mean, rms, squared_sigmas
 from tests.support.scenes import FIELD, catalogue
 from tests.support.supersampled import Sky, light
 
 EXPOSURE = 0.2
-TRAILS = (0.0, 1.0, 3.0)
-"""Lengths of the streaks (px)."""
+TRAILS, STREAKS = (0.0, 1.0, 3.0), (10.0, 20.0, 40.0)
+"""Lengths (px) of the streaks of `resting` and of `streaked`."""
+ROLLING = (0.0, 20e-6, 30e-6)
+"""Line times (s) of the additional cameras of `streaked`."""
+SHUTTERS = {
+    f"rolling {1e6 * line_time:.0f} us, {'stated' if stated else 'unstated'}": Imperfection(
+        line_time=line_time, known={"line_time": line_time if stated else None}
+    )
+    for line_time in ROLLING
+    for stated in (True, False)
+}
 _PRIOR = 1e-4
 """Standard deviations (rad and rad/s) of the predicted attitude and rate."""
 SHIFTED = ("coma", "axis 5 px off")
@@ -50,9 +65,18 @@ CAMERA = StarCameraModel(columns=512, rows=512, field_of_view=FIELD)
 
 def cases(runs: int, seed: int) -> list[Case]:
     """Return `runs` frames of each imperfection and length."""
+    return _cases(IMPERFECTIONS, TRAILS, runs, seed)
+
+
+def streaked_cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` frames of each camera of `streaked` and length."""
+    return _cases(SHUTTERS | IMPERFECTIONS, STREAKS, runs, seed)
+
+
+def _cases(rows: Iterable[str], lengths: Sequence[float], runs: int, seed: int) -> list[Case]:
     return [
-        Case(f"{name} {trail:g} {run}", (seed, cell, run), {"row": name, "trail": trail})
-        for cell, (name, trail) in enumerate((name, trail) for name in IMPERFECTIONS for trail in TRAILS)
+        Case(f"{name} {length:g} {run}", (seed, cell, run), {"row": name, "trail": length})
+        for cell, (name, length) in enumerate(product(rows, lengths))
         for run in range(runs)
     ]
 
@@ -60,6 +84,11 @@ def cases(runs: int, seed: int) -> list[Case]:
 def run(case: Case) -> Result:
     """Solve one frame of an imperfect camera, and evaluate its attitude."""
     return look_at(case, IMPERFECTIONS[case.parameters["row"]], 0.0)
+
+
+def streaked_run(case: Case) -> Result:
+    """Solve one frame of streaks, and evaluate its attitude."""
+    return look_at(case, (SHUTTERS | IMPERFECTIONS)[case.parameters["row"]], 1.0)
 
 
 def look_at(case: Case, imperfection: Imperfection, about: float) -> Result:
@@ -133,19 +162,9 @@ def job(
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return attitudes and errors of each row, and of all rows."""
-    named = dict.fromkeys(result["row"] for result in results)
-    judged = [judged for row in named for judged in _judged([r for r in results if r["row"] == row])]
-    rows = list(dict.fromkeys((result["row"], result["trail"]) for result in judged))
-    table = [
-        {
-            "row": row,
-            "trail": trail,
-            **_figures([r for r in judged if (r["row"], r["trail"]) == (row, trail)]),
-        }
-        for row, trail in rows
-    ]
-    total = _figures(judged)
-    return summary({"rows": table, "all": total})
+    judged = [one for own in grouped(results, "row").values() for one in _judged(own)]
+    rows = {name: _figures(own) for name, own in grouped(judged, "row", "trail").items()}
+    return summary({"rows": rows, "all": _figures(judged)})
 
 
 def _judged(results: Sequence[Result]) -> list[Result]:
@@ -161,7 +180,7 @@ def _judged(results: Sequence[Result]) -> list[Result]:
             off, covariance = np.array(result["error"]) - shift, np.array(result["covariance"])
             across = CAMERA.pinhole.focal_length / np.sqrt(2.0)
             figures = {
-                "nees": float(off @ np.linalg.solve(covariance, off)),
+                "nees": squared_sigmas(off, covariance),
                 "off": float(np.linalg.norm(off[:2])) * across,
                 "claim": float(np.sqrt(np.trace(covariance[:2, :2]))) * across,
             }
@@ -172,26 +191,11 @@ def _judged(results: Sequence[Result]) -> list[Result]:
 def _figures(results: Sequence[Result]) -> Result:
     answers = [result for result in results if result["nees"] is not None]
     nees = np.array([result["nees"] for result in answers])
-    some = len(answers) > 0
-    rms = {
-        name: float(np.sqrt(np.mean([result[name] ** 2 for result in answers]))) if some else None
-        for name in ("off", "claim")
-    }
     return {
         "frames": len(results),
         "attitudes": len(answers),
-        "nees": float(nees.mean()) if some else None,
-        "worst": float(np.sqrt(nees.max())) if some else None,
+        "nees": mean(nees),
+        "worst": largest(np.sqrt(nees)),
         "beyond": int(np.count_nonzero(nees > WRONG_SIGMAS**2)),
-        **rms,
+        **{name: rms([result[name] for result in answers]) for name in ("off", "claim")},
     }
-
-
-RESTING = Campaign(
-    "resting",
-    "attitudes of frames whose stars hardly move: claims of cameras like and unlike the model",
-    cases,
-    run,
-    summarise,
-    10,
-)

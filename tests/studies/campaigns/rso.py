@@ -18,6 +18,7 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.streak_result import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.pace import warm_call
+from tests.studies.campaigns.statistics import median
 from tests.support.scenes import SAMPLES, catalogue
 
 EXPOSURE = 0.5
@@ -129,11 +130,6 @@ def by_magnitude(results: Sequence[Result], magnitude: float) -> dict[str, Any]:
         "magnitude": magnitude,
         "frames": len(here),
         "found": len(errors),
-        "error_px": float(np.median(errors)) if errors else None,
+        "error_px": median(errors),
         "false": sum(r["false"] for r in here),
     }
-
-
-def number(value: float | None, digits: int) -> str:
-    """Return a number as text, or a dash if the number is missing."""
-    return "-" if value is None else f"{value:.{digits}f}"

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
@@ -29,6 +29,7 @@ from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import sun_position
 from tests.studies.campaigns.detumble import SAMPLES_NS, hash_of
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
+from tests.studies.campaigns.statistics import grouped, largest, median, rms
 
 AXIS = np.array([0.0, 0.0, 1.0])
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
@@ -137,29 +138,18 @@ def judged(notes: FloatArray, settled: float) -> Result:
     ]
     return {
         "found": float(times[near][0]) if near.any() else None,
-        "rms": _rms(off[later & sunlit]),
-        "rms_dark": _rms(off[later & ~sunlit]),
-        "worst": float(off[later & sunlit].max()) if (later & sunlit).any() else None,
+        "rms": rms(off[later & sunlit]),
+        "rms_dark": rms(off[later & ~sunlit]),
+        "worst": largest(off[later & sunlit]),
         "again": max(again, default=None),
         "missed": int(not near.any()) + len(returns) - len(again),
         "fastest_deg": float(rate.max()),
     }
 
 
-def _rms(values: FloatArray) -> float | None:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else None
-
-
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the errors of the axis towards the Sun, by satellite and by share of the worst torques."""
-    facts: dict[str, Any] = {}
-    for craft in CRAFT:
-        for share in SHARES:
-            mine = [result for result in results if (result["craft"], result["share"]) == (craft, share)]
-            if not mine:
-                continue
-            facts[f"{craft}/{share}"] = _figures(mine)
-    return summary(facts)
+    return summary({name: _figures(own) for name, own in grouped(results, "craft", "share").items()})
 
 
 def _figures(mine: Sequence[Result]) -> dict[str, Any]:
@@ -173,18 +163,8 @@ def _figures(mine: Sequence[Result]) -> dict[str, Any]:
         "median": float(np.median(lit)),
         "p95": float(np.percentile(lit, 95.0)),
         "worst": float(lit.max()),
-        "dark": float(np.median(dark)) if dark else None,
+        "dark": median(dark),
         "found": max((result["found"] for result in mine if result["found"] is not None), default=None),
         "again": max((result["again"] for result in mine if result["again"] is not None), default=None),
         "fastest_deg": max(result["fastest_deg"] for result in mine),
     }
-
-
-SAFE_SUN = Campaign(
-    "safe-sun",
-    "SAFE turns to the Sun by solar strings, gyro and magnetometer alone, and holds it",
-    cases,
-    run,
-    summarise,
-    20,
-)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import CameraKnowledge, Pinhole
@@ -32,10 +32,11 @@ from knightcube.vision.startracker.survey import DetectionSettings
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.imperfections import IMPERFECTIONS
-from tests.studies.campaigns.mismatch import LEAST_USABLE, attitudes_of, detected, seen_stars
-from tests.support.scenes import FIELD, catalogue, noise_floor
+from tests.studies.campaigns.mismatch import detected, mean_rate, usable_sky
+from tests.studies.campaigns.statistics import mean, squared_sigmas
+from tests.support.scenes import FIELD, noise_floor
 from tests.support.streak_bound import rate_bound
-from tests.support.supersampled import Optics, Sky, gaussian, light, through_lens
+from tests.support.supersampled import Optics, gaussian, light, through_lens
 
 ROWS = ("default", "field", "distortion", "shift")
 FRAMES = 14
@@ -91,24 +92,17 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 def expose(lens: TrueLens, rng: np.random.Generator) -> tuple[Image, FloatArray, FloatArray]:
     """Return a frame of a random field, the true rate (3,), rad/s, and its bound (3, 3)."""
-    stars, directions = catalogue(8.5)
-    sky = Sky(directions, _CAMERA.electrons(stars.magnitude, EXPOSURE))
-    for _ in range(1000):
-        given = {
+    given, attitudes, chosen = usable_sky(
+        _CAMERA,
+        EXPOSURE,
+        lambda: {
             "theta": float(rng.uniform(0.0, 90.0)),
             "percent": float(rng.uniform(5.0, 30.0)),
             "exposure": EXPOSURE,
-        }
-        attitudes = attitudes_of(given, _CAMERA, rng)
-        near, good = seen_stars(_CAMERA, sky, attitudes, EXPOSURE)
-        if good >= LEAST_USABLE:
-            break
-    begin, middle, end = attitude_matrix(attitudes(np.array([-0.5, 0.0, 0.5])))
-    turned = begin @ end.T  # from the axes at the end to those at the start
-    angle = np.arccos(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0))
-    axis = np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
-    rate = axis * angle / (2.0 * np.sin(angle)) / EXPOSURE
-    chosen = Sky(directions[near], sky.electrons[near])
+        },
+        rng,
+    )
+    rate, middle = mean_rate(attitudes, EXPOSURE), attitude_matrix(attitudes(np.zeros(1)))[0]
     length = 1.3 * given["percent"] / 100.0 * SIZE
     delay = lens.line_time / EXPOSURE
     electrons = light(lens.pinhole, lens.optics, chosen, attitudes, length, delay, rng)
@@ -169,7 +163,7 @@ def _judged(found: FrameFound, rate: FloatArray, bound: FloatArray) -> dict[str,
     return {
         "status": motion.status.value,
         "solved": solved,
-        "nees": float(error @ np.linalg.solve(motion.covariance, error)),
+        "nees": squared_sigmas(error, motion.covariance),
         "claim": math.sqrt(float(np.trace(motion.covariance) / np.trace(bound))),
         "error": math.sqrt(float(error @ error / np.trace(bound))),
     }
@@ -180,7 +174,7 @@ def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
     values, covariance = lens.learned
     error, unit = values[:6] - true.parameters(), np.sqrt(np.diag(covariance)[:6])
     scaled = error / unit
-    nees = float(scaled @ np.linalg.solve(covariance[:6, :6] / np.outer(unit, unit), scaled))
+    nees = squared_sigmas(scaled, covariance[:6, :6] / np.outer(unit, unit))
     return {
         "lens_nees": nees,
         "lens_sigma": unit.tolist(),
@@ -190,9 +184,8 @@ def _lens_error(lens: LensKnowledge, true: TrueLens) -> dict[str, Any]:
     }
 
 
-def summarise(results: Sequence[Result], out: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return claimed uncertainties and NEES by row, before and after the lens is estimated."""
-    del out
     facts: dict[str, dict[str, Any]] = {}
     for row in ROWS:
         frames = [f for r in results if r["row"] == row for f in r["frames"]]
@@ -202,7 +195,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
             for name, (least, most) in stages.items()
         }
         last = [r["frames"][-1] for r in results if r["row"] == row]
-        facts[row]["lens_nees"] = float(np.mean([f["lens_nees"] for f in last])) if last else None
+        facts[row]["lens_nees"] = mean([f["lens_nees"] for f in last])
         facts[row]["contradictions"] = [f["contradictions"] for f in last]
     return summary(facts)
 
@@ -221,13 +214,3 @@ def _row(frames: Sequence[Result]) -> dict[str, Any]:
         "claim_over_bound": float(np.median(claim)),
         "error_over_bound": float(np.sqrt(np.mean(error**2))),
     }
-
-
-SELF_CALIBRATION = Campaign(
-    "self-calibration",
-    "a lens learned from its own solved frames: claims of rates over their bound, NEES of rates and lens",
-    cases,
-    run,
-    summarise,
-    10,
-)

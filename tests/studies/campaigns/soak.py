@@ -23,7 +23,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Telemetry
 from flight.schema.testbed import Step, TestbedConfig
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.faults import faults
@@ -160,9 +160,8 @@ def broken(result: Result) -> list[str]:
     return [name for name, wrong in found.items() if wrong]
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the worst value of each result, and the flights that exceeded a limit."""
-    del folder
     worst: dict[str, Any] = {
         key: max(result[key] for result in results)
         for key in ("memory_slope", "log_bytes", "largest_current_a", "pointing_deg")
@@ -171,13 +170,3 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     faults_met = sum(result["faults"] for result in results)
     hours = sum(result["seconds"] for result in results) / HOUR_S
     return summary({"hours": hours, "faults": faults_met, **worst, "broken": wrong})
-
-
-SOAK = Campaign(
-    "soak",
-    "hours of simulated flight with random faults: memory, files, currents, pointing (--hours)",
-    cases,
-    run,
-    summarise,
-    default_runs=24,
-)

@@ -31,7 +31,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 from flight.app.service import FlownConfig, sum_file
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
 
@@ -258,13 +258,3 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         "longest_s": max((fault["took_s"] for fault in flew), default=0.0),
     }
     return summary(facts)
-
-
-START = Campaign(
-    "start",
-    "every system call of a board's start fails once: it flies, or waits and flies",
-    cases,
-    run,
-    summarise,
-    400,
-)

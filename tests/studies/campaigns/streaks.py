@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.errors import FlightError
 from knightcube.reference.corner_streak_rate import attitudes_of_ends, cornerness, estimate_rate
@@ -31,6 +31,7 @@ from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.streak_result import LikelihoodSettings, StreakStatus
 from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.statistics import mean, median, rms, squared_sigmas
 from tests.support.attitude_errors import attitude_error, error_in_pixels
 from tests.support.scenes import BRIGHTEST, FIELD, Scene, faintest, noise_floor, slew, usable
 from tests.support.streak_bound import rate_bound
@@ -80,7 +81,7 @@ def run(case: Case) -> Result:
     return see(case, StarCameraModel(field_of_view=FIELD))
 
 
-def run_thesis(case: Case) -> Result:
+def thesis_run(case: Case) -> Result:
     """Run every estimator on one frame of the thesis's camera."""
     exposure = case.parameters["percent"] / 100.0 * FIELD / THESIS_RATE
     return see(case, THESIS_CAMERA, exposure, THESIS_BIAS, faintest(BRIGHTEST))
@@ -172,7 +173,7 @@ def _errors(found: Any, scene: Scene, camera: StarCameraModel) -> Result:
         "status": "rate",
         "magnitude": float(np.linalg.norm(found.rate)) / size - 1.0,
         "vector": float(np.linalg.norm(error)) / size,
-        "nees": float(error @ np.linalg.solve(found.covariance, error)),
+        "nees": squared_sigmas(error, found.covariance),
         "whole_px": whole,
         "across_px": across,
     }
@@ -204,7 +205,7 @@ def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float 
     return whole, across
 
 
-def summarise(results: Sequence[Result], out: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the table by cell and estimator, the table of the thesis, and Figures 3.7 to 3.10."""
     cells = []
     for theta in THETAS_DEG:
@@ -218,22 +219,19 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
 
 def _cell(results: Sequence[Result]) -> dict[str, Any]:
     bounds = np.array([r["bound"] for r in results if r["bound"] is not None]).reshape(-1, 2)
-    row: dict[str, Any] = {
-        "bound_magnitude": _rms(bounds[:, 0]),
-        "bound_vector": _rms(bounds[:, 1]),
-    }
+    row: dict[str, Any] = {"bound_magnitude": rms(bounds[:, 0]), "bound_vector": rms(bounds[:, 1])}
     for name in ESTIMATORS:
         good = [r for r in results if r[name]["status"] == "rate" and r["bound"] is not None]
         own = np.array([r["bound"] for r in good]).reshape(-1, 2)
         row[name] = {
             "rates": len(good),
-            "magnitude": _rms(np.array([r[name]["magnitude"] for r in good])),
-            "vector": _rms(np.array([r[name]["vector"] for r in good])),
+            "magnitude": rms(np.array([r[name]["magnitude"] for r in good])),
+            "vector": rms(np.array([r[name]["vector"] for r in good])),
             "ratio_magnitude": _ratio([r[name]["magnitude"] for r in good], own[:, 0]),
             "ratio_vector": _ratio([r[name]["vector"] for r in good], own[:, 1]),
-            "nees": _mean([r[name]["nees"] for r in good]),
-            "across_px": _mean([r[name]["across_px"] for r in good if r[name]["across_px"] is not None]),
-            "whole_px": _mean([r[name]["whole_px"] for r in good if r[name]["whole_px"] is not None]),
+            "nees": mean([r[name]["nees"] for r in good]),
+            "across_px": mean([r[name]["across_px"] for r in good if r[name]["across_px"] is not None]),
+            "whole_px": mean([r[name]["whole_px"] for r in good if r[name]["whole_px"] is not None]),
         }
     return row
 
@@ -247,36 +245,16 @@ def _overall(results: Sequence[Result]) -> list[dict[str, Any]]:
     rows = []
     for percent in PERCENTS:
         here = [r for r in results if r["percent"] == percent and r["bound"] is not None]
-        good = [r for r in here if r[LIKELIHOOD]["status"] == "rate"]
-        own = np.array([r["bound"] for r in good]).reshape(-1, 2)
-        squared = [r[LIKELIHOOD]["nees"] for r in good]
-        pixels = [r[LIKELIHOOD]["across_px"] for r in good if r[LIKELIHOOD]["across_px"] is not None]
-        rows.append(
-            {
-                "percent": percent,
-                "frames": len(here),
-                "rates": len(good),
-                "wrong": sum(value > WRONG for value in squared),
-                "ratio_magnitude": _ratio([r[LIKELIHOOD]["magnitude"] for r in good], own[:, 0]),
-                "ratio_vector": _ratio([r[LIKELIHOOD]["vector"] for r in good], own[:, 1]),
-                "nees": _mean(squared),
-                "across_px_median": float(np.median(pixels)) if pixels else None,
-            }
-        )
+        good = [r[LIKELIHOOD] for r in here if r[LIKELIHOOD]["status"] == "rate"]
+        pixels = [one["across_px"] for one in good if one["across_px"] is not None]
+        row = {"percent": percent, "frames": len(here), "wrong": sum(one["nees"] > WRONG for one in good)}
+        rows.append({**row, **_cell(here)[LIKELIHOOD], "across_px_median": median(pixels)})
     return rows
-
-
-def _rms(values: FloatArray) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if len(values) else None
 
 
 def _ratio(errors: Sequence[float], bound: FloatArray) -> float | None:
     """Return the rms of the ratios of errors to their bounds."""
-    return _rms(np.array(errors) / bound) if len(errors) else None
+    return rms(np.array(errors) / bound) if len(errors) else None
 
 
 def _table_3_1(results: Sequence[Result]) -> list[dict[str, Any]]:
@@ -309,21 +287,3 @@ def _worst_mean(results: Sequence[Result], name: str, percent: int, least: int, 
         if theta >= least and values:
             means.append(float(np.mean(values)))
     return max(means, default=None)
-
-
-STREAKS = Campaign(
-    "streaks",
-    "Table 3.1: rate and attitude of five estimators over theta and turn",
-    cases,
-    run,
-    summarise,
-    10,
-)
-STREAKS_THESIS = Campaign(
-    "streaks-thesis",
-    "Table 3.1 on the thesis's own camera: bilinear spots, uniform noise",
-    cases,
-    run_thesis,
-    summarise,
-    10,
-)

@@ -29,7 +29,7 @@ from flight.link import events
 from flight.link.modes import POINTING, Mode
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from ground.report.orbit import (
     FINE,
     WITH_STARS_S,
@@ -44,8 +44,9 @@ from ground.report.signals import seconds
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.settings import Simulation
+from tests.studies.campaigns.statistics import mean
 from tests.support.flights import fly
-from tests.support.unlike_body import configured
+from tests.support.unlike_body import configured, released
 
 SPEED = {"orbit": math.radians(5.0), "orbit_3u": math.radians(3.0)}
 """Angular rates (rad/s) at the release by configuration."""
@@ -93,17 +94,11 @@ def _flight(
     config, world = configured(name)
     config = configuration.replace(config, elements=None, duration=duration, targets=config.targets[:1])
     place = float(np.random.default_rng(seed).uniform(0.0, 360.0))
+    world = released(world, seed[0] * 100_003 + seed[1], place, speed)
     assert world.free_body is not None
     varying = configuration.replace(world.free_body.disturbances, coil_variation=COIL_VARIATION)
-    body = configuration.replace(
-        world.free_body,
-        disturbances=varying,
-        orbit=configuration.replace(world.free_body.orbit, true_anomaly_deg=place),
-        release=configuration.replace(world.free_body.release, speed=speed),
-    )
-    receiver = configuration.replace(world.orbit_devices, gps_start=1.0)
-    number = seed[0] * 100_003 + seed[1]
-    return config, configuration.replace(world, seed=number, free_body=body, orbit_devices=receiver)
+    body = configuration.replace(world.free_body, disturbances=varying)
+    return config, configuration.replace(world, free_body=body)
 
 
 def facts(flown: Run, config: OrbitConfig) -> Result:
@@ -128,6 +123,7 @@ def facts(flown: Run, config: OrbitConfig) -> Result:
                 in_phases(flown, sampled.times).items(), in_phases(flown, camera.times).values(), strict=True
             )
         },
+        "fine_s": next(iter(seconds(packets)[packets["knowledge"] == FINE].tolist()), None),
         "excursions": _excursions(flown, body),
         "restarts": int(packets["restarts"][-1]),
         "learned_refused": int(np.sum(flown["event"]["code"] == events.LEARNED_REFUSED.code)),
@@ -215,9 +211,8 @@ def _inertia(flown: Run) -> dict[str, float] | None:
     }
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each configuration and phase, and a row for each configuration."""
-    del folder
     phases: dict[str, Any] = {}
     flights: dict[str, Any] = {}
     for name in dict.fromkeys(result["name"] for result in results):
@@ -254,6 +249,7 @@ def _flights(mine: Sequence[Result]) -> dict[str, Any]:
     return {
         "flights": len(mine),
         "beyond": beyond / samples if samples else None,
+        "fine_s": max((result["fine_s"] for result in mine if result["fine_s"] is not None), default=None),
         "excursion_s": max(one["longest_s"] for one in out),
         "sigmas": max(one["sigmas"] for one in out),
         "restarts": sum(result["restarts"] for result in mine),
@@ -263,17 +259,7 @@ def _flights(mine: Sequence[Result]) -> dict[str, Any]:
         "rates": rates,
         "inertia_n": len(inertia),
         "inertia_error": max((one["error"] for one in inertia), default=None),
-        "inertia_nees": float(np.mean([one["nees"] for one in inertia])) if inertia else None,
+        "inertia_nees": mean([one["nees"] for one in inertia]),
         "available": unobstructed[1] / unobstructed[0] if unobstructed[0] else None,
         "gap_s": max(result["longest_gap_s"] for result in mine),
     }
-
-
-UNKNOWN_BODY = Campaign(
-    "unknown-body",
-    "attitude knowledge from tumble to pointing of satellites that differ from their description",
-    cases,
-    run,
-    summarise,
-    20,
-)

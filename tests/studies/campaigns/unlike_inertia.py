@@ -19,7 +19,6 @@ monitor.
 from __future__ import annotations
 
 import tempfile
-from collections import defaultdict
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -30,8 +29,9 @@ import numpy as np
 from flight.link.modes import Mode
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from sim_hal.settings import Simulation
+from tests.studies.campaigns.statistics import grouped, median
 from tests.support.flights import fly
 from tests.support.unlike_body import coil_judgement, configured, with_fault, without_cameras
 
@@ -110,15 +110,11 @@ def _slow(config: OrbitConfig, world: Simulation) -> tuple[OrbitConfig, Simulati
     return config, configuration.replace(world, free_body=body)
 
 
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
+def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each craft, phase and state of the coils.
 
     Slow flights that never point, because they do not find the Sun in the Earth's shadow, are left out.
     """
-    del folder
-    cells: dict[str, list[Result]] = defaultdict(list)
-    for result in results:
-        cells[f"{result['name']} {result['kind']}"].append(result)
     facts: dict[str, Any] = {
         "flights": len(results),
         **{
@@ -126,26 +122,16 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
             for key in ("healthy_isolated", "healthy_suspected", "healthy_corrected")
         },
     }
-    for cell, flights in cells.items():
-        own = [one for one in flights if one["pointed"] or " slow " not in cell]
+    for cell, flights in grouped(results, "name", "kind").items():
+        own = [one for one in flights if one["pointed"] or "/slow " not in cell]
         row: dict[str, Any] = {"flights": len(own)}
         if not cell.endswith("healthy"):
             times = [one["handled_s"] for one in own if one["handled_s"] is not None]
             row |= {
                 "handled": len(times),
                 f"handled_within_{SOON:.0f}_s": sum(time <= SOON for time in times),
-                "handled_median_s": float(np.median(times)) if times else None,
+                "handled_median_s": median(times),
                 "handled_worst_s": max(times, default=None),
             }
-        facts |= {f"{cell}: {key}": value for key, value in row.items()}
+        facts |= {f"{cell.replace('/', ' ')}: {key}": value for key, value in row.items()}
     return summary(facts)
-
-
-UNLIKE_INERTIA = Campaign(
-    "unlike-inertia",
-    "healthy, reversed and open coils of a satellite that differs from its configuration",
-    cases,
-    run,
-    summarise,
-    10,
-)

@@ -17,7 +17,7 @@ from unittest import mock
 
 import numpy as np
 
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from ground.campaigns.runner import Case, Result, Summary, summary
 from sim_hal.worlds.basilisk.world import BasiliskWorld
 from tests.studies.campaigns import detumble, free_flight, orbit_pointing
 
@@ -72,19 +72,17 @@ def run(case: Case) -> Result:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return each flight's results in both worlds, and their comparison."""
     facts: dict[str, Any] = {"lost": sum(result["lost"] for result in results)}
-    lines: list[str] = []
     for kind, figures in FIGURES.items():
         for figure in figures:
-            found = _compared([r for r in results if r["kind"] == kind and figure in r], figure, lines)
+            found = _compared([r for r in results if r["kind"] == kind and figure in r], figure)
             if found["flights"]:
                 facts[f"{kind}/{figure}"] = found
     facts["within"] = all(found["within"] for found in facts.values() if isinstance(found, dict))
-    lines.append(f"{facts['lost']} lost")
     return summary(facts)
 
 
-def _compared(results: Sequence[Result], figure: str, lines: list[str]) -> dict[str, Any]:
-    """Return the comparison of one result over the flights of both worlds; add its table to `lines`."""
+def _compared(results: Sequence[Result], figure: str) -> dict[str, Any]:
+    """Return the comparison of one result over the flights of both worlds."""
     values: dict[str, dict[str, float]] = {}
     for result in results:
         values.setdefault(result["flight"], {})[result["world"]] = result[figure]
@@ -93,19 +91,6 @@ def _compared(results: Sequence[Result], figure: str, lines: list[str]) -> dict[
     if not both:
         return {"flights": 0}
     median = float(np.median(ratios))
-    lines.append(f"{figure:36}" + "".join(f"{world:>12}" for world in WORLDS))
-    lines += [f"{flight:36}" + "".join(f"{found[w]:12.4g}" for w in WORLDS) for flight, found in both.items()]
     widest = float(np.maximum(ratios, 1.0 / ratios).max())
-    lines.append(f"median ratio {median:.3f}, widest {widest:.3f}\n")
     within = abs(median - 1.0) <= WITHIN
     return {"flights": len(both), "median_ratio": median, "widest_ratio": widest, "within": within}
-
-
-WORLD_COMPARISON = Campaign(
-    "worlds",
-    "detumbling and nadir in our own world and in Basilisk, flight by flight",
-    cases,
-    run,
-    summarise,
-    10,
-)

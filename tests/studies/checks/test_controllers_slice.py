@@ -9,7 +9,7 @@ import pytest
 from flight.schema import reader as configuration
 from ground.campaigns.runner import Case
 from sim_hal.settings import Thread
-from tests.studies.campaigns import controllers, robust_controllers
+from tests.studies.campaigns import controllers
 from tests.support.flights import demo_config, demo_world
 from tests.support.ideal_power import clairvoyant_power
 
@@ -35,7 +35,7 @@ def test_every_controller_flies_its_own_configuration() -> None:
 
 def test_both_threads_are_flown_and_reported_apart() -> None:
     """Summarise two invented flights; their world differs from the demonstration's only in stiffness."""
-    cases = controllers.CONTROLLERS_CAMPAIGN.cases(2, 1)
+    cases = controllers.cases(2, 1)
     stiff = [case for case in cases if case.parameters["thread"] == controllers.THICK]
     assert len(stiff) == 2 * len(controllers.STIFF)
     assert len({case.key for case in cases}) == len(cases)
@@ -47,14 +47,14 @@ def test_both_threads_are_flown_and_reported_apart() -> None:
         {**drawn, "controller": name, "thread": controllers.THICK, "flight_seed": 1, "heat_w": heat}
         for name, heat in (("this loop", 0.10), ("pid", 0.101))
     ]
-    facts = controllers.CONTROLLERS_CAMPAIGN.summarise(results, Path()).facts
+    facts = controllers.summarise(results, Path()).facts
     assert "controllers" not in facts
     assert facts["stiff controllers"]["pid"]["over_this_loop"] == pytest.approx(1.01)
     assert facts["stiff controllers"]["adaptive"] == {"seeds": 0}
 
 
 def test_worlds_differ_and_stay_within_their_bounds() -> None:
-    worlds = [robust_controllers.draw((1, run)) for run in range(200)]
+    worlds = [controllers.draw((1, run)) for run in range(200)]
     for name, low, high in (
         ("inertia", 0.8, 1.2),
         ("field", 0.9, 1.1),
@@ -67,13 +67,13 @@ def test_worlds_differ_and_stay_within_their_bounds() -> None:
         assert low <= min(values) < low + 0.05 * (high - low) + 1e-9
         assert high - 0.05 * (high - low) - 1e-9 < max(values) <= high
     assert max(span for world in worlds for _, span in world["dropouts_s"]) <= 1.0
-    assert robust_controllers.draw((1, 0)) == worlds[0]
+    assert controllers.draw((1, 0)) == worlds[0]
 
 
 @pytest.mark.slow
 def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
     """The loop of this project is simulated in world 1 of seed 1."""
-    result = robust_controllers.run(Case("this loop/1", (1, 1), {"controller": "this loop"}))
+    result = controllers.robust_run(Case("this loop/1", (1, 1), {"controller": "this loop"}))
     assert not result["lost"]
     assert result["settling_s"] < 12.0
     assert result["steady_state_deg"] < 0.15
@@ -82,7 +82,7 @@ def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
 
 
 def test_the_table_counts_the_lost_and_shows_the_percentile(tmp_path: Path) -> None:
-    world = robust_controllers.draw((1, 0))
+    world = controllers.draw((1, 0))
     results = [
         {
             "world": world,
@@ -97,7 +97,7 @@ def test_the_table_counts_the_lost_and_shows_the_percentile(tmp_path: Path) -> N
         }
         for k in range(100)
     ]
-    facts = robust_controllers.summarise(results, tmp_path).facts["pid"]
+    facts = controllers.robust_summarise(results, tmp_path).facts["pid"]
     assert facts["lost"] == 1
     assert facts["steady_state_deg"][1] == pytest.approx(0.94)
     assert facts["settling_s"][2] is None

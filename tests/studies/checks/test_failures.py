@@ -13,7 +13,7 @@ from ground.campaigns.runner import Result, fly_here
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.pace import warm_call
-from tests.studies.campaigns import failures
+from tests.studies.campaigns import campaign, failures
 from tests.support.scenes import FIELD, LEAST_USABLE, RandomSlew, Scene, slew, usable
 
 _SEED = 20_261_121
@@ -101,7 +101,7 @@ def test_every_frame_has_five_usable_stars_and_is_the_same_again() -> None:
 @pytest.fixture(scope="module")
 def results() -> list[Result]:
     """Return the results of a slice of the campaign, run as the command does."""
-    return fly_here(failures.FAILURES, _FRAMES, _SEED)
+    return fly_here(campaign("failures"), _FRAMES, _SEED)
 
 
 @pytest.mark.slow

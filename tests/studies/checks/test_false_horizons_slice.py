@@ -11,8 +11,7 @@ import pytest
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge
-from tests.studies.campaigns.false_horizons import FALSE_HORIZONS, HARD, run
-from tests.studies.campaigns.limbless import MAKERS, photographed
+from tests.studies.campaigns.false_horizons import MAKERS, cases, photographed, run, summarise
 
 SEED = 3
 # Each of these pictures would give a significant (false) horizon, with or without known altitude, if the test
@@ -21,17 +20,14 @@ FALSE_ONCE = ("clouds-15", "coast-16", "terminator-12", "gradient-6", "stars-4",
 
 
 @pytest.mark.slow
-def test_pictures_that_once_gave_a_horizon_give_none_and_a_crescent_is_found(tmp_path: Path) -> None:
-    cases = {case.key: case for case in FALSE_HORIZONS.cases(20, SEED)}
-    assert len(cases) == 20 * len(MAKERS) + 4 * len(HARD)
-    results = [run(cases[key]) for key in (*FALSE_ONCE, "limb-crescent-0")]
-    verdicts = [[answer["verdict"] for answer in result["answers"]] for result in results]
-    assert not any({"right", "wrong"} & set(each) for each in verdicts[:-1])
-    # The last result is the one with the prior information of a flight.
-    assert verdicts[-1][-1] == "right"
-    summary = FALSE_HORIZONS.summarise(results, tmp_path)
-    json.dumps(summary.facts, allow_nan=False)
-    assert (summary.facts["false"], summary.facts["empty"]) == (0, len(FALSE_ONCE))
+def test_pictures_that_once_gave_a_horizon_give_none(tmp_path: Path) -> None:
+    drawn = {case.key: case for case in cases(20, SEED)}
+    assert len(drawn) == 20 * len(MAKERS)
+    results = [run(drawn[key]) for key in FALSE_ONCE]
+    assert not any({"found", "wrong"} & set(result["answers"].values()) for result in results)
+    facts = summarise(results, tmp_path).facts
+    json.dumps(facts, allow_nan=False)
+    assert (facts["false"], facts["empty"]) == (0, len(FALSE_ONCE))
 
 
 @pytest.mark.parametrize("seed", [3, 7, 8, 42])

@@ -12,7 +12,7 @@ import pytest
 from flight.loop.state import COPIES, StateStore, StoredState, begin_boot
 from ground.campaigns.runner import fly_here
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.studies.campaigns import faults_kill
+from tests.studies.campaigns import campaign, faults_kill
 from tests.studies.campaigns.faults_kill import KILLS, Board, cases, summarise
 
 
@@ -23,7 +23,7 @@ def test_boards_come_to_the_kills_that_are_asked() -> None:
 @pytest.mark.slow
 def test_after_each_kill_coils_log_and_state_are_sound_and_the_next_flight_starts(tmp_path: Path) -> None:
     """With seed 7 the first kill is made with coils on (on a fast machine), the second before READY."""
-    facts = summarise(fly_here(faults_kill.FAULTS_KILL, 2, seed=7), tmp_path).facts
+    facts = summarise(fly_here(campaign("faults-kill"), 2, seed=7), tmp_path).facts
     assert (facts["kills"], facts["early"]) == (2, 1)
     assert (facts["beyond_limit"], facts["current_after_a"]) == (0, 0.0)
     assert facts["logs_readable"] == facts["states_whole"] == facts["kills_counted"] == 2

@@ -13,7 +13,7 @@ from ground.campaigns.runner import Case
 from ground.telemetry import Run
 from sim_hal.faults.catalogue import CATALOGUE, FaultKind
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
+from tests.studies.campaigns import fault_judgement, faults, soak
 from tests.support.flights import config_for, demo_world, event_names, fly
 from tests.support.packed_run import WritablePackets
 
@@ -72,7 +72,7 @@ def test_a_coil_that_breaks_is_taken_out_of_use() -> None:
 
 @pytest.mark.usefixtures("brief")
 def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(fault_table.OWN_OF_KIND, "imu: silent", frozenset({"clock-step"}))
+    monkeypatch.setitem(fault_judgement.OWN_OF_KIND, "imu: silent", frozenset({"clock-step"}))
     result = flown("imu: silent")
     assert result["detected_s"] is None
     assert {"imu-silent", "control-lost"} <= set(result["others"])
@@ -106,10 +106,10 @@ def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any
 @pytest.mark.parametrize("kind", faults.faults(), ids=lambda kind: kind.name)
 def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
     names = {event.name: event for event in EVENTS}
-    own = fault_table.own_events(kind)
+    own = fault_judgement.own_events(kind)
     assert own
     assert all(names[name].severity is not Severity.INFORMATION for name in own)
-    reaction = fault_table.REACTION.get(fault_table.part_of(kind))
+    reaction = fault_judgement.REACTION.get(fault_judgement.part_of(kind))
     assert reaction is None or names[reaction].reaction is not Reaction.NOTE
 
 
@@ -122,7 +122,7 @@ def test_the_twin_without_a_fault_reports_none_of_their_events(mode: str, tmp_pa
     """
     section = configuration.replace(demo_world(), seed=3)
     run = fly(config_for(mode, camera=False, duration=BRIEF), tmp_path, section=section)
-    assert not set(event_names(run)) & frozenset().union(*fault_table.OWN.values(), {"stream-poor"})
+    assert not set(event_names(run)) & frozenset().union(*fault_judgement.OWN.values(), {"stream-poor"})
 
 
 @pytest.mark.parametrize("mode", ["detumble", "slew"])
@@ -171,11 +171,6 @@ def test_its_table_shows_the_worst_of_each_fault() -> None:
     named = "imu: off, hold, 5.00 to 8.00 s, number 71; reported: tumbling"
     assert summary.facts["not_reported"] == summary.facts["wrong_reaction"] == [named]
     assert summary.text.count(named) == 2
-
-
-def test_a_flight_of_the_campaign_is_flown_again_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(faults, "run", lambda case: {"case": case})
-    assert faults.refly(7, 100)["case"] == faults.cases(500, 7)[100]
 
 
 @pytest.mark.slow

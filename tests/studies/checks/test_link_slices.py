@@ -10,7 +10,6 @@ from flight.link.process.commanding import Timetable
 from flight.link.security import Vault
 from ground.link.terminal import make_keys
 from tests.studies.bench.link_kills import measure, measure_scheduled
-from tests.studies.campaigns import restored_keys
 
 
 def test_nothing_is_obeyed_twice_and_no_counter_used_twice(tmp_path: Path) -> None:
@@ -29,23 +28,6 @@ def test_a_sender_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("tests.studies.bench.link_kills.make_keys", lambda _: None)
     monkeypatch.setattr(Vault, "write", lambda *_: 2)
     assert measure(tmp_path, 3, seed=3).counters_twice > 0
-
-
-def _restored(orders: int) -> dict[str, int]:
-    found = [restored_keys.run(case) for case in restored_keys.cases(orders, seed=3)]
-    return {name: sum(one[name] for one in found) for name in found[0]}
-
-
-def test_restored_keys_reuse_no_nonce_and_obey_no_old_command() -> None:
-    found = _restored(4)
-    assert (found["reused"], found["repeated"], found["lost"]) == (0, 0, 0)
-    assert min(found["restored"], found["detected"], found["rekeyed"]) > 3
-    assert found["obeyed"] > 60
-
-
-def test_a_satellite_without_a_witness_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight.link.security._Witness.outdates", lambda *_: False)
-    assert _restored(4)["repeated"] > 0
 
 
 def test_no_scheduled_command_comes_twice_and_a_kill_costs_one_at_most(tmp_path: Path) -> None:

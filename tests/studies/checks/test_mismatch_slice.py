@@ -63,11 +63,11 @@ def test_distortion_moves_the_corner_by_its_share_and_the_axis_moves_all() -> No
 
 
 def test_cases_cover_every_imperfection_at_both_turns_and_do_not_depend_on_how_many_are_run() -> None:
-    many = mismatch.mismatch_cases(2, _SEED)
+    many = mismatch.cases(2, _SEED)
     assert {(case.parameters["row"], case.parameters["percent"]) for case in many} == {
         (row, percent) for row in IMPERFECTIONS for percent in (10.0, 30.0)
     }
-    assert mismatch.mismatch_cases(1, _SEED) == [case for case in many if case.key.endswith(" 0")]
+    assert mismatch.cases(1, _SEED) == [case for case in many if case.key.endswith(" 0")]
     assert mismatch.vibration_cases(2, _SEED) == mismatch.vibration_cases(4, _SEED)[:2]
 
 
@@ -81,12 +81,12 @@ def test_vibrations_have_every_exposure_amplitude_and_shape() -> None:
 
 
 def _case(row: str, run: int) -> Case:
-    return next(c for c in mismatch.mismatch_cases(run + 1, _SEED) if c.key == f"{row} 10 {run}")
+    return next(c for c in mismatch.cases(run + 1, _SEED) if c.key == f"{row} 10 {run}")
 
 
 @pytest.mark.slow
 def test_a_frame_that_a_median_filtered_is_not_confidently_wrong() -> None:
-    result = mismatch.run_mismatch(_case("median 3 x 3", 0))
+    result = mismatch.run(_case("median 3 x 3", 0))
     assert result["nees"] is None or result["nees"] < mismatch.WRONG_SIGMAS**2
 
 
@@ -108,8 +108,8 @@ def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rat
     A correction after the fit alone would leave a rate error of up to 1.5 %.
     """
     for run in range(3):
-        case = next(c for c in mismatch.mismatch_cases(run + 1, _SEED) if c.key == f"distortion 1 % 30 {run}")
-        result = mismatch.run_mismatch(case)
+        case = next(c for c in mismatch.cases(run + 1, _SEED) if c.key == f"distortion 1 % 30 {run}")
+        result = mismatch.run(case)
         assert result["nees"] < mismatch.WRONG_SIGMAS**2
         assert result["share"] < 0.004
         assert result["claimed"] < 0.004
@@ -118,14 +118,14 @@ def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rat
 @pytest.mark.slow
 def test_an_elongated_point_spread_that_nobody_described_is_refused_on_short_streaks() -> None:
     """A body that vibrates fast along one axis causes the same streaks with other end points."""
-    result = mismatch.run_mismatch(_case("ellipse 1:2 turned", 0))
+    result = mismatch.run(_case("ellipse 1:2 turned", 0))
     assert result["nees"] is None
 
 
 @pytest.mark.slow
 def test_a_body_that_shakes_is_refused_or_within_what_is_claimed() -> None:
     shaking = {"row": "0.2 s", "percent": 10.0, "exposure": 0.2, "theta": 70.0, "frequency": 20.0}
-    result = mismatch.run_vibration(Case("a", (_SEED, 1), {**shaking, "amplitude": 2.0}))
+    result = mismatch.vibration_run(Case("a", (_SEED, 1), {**shaking, "amplitude": 2.0}))
     assert result["nees"] is None or result["nees"] < mismatch.WRONG_SIGMAS**2
 
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from ground.campaigns.runner import Result, fly_here
-from tests.studies.campaigns.nadir import NADIR, summarise
+from tests.studies.campaigns import campaign
+from tests.studies.campaigns.nadir import summarise
 
 
 @pytest.fixture(scope="module")
 def slice_() -> list[Result]:
     """Return the results of two frames of the campaign `nadir` for each pair of view and atmosphere model."""
-    return fly_here(NADIR, 2, 20_261_121)
+    return fly_here(campaign("nadir"), 2, 20_261_121)
 
 
 @pytest.mark.slow
@@ -35,7 +36,7 @@ def test_the_summary_counts_what_is_wrong_and_what_is_refused(slice_: list[Resul
     wrong = {**slice_[0], "verdict": "wrong", "error_deg": 3.0, "nees": 900.0}
     none = {**slice_[1], "verdict": "refused", "error_deg": None, "nees": None, "reason": "5 % of sky"}
     summary = summarise([wrong, none, *slice_[2:]], tmp_path)
-    assert summary.facts["views"][0]["wrong"] == 1
-    assert summary.facts["views"][0]["refused"] == 1
-    assert summary.facts["views"][0]["worst_deg"] == 3.0
+    assert summary.facts["views"]["sunlit/known"]["wrong"] == 1
+    assert summary.facts["views"]["sunlit/known"]["refused"] == 1
+    assert summary.facts["views"]["sunlit/known"]["worst_deg"] == 3.0
     assert "5 % of sky" in summary.text

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ground.campaigns.runner import Case
-from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS, cases, least_deviation, run
+from tests.studies.campaigns.object_flights import cases, least_deviation, run, summarise
 
 
 @pytest.mark.parametrize("lean", [0.0, np.radians(30.0)])
@@ -39,7 +39,7 @@ def test_a_slow_object_is_kept_through_ten_seconds_without_it(tmp_path: Path) ->
     assert found["same"]
     assert found["end"] < 0.5
     assert found["most"] >= found["least"] - 0.1
-    json.dumps(OBJECT_FLIGHTS.summarise([found], tmp_path).facts, allow_nan=False)
+    json.dumps(summarise([found], tmp_path).facts, allow_nan=False)
     assert len({case.key for case in cases(2, 1)}) == 16
 
 

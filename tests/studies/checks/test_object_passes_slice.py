@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ground.campaigns.runner import Case
-from tests.studies.campaigns.object_passes import OBJECT_PASSES, run
+from tests.studies.campaigns.object_passes import run, summarise
 
 SEED = 16
 
@@ -25,4 +25,4 @@ def test_an_object_is_sighted_near_the_bound_and_an_empty_sky_shows_none(tmp_pat
     assert shown["nees"]
     assert np.max(shown["nees"]) < 18.4  # 99.99 % quantile of chi-square with two degrees of freedom
     assert shown["false_tracks"] == empty["false_tracks"] == 0
-    json.dumps(OBJECT_PASSES.summarise([shown, empty], tmp_path).facts, allow_nan=False)
+    json.dumps(summarise([shown, empty], tmp_path).facts, allow_nan=False)

@@ -17,7 +17,7 @@ from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns import orbit_fault_flights, orbit_faults
 from tests.studies.campaigns import orbit_fault_judgement as judgement
-from tests.studies.campaigns.fault_table import part_of
+from tests.studies.campaigns.fault_judgement import part_of
 from tests.studies.campaigns.orbit_fault_flights import (
     MODES,
     config_for,

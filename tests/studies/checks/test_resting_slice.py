@@ -9,7 +9,7 @@ import numpy as np
 
 from ground.campaigns.runner import Case
 from knightcube.astro.chi_square import bound
-from tests.studies.campaigns.resting import RESTING, TRAILS, run
+from tests.studies.campaigns.resting import TRAILS, run, summarise
 
 SEED = 17
 
@@ -20,7 +20,7 @@ def _flown(row: str, trail: float, runs: int) -> list[dict[str, object]]:
 
 def test_attitudes_of_the_model_s_own_camera_are_known_as_well_as_they_claim(tmp_path: Path) -> None:
     results = [result for trail in TRAILS for result in _flown("none", trail, 4)]
-    facts = RESTING.summarise(results, tmp_path).facts
+    facts = summarise(results, tmp_path).facts
     json.dumps(facts, allow_nan=False)
     own = facts["all"]
     assert own["attitudes"] == own["frames"] == 12
@@ -37,7 +37,7 @@ def test_attitudes_of_unlike_cameras_are_within_their_claims(tmp_path: Path) -> 
         ("rolling, described", 3.0),
         ("rolling, unknown line time", 1.0),
     ):
-        own = RESTING.summarise(_flown(row, trail, 2), tmp_path).facts["all"]
+        own = summarise(_flown(row, trail, 2), tmp_path).facts["all"]
         assert own["attitudes"] == 2
         assert own["worst"] < 4.5
         assert own["claim"] < 0.02

@@ -11,16 +11,15 @@ from ground.campaigns.runner import Case
 from tests.studies.campaigns.rso import by_magnitude, ends_error
 from tests.studies.campaigns.rso_orbits import (
     ESTIMATORS,
-    MAGNITUDES,
-    RSO_ORBITS,
     TABLE_MAGNITUDE,
     THESIS,
+    cases,
     flown,
     mean_errors,
     one_frame,
     rate_error,
     star_streaks,
-    weakest,
+    summarise,
 )
 from tests.support.scenes import BRIGHTEST, catalogue, faintest
 
@@ -40,9 +39,8 @@ def test_the_orbits_give_the_thesis_s_opportunities_and_the_hardest_is_found() -
     for name in ESTIMATORS:
         assert abs(frame[name][0]) < 0.01
         assert frame[name][1] < 0.8
-    facts = RSO_ORBITS.summarise([{"run": 0, "magnitude": 4.0, "frames": []}], Path()).facts
+    facts = summarise([{"run": 0, "magnitude": 4.0, "frames": []}], Path()).facts
     assert facts["skies"]["whole"]["judge"] == [0, 0, 0]
-    assert facts["weakest_at_95"] is None
     ends, _ = star_streaks(scenario, times[11])
     # The stars move along the rows at 0.05 rad/s: 73 px in half a second at the image centre.
     middle = np.abs(ends - 512.0).max(axis=(1, 2)) < 100.0
@@ -55,11 +53,11 @@ def test_fewer_stars_are_the_brightest_and_table_4_4_counts_them_apart() -> None
     # Magnitudes have two decimals, so several stars have the magnitude of the faintest star.
     assert BRIGHTEST <= len(stars.magnitude) < 1.02 * BRIGHTEST
     assert stars.magnitude.max() < 6.5
-    tables = [case for case in RSO_ORBITS.cases(1, SEED) if case.parameters["stars"] == BRIGHTEST]
+    tables = [case for case in cases(1, SEED) if case.parameters["stars"] == BRIGHTEST]
     assert [case.parameters["magnitude"] for case in tables] == [TABLE_MAGNITUDE]
     scenario, times = flown(tables[0].seed, 0)
     frame = one_frame(scenario, times[0], tables[0], 0)
-    facts = RSO_ORBITS.summarise([{**tables[0].parameters, "frames": [frame]}], Path()).facts
+    facts = summarise([{**tables[0].parameters, "frames": [frame]}], Path()).facts
     table = facts["skies"]["brightest 7000"]
     assert table["judge"] == [1, 0, 0]
     assert facts["frames"] == 0
@@ -75,13 +73,7 @@ def test_another_run_starts_elsewhere() -> None:
     assert not np.allclose(first.attitude(at), other.attitude(at))
 
 
-def test_the_weakest_found_is_the_last_before_the_first_miss() -> None:
-    rows = [
-        {"magnitude": magnitude, "frames": 20, "found": found}
-        for magnitude, found in zip(MAGNITUDES, (20, 20, 19, 18, 20), strict=False)
-    ]
-    assert weakest(rows) == 4.0
-    assert weakest([{**rows[0], "found": 5}]) is None
+def test_a_magnitude_without_frames_has_no_error() -> None:
     empty = by_magnitude([], 4.0)
     assert (empty["frames"], empty["error_px"]) == (0, None)
 

@@ -5,21 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 from ground.campaigns.runner import Case
-from tests.studies.campaigns.streaked import STREAKED, STREAKS, run
+from tests.studies.campaigns.resting import STREAKS, streaked_run, summarise
 
 SEED = 18
 
 
 def _flown(row: str, runs: int) -> list[dict[str, object]]:
-    cells = [(length, n) for length in STREAKS for n in range(runs)]
-    return [
-        run(Case(f"{row} {length:g} {n}", (SEED, n), {"row": row, "trail": length})) for length, n in cells
-    ]
+    cells = [(f"{row} {length:g} {n}", n, length) for length in STREAKS for n in range(runs)]
+    return [streaked_run(Case(key, (SEED, n), {"row": row, "trail": length})) for key, n, length in cells]
 
 
 def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path) -> None:
     """If the covariance ignored the unknown shutter, errors would reach 7 sigma, or 0.4 px, not 0.05 px."""
-    own = STREAKED.summarise(_flown("rolling 30 us, unstated", 2), tmp_path).facts["all"]
+    own = summarise(_flown("rolling 30 us, unstated", 2), tmp_path).facts["all"]
     assert own["attitudes"] == own["frames"] == 6
     assert own["worst"] < 4.5
     assert own["off"] < 0.03
@@ -28,8 +26,7 @@ def test_a_rolling_shutter_that_nobody_described_is_in_the_claim(tmp_path: Path)
 def test_a_shutter_that_is_described_costs_nothing(tmp_path: Path) -> None:
     """On the same frames, the claimed uncertainty is larger if the line time is not known."""
     stated, unstated = (
-        STREAKED.summarise(_flown(f"rolling 0 us, {how}", 2), tmp_path).facts["all"]
-        for how in ("stated", "unstated")
+        summarise(_flown(f"rolling 0 us, {how}", 2), tmp_path).facts["all"] for how in ("stated", "unstated")
     )
     assert stated["attitudes"] == unstated["attitudes"] == 6
     assert max(stated["worst"], unstated["worst"]) < 4.5

@@ -60,7 +60,7 @@ def test_the_thesis_s_own_camera_gives_the_thesis_s_table() -> None:
     be better than the best result of the thesis.
     """
     cases = [Case(f"60/50/{run}", (20_261_123, run), {"theta": 60, "percent": 50}) for run in range(2)]
-    seen = [streaks.run_thesis(case) for case in cases]
+    seen = [streaks.thesis_run(case) for case in cases]
     for name, limit in (("harris", 0.0007), ("minimum-eigenvalue", 0.0019), ("likelihood", 0.00035)):
         rates = [result[name] for result in seen if result[name]["status"] == "rate"]
         assert len(rates) >= (1 if name == "likelihood" else 2)

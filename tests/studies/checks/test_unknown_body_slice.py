@@ -39,6 +39,7 @@ def test_a_flight_is_judged_by_phase_in_the_axes_of_body_and_star_camera(tmp_pat
     flight = table.facts["flights"]["orbit"]
     assert (flight["restarts"], flight["beyond"], flight["excursion_s"]) == (0, 0.0, 0.0)
     assert flight["learned_refused"] == 0
+    assert flight["fine_s"] < 15.0
     assert flight["attitudes"][0] >= 4
     assert flight["attitudes"][1] == 0
     assert flight["available"] >= 0.8
@@ -57,6 +58,7 @@ def test_samples_beyond_five_sigma_and_the_longest_excursion_are_counted(tmp_pat
     result = {
         "name": "orbit",
         "phases": dict.fromkeys(unknown_body.PHASES, part),
+        "fine_s": 12.0,
         "excursions": {"samples": 1000.0, "beyond": 2.0, "longest_s": 0.1, "sigmas": 5.5},
         "restarts": 1,
         "learned_refused": 2,
@@ -73,6 +75,7 @@ def test_samples_beyond_five_sigma_and_the_longest_excursion_are_counted(tmp_pat
     assert phase["body_deg"] == pytest.approx(math.degrees(1e-3))
     flight = facts["flights"]["orbit"]
     assert flight["beyond"] == pytest.approx(0.002)
+    assert flight["fine_s"] == 12.0
     assert flight["learned_refused"] == 4
     assert flight["attitudes"] == [200, 4]
     assert flight["available"] == pytest.approx(0.9)

@@ -400,3 +400,19 @@ def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while() -> No
         return replace(sent, time_ns=sent.time_ns + 2 * SECOND_NS)
 
     assert CONFIRMED // 10 <= flight.fly(600, late).index(True) <= CONFIRMED // 10 + 1
+
+
+def test_after_a_leap_second_fixes_are_used_again_and_the_position_is_within_its_uncertainty() -> None:
+    """UTC is compared in terrestrial axes, because a leap second does not change the Earth's rotation."""
+    elements = TwoLineElements(FIRST, SECOND)
+    flight = Flight(None, elements)
+    assert all(flight.fly(600, flight.reading)[FIRST_FIXES:])
+    for _ in range(20):
+        used = flight.fly(60, lambda: flight.reading(seconds=-1.0))
+        state = flight.environment.state(flight.seconds * SECOND_NS)
+        assert state is not None
+        date = UNIX_EPOCH + (UTC_NS + flight.seconds * SECOND_NS) / (DAY * SECOND_NS)
+        place = celestial_to_terrestrial(state.julian_date) @ state.position
+        true = celestial_to_terrestrial(date) @ elements.at(date).position
+        assert np.linalg.norm(place - true) < 4.0 * state.sigma
+    assert all(used)

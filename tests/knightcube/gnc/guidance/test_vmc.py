@@ -487,3 +487,21 @@ def test_past_a_moving_end_the_path_coasts_on_as_far_as_the_coil_turns_the_body(
     together = np.array(path.motion(times)).T
     one_by_one = [path.sample(round(t * 1e9)) for t in times.tolist()]
     np.testing.assert_allclose(together, [(s.angle, s.rate, s.acceleration) for s in one_by_one], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "stiffness", "horizon"),
+    [(0.6731, 0.6642, 1.05e-5, 55.36), (0.6443, 0.6796, 1.24e-5, 59.39), (0.68, 0.675, 1.55e-5, 26.7)],
+)
+def test_against_a_strong_thread_the_body_is_swung(
+    start: float, end: float, stiffness: float, horizon: float
+) -> None:
+    plant = replace(KNIGHTCUBE, damping=2e-6, stiffness=stiffness)
+    assert Problem(plant, start, 0.0, end, 0.0, horizon).planned().status is PlanStatus.OPTIMAL
+
+
+def test_a_horizon_slightly_shorter_than_the_first_path_found_is_kept() -> None:
+    """The first path found lasts 0.4 % longer than requested."""
+    plant = replace(KNIGHTCUBE, damping=2e-6, stiffness=1.969058302744695e-5)
+    slew = Problem(plant, -0.6781216293719047, 0.0, -0.6677379601088886, 0.0, 25.11531181068483)
+    assert slew.planned().horizon <= slew.horizon * (1.0 + 1e-9)

@@ -221,6 +221,19 @@ def test_a_rotation_that_reverses_within_the_exposure_is_rejected() -> None:
     assert found.rate is None
 
 
+def test_a_rotation_that_returns_nearly_to_its_start_is_not_reported_as_one_from_rest() -> None:
+    """A motion from rest at a very different rate fits these streaks equally well."""
+    camera, generator = StarCameraModel(field_of_view=FIELD), np.random.default_rng((7, 49, 1))
+    turn = turn_of(np.radians(21.97996), 6.63953, generator.uniform(0.0, 2.0 * np.pi), camera)
+
+    def turns(times: FloatArray) -> FloatArray:
+        return np.asarray((times + 0.5 * 18.80413 * times**2 / 0.2)[:, None] * turn / 0.2)
+
+    scene = row_scene(camera, turns, 0.2, generator)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, line_time=0.0)
+    assert estimate_motion(scene.pixels, camera.pinhole, 0.2, settings, turn / 0.2, 0.0).rate is None
+
+
 def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
     """Streaks of half the field of view are fitted, although few of them are entirely in the frame.
 

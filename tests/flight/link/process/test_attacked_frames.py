@@ -1,27 +1,26 @@
-"""Campaign `frames`: altered, repeated and reordered telecommand frames near the limits of the frame counter.
+"""Tests with altered, repeated and reordered telecommand frames near the limits of the frame counter.
 
-Each run starts a link process whose next counter is near a limit, and sends it 1,000 frames in portions:
-genuine frames in another order, repetitions, damaged frames with a wrong or a correct CRC, joined parts of
-two frames, and authentic frames whose IV of 96 bits is near a limit. The link must not execute a command
-twice, nor a command that the ground did not send. No frame may end the process, and the link must execute the
-next genuine command.
+The attacker sends a link process, whose next counter is near a limit, 1,000 frames in portions: genuine
+frames in another order, repetitions, damaged frames with a wrong or a correct CRC, joined parts of two
+frames, and authentic frames whose IV of 96 bits is near a limit. The link must not execute a command twice,
+nor a command that the ground did not send. No frame may end the process, and the link must execute the next
+genuine command.
 """
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 
 from flight.link.commands import CommandPacker, Ping, unpack
 from flight.link.frames import close_frame
-from flight.link.security import HIGHEST_COUNTER, Refusal
-from ground.campaigns.runner import Campaign, Case, Result, Summary, summary
+from flight.link.security import HIGHEST_COUNTER, Gate, Refusal
 from tests.flight.link.process.both_ends import BothEnds
 from tests.flight.link.vaults import frame_with
 
@@ -32,18 +31,43 @@ STARTS = (0, 2**31 - 5, 2**32 - 5, 2**63 - 70_000, 2**63 - 20)
 KINDS = ("repeated", "flipped", "flipped, CRC right", "cut", "joined", "edge", "noise")
 
 
-def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` link processes that cycle through the start counters."""
-    return [Case(f"{run}", (seed, run), {"start": str(STARTS[run % len(STARTS)])}) for run in range(runs)]
+SEED = 35
 
 
-def run(case: Case) -> Result:
-    """Attack one link process."""
-    with tempfile.TemporaryDirectory(prefix="frames-") as place, closing(BothEnds(Path(place))) as link:
-        return {**case.parameters, **_attack(link, int(case.parameters["start"]), case.seed)}
+@pytest.mark.parametrize("number", range(len(STARTS)))
+def test_no_frame_is_obeyed_twice_and_none_ends_the_process(number: int, tmp_path: Path) -> None:
+    """Near its highest value, the counter permits few more commands."""
+    found = attacked(tmp_path, STARTS[number], (SEED, number))
+    assert sum(found["kinds"].values()) == FRAMES
+    assert set(found["kinds"]) == {*KINDS, "genuine"}
+    assert (found["twice"], found["strange"], found["deaf"], found["ended"]) == (0, 0, False, "")
+    assert found["obeyed"] >= (2 if STARTS[number] == max(STARTS) else 10)
+    causes = ("CRC", "HEADER", "SPI", "MAC", "REPEATED", "BEYOND")
+    assert min(found["refused"][cause] for cause in causes) > 2
 
 
-def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
+def test_a_gate_that_forgets_what_it_accepted_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    admit = Gate._admit
+
+    def forgetful(self: Gate, frame: bytes) -> Any:
+        before = dict(self._open)
+        admitted = admit(self, frame)
+        self._open.update(before)
+        return admitted
+
+    monkeypatch.setattr(Gate, "_admit", forgetful)
+    assert attacked(tmp_path, STARTS[0], (SEED, 0))["twice"] > 0
+
+
+def attacked(place: Path, start: int, seed: tuple[int, ...]) -> dict[str, Any]:
+    """Attack a link process whose next counter is `start`, and return what it did."""
+    with closing(BothEnds(place)) as link:
+        return _attack(link, start, seed)
+
+
+def _attack(link: BothEnds, start: int, seed: tuple[int, ...]) -> dict[str, Any]:
     draw = np.random.default_rng(seed)
     entry = link.sky.read(1)
     assert entry is not None
@@ -78,7 +102,6 @@ def _attack(link: BothEnds, start: int, seed: Sequence[int]) -> Result:
     numbers = [command.number for command in map(unpack, link.obeyed) if isinstance(command, Ping)]
     possible = {GENUINE + i for i, edge in enumerate(EDGES) if edge % 2**64 < HIGHEST_COUNTER}
     return {
-        "frames": sum(kinds.values()),
         "kinds": dict(kinds),
         "ended": ended,
         "obeyed": len(numbers),
@@ -118,32 +141,3 @@ def _flipped(data: bytes, draw: np.random.Generator) -> bytes:
     for _ in range(int(draw.integers(1, 4))):
         changed[draw.integers(len(changed))] ^= 1 << int(draw.integers(8))
     return bytes(changed)
-
-
-def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return the sums over all link processes."""
-    del folder
-    kinds: Counter[str] = Counter()
-    refused: Counter[str] = Counter()
-    for result in results:
-        kinds.update(result["kinds"])
-        refused.update(result["refused"])
-    facts = {
-        "processes": len(results),
-        "frames": sum(result["frames"] for result in results),
-        **{name: sum(result[name] for result in results) for name in ("obeyed", "twice", "strange", "deaf")},
-        "ended": sorted({result["ended"] for result in results} - {""}),
-        "kinds": dict(kinds),
-        "refused": dict(refused),
-    }
-    return summary(facts)
-
-
-FRAMES_CAMPAIGN = Campaign(
-    "frames",
-    "telecommand frames mutated, repeated and reordered at every edge of the counter: none is obeyed twice",
-    cases,
-    run,
-    summarise,
-    default_runs=1000,
-)
