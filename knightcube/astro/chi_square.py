@@ -1,8 +1,7 @@
 """Upper quantiles of the chi-square distribution for small numbers of degrees of freedom.
 
 The upper tail probability has a closed form (Abramowitz and Stegun, 26.4.4, 26.4.5 and 26.4.8), which is
-inverted by bisection. The module scipy.stats is not used, because it would need 13 MB of memory in the
-control process.
+inverted by bisection. The module scipy.stats would need 13 MB of memory in the control process.
 """
 
 from __future__ import annotations

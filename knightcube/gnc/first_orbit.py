@@ -125,8 +125,7 @@ class Bearings:
         times: increasing times (n,) of the sightings, s.
         directions: unit vectors (n, 3) from the observer to the object, ICRS.
         sigma: standard deviation (n,) of the directions along each axis, rad.
-        observer: position and velocity (n, 6) of the observer relative to the Earth's centre, ICRS, m and
-            m/s.
+        observer: geocentric position and velocity (n, 6) of the observer, ICRS, m and m/s.
         earth: velocity (3,) of the Earth relative to the Sun, ICRS, m/s.
     """
 

@@ -53,8 +53,7 @@ class FrameSightings:
         magnitudes: magnitudes (n,) of the objects, calibrated by the stars in the frame, or NaN if unknown.
         attitude: covariance (3, 3) of the attitude error, ICRS axes, rad^2. The attitude error rotates all
             directions of a frame together.
-        observer: position (3,) of the observer from the Earth's centre, ICRS, m, or None on the ground or if
-            unknown.
+        observer: geocentric position (3,) of the observer, ICRS, m, or None on the ground or if unknown.
     """
 
     time_ns: int
@@ -97,8 +96,7 @@ class LineOfSightState:
         time_ns: time of the state.
         direction: unit vector (3,) to the object, ICRS.
         velocity: relative velocity (3,) divided by the range (z of the module's docstring), ICRS, 1/s.
-        covariance: covariance (6, 6) of direction and velocity; the variance of the direction vector along
-            itself is zero.
+        covariance: covariance (6, 6) of direction and velocity, with zero variance along the direction.
     """
 
     time_ns: int
@@ -232,8 +230,7 @@ class TrackSettings:
         missed: probability that the gate rejects a true sighting of the object.
         moving: minimum difference between the angular rates of object and stars for a confirmed track, in
             standard deviations.
-        minimum_rate: angular rate below which an object cannot be distinguished from an uncatalogued star,
-            rad/s.
+        minimum_rate: angular rate below which an object may be an uncatalogued star, rad/s.
         coast: time after which a confirmed track without a sighting ends, s.
         maximum_tracks: largest number of tracks, including tentative tracks.
         brightness: standard deviation of the brightness of an object from sighting to sighting, magnitudes.
@@ -264,8 +261,7 @@ class Track:
         magnitude_sigma: standard deviation of the mean magnitude, computed from the scatter, or NaN before
             the second sighting. The common error of all magnitudes due to the colours of the stars is not
             included.
-        history: one bit per frame, which is set if the frame contains a sighting; the lowest bit is for the
-            newest frame.
+        history: one bit per frame, set if the frame contains a sighting; the lowest bit is the newest frame.
         measured: direction (3,) of the sighting in the newest frame, or NaN without a sighting.
         measured_sigma: standard deviation of `measured` along each axis, including the attitude error, rad.
         chi_square: chi-square of the sightings relative to the predictions, with two degrees of freedom per

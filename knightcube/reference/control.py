@@ -119,8 +119,7 @@ class AdaptiveSettings:
     Attributes:
         bandwidth: factor l in the composite error s = e' + l e, rad/s; also the gain on s, 1/s.
         adaptation: adaptation gain, divided by the square of each parameter's range, s/rad^2.
-        reference_bandwidth: bandwidth of the reference model, rad/s, or None to follow the commanded motion
-            directly.
+        reference_bandwidth: bandwidth of the reference model, rad/s, or None without a reference model.
         dead_zone: minimum absolute composite error s for adaptation of the parameters, rad/s.
     """
 

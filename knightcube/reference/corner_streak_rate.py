@@ -217,11 +217,9 @@ class RotationFit:
     Attributes:
         rotation_vector: (3,) rotation vector from the first ends to the second ends in camera axes, rad.
         covariance: (3, 3) covariance of the rotation vector, rad^2.
-        endpoints: (n, 2, 2) end positions corrected for bias, px; the ends are ordered consistently for all
-            streaks.
+        endpoints: (n, 2, 2) end positions, corrected for bias and consistently ordered, px.
         used: (n,) whether each streak is used in the rotation.
-        residual: RMS error of a streak end, computed from the residuals of the used streaks (Sease, eq. 4.7),
-            rad.
+        residual: RMS error of a streak end from the residuals of the used streaks (Sease, eq. 4.7), rad.
     """
 
     rotation_vector: FloatArray
@@ -409,8 +407,7 @@ def trajkovic_response(
 def simple_response(image: FloatArray, neighbours: int) -> FloatArray:
     """Return the simple cornerness: the minimum squared intensity change over the diameters.
 
-    A diameter is a line through a pixel that ends at two opposite pixels of its 4 or 8 neighbours (Sease, eq.
-    3.9 and 3.10).
+    A diameter connects two opposite pixels of the 4 or 8 neighbours of a pixel (Sease, eq. 3.9 and 3.10).
     """
     return np.asarray(np.min([changes.squared for changes in _changes(image, neighbours)], axis=0))
 

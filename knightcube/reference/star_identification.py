@@ -89,8 +89,7 @@ class ClassicalSettings:
         brightest: number of brightest observed stars from which patterns are formed.
         tolerance: tolerance of angles, areas and moments, in standard deviations.
         patterns: maximum number of triangles or grid patterns that are looked up in a table.
-        joins: maximum total number, for all image scales, of triangles formed from star pairs; a triangle
-            takes 0.5 ms.
+        joins: maximum number, for all image scales, of triangles formed from pairs, which take 0.5 ms each.
         candidates: maximum number of candidates per image scale that are compared with the observed stars.
         screened: number of brightest observed stars with which a candidate is first compared.
         verified: maximum number of candidates of a pattern that are verified with all observed stars.
@@ -743,8 +742,7 @@ def match_images(
         observed: (n, 3) observed unit vectors in camera axes, boresight +z.
         reference: (n, 3) reference unit vectors.
         sigma: (n,) standard deviations of the observed directions, rad.
-        prior: (4,) prior attitude, reference frame to camera; by default the TRIAD attitude of the best pair
-            of stars.
+        prior: (4,) prior attitude, reference frame to camera; by default TRIAD with the best pair of stars.
         steps: number of projections with the newest attitude.
     """
     seen = sightings(observed, reference, sigma)

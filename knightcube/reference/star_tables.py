@@ -52,8 +52,7 @@ class KVector:
     Attributes:
         key: (n,) keys in ascending order.
         count: (cells + 1,) number of keys below each evenly spaced value of the straight line.
-        slope, origin: parameters of the straight line, whose value at index j is origin + slope j (Michalski,
-            eq. 53).
+        slope, origin: parameters of the straight line origin + slope j at index j (Michalski, eq. 53).
     """
 
     key: npt.NDArray[Any]

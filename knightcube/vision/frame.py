@@ -552,8 +552,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
 def _root_of(root: IntArray, run: int) -> int:
     """Return the first run of the region that contains `run`, and shorten the links to the first run.
 
-    A run consists of adjacent pixels in a row. The array `root` links each run to an earlier run of its
-    region.
+    A run is a row's adjacent pixels. The array `root` links each run to an earlier run of its region.
     """
     while root[run] != run:
         root[run] = root[root[run]]
@@ -656,8 +655,7 @@ _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) !
 def repair_hot_pixels(signal: Image, noise: Image) -> int:
     """Replace hot pixels of `signal` (rows, columns) by their neighbours' median, and return their number.
 
-    Only pixels well above the noise are tested. The array `noise` (rows, columns) is the standard deviation
-    of the noise.
+    Only pixels well above the noise, whose standard deviation is `noise` (rows, columns), are tested.
     """
     row, column = find_hot_pixels(signal, np.square(noise))
     bright = signal[row, column] > _REPAIR_SIGMAS * noise[row, column]
@@ -785,8 +783,7 @@ class FrameState(Enum):
 def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> FrameState:
     """Return whether a frame (rows, columns) is usable, dead (all pixels are equal) or overexposed.
 
-    A frame is overexposed if at least the fraction `saturated_fraction` of its pixels reaches the count
-    `saturation`.
+    A frame is overexposed if at least the fraction `saturated_fraction` of its pixels is saturated.
     """
     if np.count_nonzero(at_least(pixels, saturation)) >= saturated_fraction * pixels.size:
         return FrameState.SATURATED

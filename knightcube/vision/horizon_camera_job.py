@@ -76,8 +76,7 @@ class StructureMap:
     Attributes:
         rows, columns: number of pixels of the images.
         configured: mask of the blocks that contain configured structure (m, n).
-        level: mean brightness of the blocks in the last counted frame (m, n), or an empty array (0, 0) before
-            the first frame.
+        level: mean brightness of the blocks in the last counted frame (m, n); (0, 0) before the first frame.
         quiet: number of counted frames since the last change of each block (m, n).
     """
 
@@ -170,8 +169,7 @@ class HorizonCameraJob:
 class MeasuredDirection:
     """A direction (3,) in body axes, its covariance (3, 3), rad^2, and the cameras that measured it.
 
-    If `cameras` is empty, the direction is the Sun from the solar strings, or the nadir from the brightness
-    of all images.
+    If `cameras` is empty, it is the Sun from the solar strings, or the nadir from the brightness.
     """
 
     direction: FloatArray

@@ -94,8 +94,7 @@ class LensPrior:
             roughly known field of view.
         centre: error of the optical axis in the image, per axis, px. The default `centre` allows for the
             position error of a sensor that was mounted by hand.
-        k1, k2: errors of the radial distortion coefficients. The default `k1` and `k2` allow any lens except
-            a fisheye.
+        k1, k2: errors of the radial distortion coefficients. The defaults allow any lens except a fisheye.
         pixels: errors of aspect and shear. The default `pixels` means square pixels.
         tangential: errors of the tangential distortion coefficients p1 and p2. The default `tangential` means
             no tangential distortion.
@@ -307,8 +306,7 @@ def _rms(frames: Sequence[MatchedFrame], lens: Lens, used: Sequence[BoolArray]) 
 class OmittedTerm:
     """A lens term that the stars do not determine: last fitted values and their standard deviations.
 
-    The calibrated lens has the values `assumed` instead. There is one value for k1 and k2, and x and y for
-    the centre.
+    The calibrated lens has the values `assumed` instead: one for k1 and k2, and x and y for the centre.
     """
 
     values: tuple[float, ...]
@@ -321,8 +319,7 @@ class DeterminedLens:
     """A calibration that includes only the lens terms determined by the stars.
 
     Attributes:
-        calibration: calibration in which the omitted terms have their assumed values and nearly zero
-            uncertainty.
+        calibration: calibration with assumed, nearly certain values of the omitted terms.
         omitted: omitted lens terms by their names "k1", "k2" and "centre".
         accuracy: standard deviations of the lens by the keys of `camera.accuracy` in a configuration. A key
             of `accuracy` is missing if the stars do not determine its lens term.
@@ -500,14 +497,12 @@ def calibrate_lens(
     All images must be taken by one camera at one focus setting. Images that do not fit the lens of the other
     images are excluded. Ten images with stars in the corners give a better calibration than a hundred images
     without stars in the corners. Lens terms that the stars do not determine are omitted. If most images show
-    a mirrored sky, because of a mirror or a reversed order of the rows, they are mirrored back for the
-    calibration.
+    a mirrored sky, because of a mirror or a reversed order of the rows, they are mirrored back.
 
     Args:
         images: arrays (rows, columns) of counts, all of one shape. Colour images (rows, columns, 3) are
             converted to luminance.
-        fov_deg: approximate field of view across the columns, deg. If `fov_deg` is None, fields from 4 to 60
-            deg are tried.
+        fov_deg: approximate field of view across the columns, deg. Without it, 4 to 60 deg are tried.
         progress: function that is called before each image with the number of the pass and the number of the
             image, both counted from 1.
 

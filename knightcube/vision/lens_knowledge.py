@@ -254,8 +254,7 @@ def residual_lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[Float
 def residual_spread(lengths: Sequence[FloatArray]) -> float:
     """Return the standard deviation per axis of the residuals, estimated from their median.
 
-    The returned standard deviation is at least one. Raises CalibrationError if half of the stars are behind
-    the camera.
+    It is at least one. Raises CalibrationError if half of the stars are behind the camera.
     """
     median = float(np.median(np.concatenate(lengths)))
     if not median < np.inf:
@@ -496,8 +495,7 @@ class LensKnowledge:
 
         The frame was solved with `camera` and `shutter` of this object and, if given, with the velocity (3,)
         of the camera, m/s. If the frame contradicts the estimated lens, the result is the configured lens,
-        the attribute `contradictions` is increased by one, and the frame should be solved again with the
-        configured lens.
+        the attribute `contradictions` is increased by one, and the frame should be solved again.
         """
         motion, line_time_known = solution.motion, self.shutter[1] == 0.0
         if solution.fix is None or solution.mirrored or len(solution.matched) < _LEAST_MATCHED:
@@ -539,8 +537,7 @@ class LensKnowledge:
     def _with_psf(self, measured: float) -> LensKnowledge:
         """Return the estimate updated with a measured point-spread width, px, which is NaN if unknown.
 
-        If the measured width contradicts the estimated width, the estimation starts again from the configured
-        width.
+        If the measured width contradicts the estimated width, the configured width is estimated again.
         """
         if not measured > 0.0:
             return self
@@ -563,8 +560,7 @@ class _FrameFit:
         covariance: covariance (10, 10) of the parameters.
         objective: chi-square of residuals and prior.
         used: mask (n,) of the stars that agree with the fit.
-        excess: chi-square of the residuals per degree of freedom if it is significantly greater than 1,
-            otherwise 1.
+        excess: chi-square of the residuals per degree of freedom if significantly above 1, otherwise 1.
     """
 
     parameters: FloatArray

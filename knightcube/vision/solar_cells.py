@@ -62,8 +62,7 @@ class SolarStringModel:
         peaks: currents (n,) in full sunlight at normal incidence, A.
         sigma: standard deviation of a reading relative to its peak, from calibration errors and departures
             from the cosine law.
-        albedo: illumination by an Earth that would fill half the sky, relative to the Sun, as a mean over day
-            and night.
+        albedo: mean illumination by an Earth that would fill half the sky, relative to the Sun.
         albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
         dark: fraction of its peak current below which a string counts as dark.
 
@@ -324,8 +323,7 @@ class FieldAndStrings:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the chi-squares of the relative currents `shares` (n,) for t trial rotations.
 
-        The first returned array (t,) uses all strings, and each row of the second array (n, t) omits one
-        string.
+        The first returned array (t,) uses all strings, and each row of the second array (n, t) omits one.
         """
         strings = self._strings
         sunlight, slopes = _sunlight(_rotated_about(base @ sky.sun, axis) @ strings.normals.T)

@@ -53,8 +53,7 @@ class MatchedStars:
         magnitude: Johnson V magnitudes (m,). For stars that the image does not resolve, `magnitude` is their
             combined magnitude.
         directions: unit vectors (m, 3) to the stars, ICRS, at the epoch of the image.
-        points: measured positions (m, 2), x and y, px. The position of a streaked star is that at
-            mid-exposure.
+        points: measured positions (m, 2), x and y, px, of streaked stars at mid-exposure.
         residuals: measured minus predicted positions of the stars (m, 2), px.
     """
 
@@ -85,18 +84,15 @@ class StarSolution:
         reason: one-sentence reason why the image was not solved. The reason is empty for a solved image.
         right_ascension: right ascension of the boresight, ICRS, from 0 to 2 pi, rad.
         declination: declination of the boresight, ICRS, rad.
-        roll: position angle of the image's upward direction (-y), from north through east, from 0 to 2 pi,
-            rad.
+        roll: position angle of the image's upward direction (-y), north through east, 0 to 2 pi, rad.
         quaternion: attitude (4,) at mid-exposure, scalar last. The quaternion rotates ICRS into camera axes:
             z along the boresight, x to the right along the pixel rows, y down.
         covariance: covariance (3, 3) of the attitude error as a small rotation in camera axes, rad^2.
         stars: identified catalogue stars.
         field_of_view: angle between the outer edges of the first and last column, without distortion, rad.
             The field of view is fitted to the stars unless the camera is calibrated.
-        field_of_view_sigma: standard deviation of the field of view, rad. The deviation is 0 for a calibrated
-            camera.
-        log10_false_alarm: log10 of an upper limit of the probability that points at random positions are
-            solved.
+        field_of_view_sigma: standard deviation of the field of view, rad; 0 for a calibrated camera.
+        log10_false_alarm: log10 of an upper limit of the probability that random points are solved.
         mirrored: whether the image is a mirror image of the sky. The attitude of a mirror image is that of
             the image after left and right are swapped.
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
@@ -169,17 +165,15 @@ class StarTracker:
     """Determines the attitude of a camera from single images of the sky, with or without a prior attitude.
 
     The star tracker identifies the stars against the Hipparcos catalogue to V 8.5 and fits the attitude to
-    their positions in the image. Streaked stars also give the angular velocity. One instance can solve any
-    number of images. The sky index is built in a few seconds at the first use and stored in the user's cache
-    folder.
+    their positions in the image. Streaked stars also give the angular velocity. The sky index is built in a
+    few seconds at the first use and stored in the user's cache folder.
 
     Args:
         fov_deg: field of view between the outer edges of the first and last column, from 1 to 120 deg. If
             `fov_deg` is None, fields from 4 to 60 deg are tried.
         fov_error_deg: largest error of the field of view, deg. If `fov_error_deg` is None, the error is 5 %
             of `fov_deg`, or zero for a given `camera`.
-        camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`), given instead of
-            `fov_deg`.
+        camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`) instead of `fov_deg`.
         settings: settings of detection, identification and attitude estimation. None: the defaults.
         index: a sky index, or the path of a sky index file. None: the default index.
         learn: whether the lens parameters are estimated from the solved images, which must be taken by one
@@ -188,8 +182,7 @@ class StarTracker:
             uncalibrated camera.
 
     Raises:
-        InputError: if a field of view is out of range or is given together with a camera, or if the index
-            cannot be read.
+        InputError: if a field of view is out of range or given with a camera, or for an unreadable index.
 
     Source: the overall method follows Michalski, chapter 3; see `knightcube.vision.startracker`.
     """
@@ -246,8 +239,7 @@ class StarTracker:
             rate_sigma: standard deviation of each component of the predicted rate, rad/s.
 
         Raises:
-            ValueError: if the image has another shape, is smaller than 16 x 16 pixels, or has non-finite
-                values.
+            ValueError: if the image has another shape, fewer than 16 x 16 pixels or non-finite values.
             InputError: if the image does not have the size of the camera.
         """
         image = grey_image(image)
@@ -277,8 +269,7 @@ class StarTracker:
         """Return the solution of a large image after binning, or None if no binned image is solved.
 
         The stars of large photographs are often several pixels wide. Compression or interpolation correlates
-        the noise of neighbouring pixels, so that the computed uncertainties of the star positions are too
-        small.
+        the noise of neighbouring pixels, so that the computed uncertainties are too small.
         """
         for size in _SQUARES:
             if min(image.shape) < _LEAST_COARSE_PX * size:

@@ -451,8 +451,7 @@ class Circle:
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     """Return the circle through rim `points` (n, 2), which are in order around it; None if there is none.
 
-    The argument `scale` is the standard deviation of a point that is not an outlier, in the unit of the
-    points.
+    The argument `scale` is the standard deviation of a point that is not an outlier.
     """
     solution = _consensus(points, 2.5 * scale) if len(points) >= _LEAST_POINTS else None
     if solution is None:
@@ -585,8 +584,7 @@ class SunOfCameras:
     """The Sun in body axes.
 
     Attributes:
-        direction: unit vector (3,) to the Sun, or None if neither a camera nor the solar strings found the
-            Sun.
+        direction: unit vector (3,) to the Sun, or None if neither a camera nor the solar strings found it.
         covariance: covariance (3, 3) of the direction error, zero along the direction, rad^2.
         camera: index of the camera that found the Sun, or None if the solar strings gave the direction.
         each: result of the search in each image by camera index, in the order in which the cameras were read.

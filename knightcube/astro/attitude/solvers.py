@@ -318,8 +318,7 @@ class OlaeSolution:
 def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) -> OlaeSolution:
     """Return the least-squares rotation from unit vectors `starts` to `ends` (n, 3) (Sease, eq. 4.1-4.7).
 
-    Raises numpy.linalg.LinAlgError if the directions do not determine a rotation, for example a single
-    direction.
+    Raises numpy.linalg.LinAlgError if the directions do not determine a rotation.
     """
     sums, differences = ends + starts, ends - starts
     cross = cross_matrices(sums)
@@ -435,8 +434,7 @@ def field_observation(field: FloatArray, reference: FloatArray, covariance: Floa
     """Return the direction observation of a measured magnetic field (3,), body axes, T.
 
     The covariance (3, 3), T^2, includes the magnetometer bias. The field `reference` (3,), T, is that of the
-    model in inertial axes. Raises AttitudeError for a field so weak that the error of its direction exceeds
-    one radian.
+    model in inertial axes. Raises AttitudeError if the error of the field's direction exceeds one radian.
     """
     strength = float(np.linalg.norm(reference))
     if not float(np.sqrt(np.trace(covariance))) < strength:
@@ -450,8 +448,7 @@ def weighted_fit(observations: Sequence[VectorObservation]) -> AttitudeFix:
     """Return the least-squares attitude of directions with full covariance matrices.
 
     Gauss-Newton iterations start from the QUEST attitude. Twice the loss has a chi-square distribution with
-    2n - 3 degrees of freedom for n directions. Raises AttitudeError if the directions do not determine an
-    attitude.
+    2n - 3 degrees of freedom for n directions. Raises AttitudeError if the attitude is not determined.
     """
     observed, reference = (
         np.array([getattr(o, name) for o in observations]) for name in ("observed", "reference")

@@ -57,8 +57,8 @@ class AttitudeFix:
     """Attitude determined from directions.
 
     Attributes:
-        quaternion: (4,) rotation of the reference frame into the observer's frame, with a scalar part of at
-            least 0.
+        quaternion: (4,) rotation of the reference frame into the observer's frame; its scalar is not
+            negative.
         covariance: (3, 3) covariance of small rotations about the observer's axes, rad^2.
         loss: half the sum of squared normalised residuals.
     """
@@ -77,7 +77,7 @@ class Sightings:
         weight: (n,) weights 1/sigma^2, scaled to a sum of one.
         total: sum of 1/sigma^2, 1/rad^2.
         profile: (3, 3) attitude profile matrix, the weighted sum of b r^T.
-        covariance: (3, 3) covariance of the optimal attitude for small rotations about the observer's axes,
+        covariance: (3, 3) covariance of the optimal attitude, small rotations about the observer's axes,
             rad^2.
     """
 
@@ -216,8 +216,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
     The second derivative of the loss differs from the information matrix by at most sqrt(2 loss/total). If
     the loss is small, the information matrix is used as second derivative (Gauss-Newton method). The four
     stationary points of the loss are the eigenvectors of Davenport's matrix K, and only one stationary point
-    is a minimum. If the largest eigenvalue is double, for example for mirrored directions, the minimum is not
-    unique.
+    is a minimum. If the largest eigenvalue is double, as for mirrored directions, it is not unique.
 
     Raises AttitudeError if the iteration does not converge, or converges to a point that is not a minimum.
     """

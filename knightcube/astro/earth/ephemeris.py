@@ -152,8 +152,7 @@ def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) 
     """Return the field (n, 3) in ICRS axes, T, predicted by a dipole model for `times` (n,) after now, s.
 
     The satellite is assumed to move along a circle with its current position, direction and angular rate. The
-    dipole field is rotated and scaled to agree with the current field (3,), and this correction decays with
-    time.
+    dipole field is rotated and scaled to agree with the current field (3,); this correction decays.
     """
     all_times = np.concatenate([[0.0], times])
     distance = float(np.linalg.norm(state.position))

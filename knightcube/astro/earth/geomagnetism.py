@@ -91,8 +91,7 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
 def fields(julian_dates: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the fields (n, 3) at n Julian dates UTC and positions (n, 3), equal to the results of `field`.
 
-    The expansion is evaluated for all positions together. For a hundred positions, the computation takes 0.03
-    ms per position.
+    The expansion is evaluated for all positions together, which takes 0.03 ms each for a hundred positions.
     """
     to_ground = celestial_to_terrestrial(julian_dates)
     there = np.array([turn @ position for turn, position in zip(to_ground, positions, strict=True)])

@@ -101,7 +101,7 @@ class CoilMap:
         resistance: resistance of each coil (n,), ohm.
         limits: largest dipole moment along each body axis (3,), A m^2. The coils can produce all dipole
             moments within these three limits.
-        heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, of currents below their
+        heat: heating power per squared dipole moment (3, 3), W/(A m^2)^2, body axes, below the current
             limits.
     """
 
@@ -157,8 +157,7 @@ class CoilMap:
     def currents(self, dipole: FloatArray) -> FloatArray:
         """Return the currents (n,), A, of least heat that produce a dipole moment (3,), A m^2.
 
-        The currents of more than three coils satisfy the current limits if the dipole moment is within
-        `limits`.
+        The currents of more than three coils are within their limits if the dipole moment is within `limits`.
         """
         if self._strength is not None:
             return np.asarray(dipole / self._strength)
@@ -172,8 +171,7 @@ class CoilMap:
 
         By duality, the currents are R^-1 D' y, clipped to the limits, for a vector y (3,) of Lagrange
         multipliers. The multipliers maximise a concave function, whose gradient is the difference between the
-        wanted and the produced dipole moment. The multipliers are found by Newton's method with a line
-        search.
+        wanted and the produced dipole moment. They are found by Newton's method with a line search.
         """
         limits, resistance = self.current_limits, self.resistance
 
@@ -285,8 +283,7 @@ class Allocation:
     Attributes:
         currents: coil currents (n,), zero for coils that are not available, A.
         torque: torque (3,) of the allocated currents, N m.
-        share: component of the torque along the requested torque, as a fraction of the requested torque, 0 to
-            1.
+        share: component of the torque along the requested torque, as a fraction of the latter, 0 to 1.
     """
 
     currents: FloatArray

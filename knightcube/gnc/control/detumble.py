@@ -109,8 +109,7 @@ def braking_current(
 ) -> FloatArray:
     """Return the currents (3,), A, that reduce a rate (3,), rad/s, across a field (3,), T, in `act_time` s.
 
-    If a coil would exceed its current limit, all three currents are scaled by one factor to preserve the
-    direction.
+    If a coil would exceed its current limit, one factor scales all currents to preserve the direction.
     """
     square = float(field @ field)
     if square == 0.0:

@@ -175,8 +175,7 @@ def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> 
 def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     """Return `fields` (n, 3), rotated so that the first predicted field has the direction of `field` (3,).
 
-    The rotation is useful because the measured field is more accurate than fields predicted with a coarse
-    attitude.
+    The measured field is more accurate than fields predicted with a coarse attitude.
     """
     first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
     wanted = field / math.sqrt(float(field @ field))
@@ -304,8 +303,7 @@ class FieldDetumblerSettings:
         horizon: duration of the field prediction, about a quarter of an orbit, s.
         replan: time between momentum plans, s.
         gentle: initial rate up to which the upper bound of the rate equals the initial rate, rad/s.
-        spin_up: ratio of the upper bound of the rate to the initial rate if the initial rate is above
-            `gentle`.
+        spin_up: ratio of the upper bound of the rate to the initial rate if the latter is above `gentle`.
         slow: rate below which a body counts as detumbled, rad/s.
     """
 

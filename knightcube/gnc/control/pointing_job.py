@@ -172,8 +172,7 @@ def slew(
 ) -> SlewPath | None:
     """Return a slew, slower than `fastest` rad/s, to the attitude law of a target, or None if none is found.
 
-    The slew avoids the exclusion cones that do not contain the camera at the start, unless no such slew is
-    found.
+    If possible, the slew avoids the exclusion cones that do not contain the camera at the start.
     """
     first = float(begin.times[0])
     start = begin.quaternion[None]
@@ -219,8 +218,7 @@ def _slow_enough(
 ) -> SlewPath | None:
     """Return a path of a task on which the body is slower than `fastest` rad/s, or None if none is found.
 
-    The duration of the path is increased if necessary. The search is warm-started from `near`, the path of a
-    similar task.
+    The duration is increased if necessary. The search starts from `near`, the path of a similar task.
     """
     plan, _ = wish.planners()
     for _ in range(_TRIALS):
@@ -458,8 +456,7 @@ class PointingJob:
         areas: relative areas (3,) of the faces on which air and sunlight act.
         slew: parameters of slews, or None if the body approaches every attitude law without a slew.
         running: the slew in progress whose remaining part is replanned, or None if a new path is planned.
-        sight: the sighted object at which the body points instead of `target`, or None if it points at
-            `target`.
+        sight: the sighted object at which the body points instead of `target`, or None.
     """
 
     number: int

@@ -37,8 +37,7 @@ LARGEST_RATE = math.radians(1.0)
 class PointingCommand:
     """Dipole moment (3,), A m^2, within the coils' limit, and the errors relative to the reference.
 
-    The errors are a rotation vector (3,), rad, from the reference attitude to the body, and a rate (3,),
-    rad/s.
+    The errors are a rotation vector (3,), rad, from the reference to the body, and a rate (3,), rad/s.
     """
 
     dipole: FloatArray

@@ -55,8 +55,7 @@ class LinearErrorModel:
 
     Attributes:
         transition: (n, 6, 6).
-        by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2 for a
-            dipole.
+        by_control: change of the errors (n, 6, controls) per unit of each control, such as A m^2.
         by_torque: change of the errors (n, 6, 3) per N m of torque in each axis.
         missing: torque f (n, 3) that the reference motion needs in addition to the modelled torques, N m.
         field: magnetic field (n, 3) in the axes of the reference motion, T.
@@ -79,8 +78,7 @@ class SweepCost:
         state: quadratic weights (n, 6, 6) of the errors.
         control: quadratic weights (n, controls) of the controls.
         state_slope, control_slope: linear weights of the errors (n, 6, columns) and of the controls (n,
-            controls, columns). Each column belongs to one source of errors, as in the affine part of the
-            error model.
+            controls, columns). Each column belongs to one source of errors.
     """
 
     state: FloatArray
@@ -440,8 +438,7 @@ def propagate(
 ) -> PlannedMotion | None:
     """Return the motion after applying the feedback gains and a fraction `share` of the computed change.
 
-    Returns None if the motion diverges. Far from `motion`, the unlimited torques along the field can cause a
-    divergence.
+    Returns None if the motion diverges, due to the unlimited torques along the field far from `motion`.
     """
     count, step = len(motion.control), expected.step
     quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))

@@ -116,8 +116,7 @@ def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
 def _rotation_jacobian(vector: FloatArray) -> FloatArray:
     """Return the derivatives (n, 3, 3) of rotations with respect to the rotation vectors (n, 3).
 
-    The derivatives are left Jacobians of the rotation group, for scalar-last quaternions from inertial into
-    body axes.
+    They are left Jacobians of the rotation group, for scalar-last quaternions, inertial to body axes.
     """
     angle = np.linalg.norm(vector, axis=1)[:, None, None]
     safe = np.where(angle < 1e-2, 1.0, angle)
@@ -318,8 +317,7 @@ class PointingTable:
         wanted: motion commanded by the attitude law at n + 1 instants.
         dipole: feedforward dipole moment (n, 3), held until the next instant, A m^2.
         gain: feedback gains K (n, 3, 6), in A m^2 per rad and per rad/s.
-        torque_part: change of the dipole moment (n, 3, 9) per change of each disturbance torque component, A
-            m^2/(N m).
+        torque_part: change of the dipole moment (n, 3, 9) per disturbance torque component, A m^2/(N m).
         sizes: components (9,) of the disturbance torques with which the path was planned, N m.
         slew: slew path at the start of the table, with times from the start of the path, or None if the table
             begins without a slew.

@@ -108,8 +108,7 @@ class CommandCheck:
     def judge(self, newest: Checkpoint) -> int | None:
         """Return the time (ns) from which the currents are unknown, if the newest checkpoint raises an alarm.
 
-        Return None if no alarm is raised. A checkpoint of a measurement other than a gyro rate never raises
-        one.
+        Return None without an alarm. Only a checkpoint of a gyro rate raises an alarm.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
@@ -213,8 +212,7 @@ class FilterSettings:
         disturbance_start: initial standard deviation of the unmodelled angular acceleration, rad/s^2.
         bias_walk: random walk of the gyro bias, rad/s per sqrt(s).
         bias_start: initial standard deviation of the gyro bias, rad/s.
-        torsion_start: initial standard deviation of the thread's torsion, 1/s^2; zero if the torsion is
-            known.
+        torsion_start: initial standard deviation of the thread's torsion, 1/s^2; zero if it is known.
         damping_start: initial standard deviation of the thread's damping, 1/s; zero if the damping is known.
         gain_start: initial standard deviation of the coils' gain; zero if the gain is known.
         latency_start: initial standard deviation of the age that the inertial unit's samples have at their
@@ -222,7 +220,7 @@ class FilterSettings:
         latency_walk: random walk of the age of the inertial unit's samples, s per sqrt(s).
         field_bias_start: initial standard deviation of the magnetometer bias, T; zero without a magnetometer.
         field_bias_walk: random walk of the magnetometer bias and of the field model's error, T per sqrt(s).
-        rate_walk: random walk of the rate due to white torque noise other than that of the coils, rad/s per
+        rate_walk: random walk of the rate due to torque noise other than that of the coils, rad/s per
             sqrt(s).
         unknown_current: current assumed for a coil whose current is unknown, A.
         gate_sigma: gate threshold; a measurement is rejected if it is less likely than a deviation of one
@@ -350,8 +348,7 @@ class AttitudeFilter:
         refused: number of measurements that did not pass the gate.
         late: number of measurements that were too late to be inserted.
         restarts: number of times that the filter discarded its estimate.
-        nis: normalised innovation squared of the last measurement; NaN if the last measurement was not
-            applied.
+        nis: normalised innovation squared of the last measurement; NaN if it was not applied.
     """
 
     REJECTIONS_TO_RESTART = 40

@@ -40,8 +40,7 @@ class StateBlock:
     Attributes:
         name: name of the block, unique within the list.
         prior: initial standard deviations (n,) or initial covariance (n, n).
-        walk: standard deviations (n,) of the random walk per sqrt(s); a single number applies to all
-            elements.
+        walk: standard deviations (n,) of the random walk per sqrt(s), or one number for all elements.
         role: whether the block is estimated, considered or fixed.
     """
 
@@ -254,8 +253,7 @@ class PriorCheck:
 def gate_bounds(sigma: float) -> dict[int, float]:
     """Return the largest accepted normalised square of an innovation with 1, 2 and 3 components.
 
-    A larger squared innovation is less likely than a deviation of one component by `sigma` standard
-    deviations.
+    A larger square is less likely than a deviation of one component by `sigma` standard deviations.
     """
     chance = math.erfc(sigma / math.sqrt(2.0))
     return {components: chi_square.bound(chance, components) for components in (1, 2, 3)}
@@ -279,8 +277,7 @@ def _inverted(s: FloatArray) -> FloatArray:
 def with_role(blocks: Sequence[StateBlock], roles: Mapping[str, Role]) -> list[StateBlock]:
     """Return the blocks of an error state with some roles replaced.
 
-    The mapping `roles` assigns new roles to names of blocks. Raises UsageError if no block has one of the
-    names.
+    The mapping `roles` assigns new roles to names of blocks. Raises UsageError for an unknown name.
     """
     unknown = sorted(roles.keys() - {block.name for block in blocks})
     if unknown:

@@ -34,8 +34,7 @@ class _AtOneTime:
 class AttitudeMeasurement(_AtOneTime):
     """A measured attitude (4,), reference to body axes, with covariance (3, 3), rad^2, in body axes.
 
-    The flag `by_stars` is true for an attitude of the star camera, whose misalignment is not included in the
-    covariance.
+    The flag `by_stars` marks an attitude of the star camera. The covariance excludes its misalignment.
     """
 
     time_ns: int
@@ -159,8 +158,7 @@ class Estimate:
         bias: gyro bias (3,) in body axes, rad/s.
         disturbance: unmodelled angular acceleration (3,), rad/s^2.
         parameters: estimated torsion and damping of the thread, and gain of the coils.
-        covariance: covariance (19, 19) of the error state, whose attitude error is a rotation vector in body
-            axes.
+        covariance: covariance (19, 19) of the error state; the attitude error is a rotation in body axes.
         measured_ns: time of the newest accepted measurement, ns.
         latency: age of the inertial unit's samples at the time of their time stamps, s.
         field_bias: magnetometer bias (3,) in body axes, T.

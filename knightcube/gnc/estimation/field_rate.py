@@ -59,8 +59,7 @@ class FieldRateSettings:
 
     Attributes:
         inertia: assumed inertia tensor (3, 3) in body axes, kg m^2.
-        field_sigma: standard deviation of a field measurement per axis, including constant magnetometer
-            errors, T.
+        field_sigma: standard deviation of a field measurement per axis, with constant errors, T.
         rate_start: initial standard deviation of the rate along the field, rad/s.
         change_start: initial standard deviation of the field's inertial time derivative, T/s.
         change_walk: random walk of the field's inertial time derivative, T/s per sqrt(s).
@@ -72,8 +71,7 @@ class FieldRateSettings:
         refusals: number of consecutively rejected measurements after which the filter restarts (field
             measurements) or the gyro is excluded (gyro measurements).
         gyro_sigma: assumed bound of the gyro bias per axis, rad/s.
-        longest_gap: longest time between the samples that start the filter, s; longer gaps can hide a fast
-            spin.
+        longest_gap: longest time between the samples that start the filter, s, without a hidden fast spin.
     """
 
     inertia: FloatArray

@@ -239,10 +239,8 @@ class FreeFilterSettings:
             the solar radiation torque and of the constant torque are fixed fractions of `torque`.
         torque_noise: density of the white noise of all other torques, N m sqrt(s).
         coil_error: relative standard deviation of each coil's dipole, which varies over tens of seconds.
-        coil_noise: density of the white noise of each coil's dipole while the coils are driven, A m^2
-            sqrt(s).
-        coil_walk: random walk of the elements of the coils' matrix per sqrt(s), for example due to
-            temperature.
+        coil_noise: density of the white noise of each coil's dipole while it is driven, A m^2 sqrt(s).
+        coil_walk: random walk of the elements of the coils' matrix per sqrt(s), such as by temperature.
         inertia_walk: random walk of the inertia's error, relative to the trace, per sqrt(s) and per angular
             rate in rad/s. It represents flexible parts, which are loaded only while the body rotates, and
             prevents the uncertainty of the inertia from becoming too small.

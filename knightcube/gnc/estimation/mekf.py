@@ -67,8 +67,7 @@ _EYE: FloatArray = np.eye(3)
 class RateChange(NamedTuple):
     """The angular acceleration (rad/s^2) at the time of a sample, and its uncertainty.
 
-    `uncertainty` (3, 3) rad^2/s^2 is the covariance of the sampled rate due to effects that are not linear in
-    the age.
+    `uncertainty` (3, 3) rad^2/s^2 is the covariance of the sampled rate due to effects not linear in the age.
     """
 
     acceleration: Vector
@@ -102,8 +101,7 @@ def rate_change(
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:
     """Return innovation and Jacobian, corrected for age, of a quantity with the time derivative `change`.
 
-    The argument `more`, s, is the estimated age minus the assumed age that was subtracted from the time
-    stamp.
+    The argument `more`, s, is the estimated age minus the age subtracted from the time stamp.
     """
     x, y, z = change
     rows = rows.copy()

@@ -205,8 +205,7 @@ def free_roll(
 ) -> AttitudeLaw:
     """Return a law that aligns `axis` (3,) with `first` and keeps the roll of an attitude (4,) at `time`, s.
 
-    The roll is constant in inertial axes if the direction is inertially fixed, and otherwise constant in the
-    orbital axes.
+    The roll is constant in inertial axes if the direction is inertially fixed, otherwise in orbital axes.
     """
     across = _any_across(axis)
     shown = attitude_matrix(quaternion).T @ across
@@ -238,8 +237,7 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
 
-    The law starts with the given attitude (4,), changed by the shortest rotation that aligns `axis` with
-    `direction`.
+    The law starts with the given attitude (4,), rotated by the least angle so that `axis` is aligned.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)

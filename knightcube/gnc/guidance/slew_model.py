@@ -334,8 +334,7 @@ class SlewPath:
     def references(self, times: FloatArray) -> AttitudeReferences:
         """Return the commanded motion at times (m,) s.
 
-        Before the start of the path, the body rests at the first attitude, and after the end, at the last
-        attitude.
+        Before the start and after the end of the path, the body rests at the first or last attitude.
         """
         inside = np.clip(times, 0.0, self.horizon)
         turning = HermiteCubic(self.times, self.rate, self.acceleration)

@@ -314,8 +314,7 @@ class SlewOrder:
         axes: body axis that points to the targets, and body axis from which a roll is measured.
         camera: body axis (3,) that stays outside the exclusion cones.
         start: pointing target that is held until the slew begins, with a roll of zero if its roll is free.
-        goal: pointing target at the end; if its roll is free, only the direction of the target is an end
-            condition.
+        goal: pointing target at the end; if its roll is free, only the direction is an end condition.
         horizon, longest: requested and longest permitted duration of the slew, s.
         window: length of the time interval in which the slew may begin, s.
         time_cost: weight of the slew duration in the cost, W (see `SlewTask`).
@@ -490,23 +489,18 @@ def plan_slew(
         elements: two lines of the two-line element set of the orbit.
         time: UTC at the start of the slew or of the window, as a datetime without a time zone.
         start: pointing target that is held until the slew begins, with a roll of zero if its roll is free.
-        goal: pointing target at the end; if its roll is free, only the direction of the target is an end
-            condition.
+        goal: pointing target at the end; if its roll is free, only the direction is an end condition.
         duration: requested duration of the slew, s.
         longest: longest duration to which the slew may be extended if no slew of `duration` is found, s. The
             default is three times `duration`.
-        window: length of the time interval in which the slew may begin, s. The start time of minimum energy
-            is chosen.
+        window: length of the time interval in which the slew may begin, s, at the time of minimum energy.
         time_cost: weight of the slew duration in the cost, W. If `time_cost` is given, the slew minimises
             energy plus `time_cost` times the duration. If the time cost is infinite, the shortest slew is
             planned; if it is None, the duration is fixed.
         pointing_axis: unit vector (3,) of the body axis that points to the targets.
-        across_axis: unit vector (3,) of the body axis from which a roll is measured, normal to
-            `pointing_axis`.
-        camera_axis: unit vector (3,) of the body axis that stays outside the exclusion cones, or None for
-            `pointing_axis`.
-        cones: half angles of the exclusion cones about the Sun and the Moon, and angle from the Earth's limb,
-            rad.
+        across_axis: unit vector (3,) of the body axis, normal to `pointing_axis`, at which a roll begins.
+        camera_axis: unit vector (3,) of the body axis outside the cones, or None for `pointing_axis`.
+        cones: half angles of the exclusion cones of Sun and Moon, and angle from the Earth's limb, rad.
         nodes: number of collocation intervals, 8 to 96.
 
     Raises:

@@ -62,8 +62,7 @@ class BandLayout:
         end: indices (ends,) of the multipliers of the end conditions.
         begins: indices (k + 1,) of the first element of each interval and of the last node.
         places: indices, in the flattened band matrix, of the elements to which the intervals contribute.
-        entries: indices of those elements of the flattened matrix block of one interval that are copied to
-            `places`.
+        entries: indices of the elements of an interval's flattened matrix block that are copied to `places`.
     """
 
     states: IntArray
@@ -175,10 +174,8 @@ class LinearisedEquations:
         at: the trajectory about which the equations are linearised.
         between: residuals (k, 14) of the collocation equations on k intervals.
         begun: residuals (7,) of the start conditions, which fix the state at the start.
-        ended: residuals (ends,) of the end conditions, which are the attitude and rate errors at the end of
-            the slew.
-        jacobian: derivatives (k, 14, WIDE) of the collocation equations with respect to the unknowns of each
-            interval.
+        ended: residuals (ends,) of the end conditions: attitude and rate errors at the end of the slew.
+        jacobian: derivatives (k, 14, WIDE) of the collocation equations by the unknowns of each interval.
         ending: derivatives (ends, 7) of the end conditions with respect to the state at the end.
     """
 

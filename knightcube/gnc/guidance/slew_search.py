@@ -12,8 +12,7 @@ in every call.
 Without the dipole limit, most guesses converge in a dozen Newton steps to a path outside the exclusion cones
 (a relaxed path). The heat of a relaxed path is a lower bound of the heat of a path within the dipole limit.
 If the constraint violations of a guess are large after some steps, the guess is deferred, because most such
-guesses never converge. If no path of the requested duration is found, a longer slew is shortened in steps
-(continuation).
+guesses never converge. If no path of the requested duration is found, a longer slew is shortened in steps.
 """
 
 from __future__ import annotations
@@ -264,8 +263,7 @@ def _curves(equations: Transcription, craft: SlewCraft) -> tuple[FloatArray, Flo
     """Return a curve (n, 3) of the angular momentum from start to end, and d modes (d, n, 3) of its change.
 
     The momentum is in kg m^2/s and ICRS axes. The modes preserve both ends, and are orthogonal, so that their
-    heats are additive. An amplitude of one corresponds to the torques that rotate the body by about half a
-    revolution.
+    heats are additive. The torques of an amplitude of one rotate the body by about half a revolution.
     """
     field, start, end, scale = equations.around.field, equations.start, equations.end, equations.scale
     count = len(field)
@@ -430,7 +428,7 @@ class HorizonContinuation:
     def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
         """Return the best path found by shortening the slew as long as this reduces energy plus time cost.
 
-        The continuation starts from those paths in `relaxed` that satisfy the dipole limit at the shortest
+        The continuation starts from those paths in `relaxed` that satisfy the limit at the shortest
         durations.
         """
         best: SolvedPath | None = None

@@ -375,8 +375,7 @@ class VmcProgram:
     def excess(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return excesses (n, 6 + cones) over the limits at n points, and the gradients (n, 6 + cones, k).
 
-        An excess over the dipole limit is relative to the usable limit, which is the fraction `share` of the
-        dipole limit.
+        An excess over the dipole limit is relative to the usable limit, a fraction `share` of it.
         """
         values, slopes = self._cost.values(y)
         limit = self.share * self._task.craft.limit / self._unit

@@ -277,8 +277,7 @@ class StepPlan:
     Attributes:
         path: planned path, which starts at time zero until guidance sets the start time.
         status: whether the requested duration was kept or extended to the shortest feasible duration.
-        horizon_asked, horizon: requested and planned duration, s; the values are equal if the duration has a
-            cost.
+        horizon_asked, horizon: requested and planned duration, s, which are equal if the duration has a cost.
         energy: integral of R I^2 along the path, J.
         supplied: energy taken from the supply, which is the integral of V |I| along the path, J.
         peak_current: largest absolute coil current along the path, A.
@@ -345,8 +344,7 @@ def plan(
     path. The initial guess is the remaining part of the path `last`. The argument `cost` selects which energy
     is minimised.
 
-    Raises PlanningError if an argument is not finite or outside its limits, or if no permitted duration is
-    feasible.
+    Raises PlanningError if an argument is outside its limits, or if no permitted duration is feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
     _check(states, horizon, nodes, reference, q2_limit, max_stretch)
@@ -489,8 +487,7 @@ class PlanJob:
     """A planning job for a path of `horizon` s between two states, which consist of q2 and rate (rad/s).
 
     The job has a `number`, and the path starts at `origin_ns`. The attribute `last` is the path followed
-    until now, with an origin relative to `origin_ns`. The remaining attributes of a job are arguments of
-    `plan`.
+    until now, with an origin relative to `origin_ns`. The other attributes are arguments of `plan`.
     """
 
     number: int

@@ -248,8 +248,7 @@ class PathProgram:
     """The nonlinear program for a plant and a family of paths between two states, with cost and limits.
 
     Attributes:
-        family: paths between the two states, with parameters whitened about the initial guess of the given
-            duration.
+        family: paths between the two states, with parameters whitened about the initial guess.
         evaluations: number of evaluations of the cost, over all solutions.
         bang_power: power R Imax^2 of the coil at the current limit, W.
     """
@@ -439,13 +438,11 @@ class PathProgram:
 class _Variables:
     """The optimisation variables: path parameters and, if free, the scaled logarithm of the duration.
 
-    The logarithm log(T/T0) is scaled so that the time cost has, like the whitened energy, a curvature of
-    about one.
+    The logarithm log(T/T0) is scaled so that the time cost, like the energy, has a curvature of about one.
 
     Attributes:
         first: initial values of the variables.
-        root: change of log(T/T0) per unit of the variable that describes a free duration T; zero for a fixed
-            duration.
+        root: change of log(T/T0) per unit of the variable of a free duration T; zero for a fixed duration.
     """
 
     def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:

@@ -156,11 +156,9 @@ class Lens:
         focal_length: focal length on the axis, px.
         centre: pixel (x, y) of the optical axis.
         k1, k2: radial distortion coefficients of the second and the fourth power of the undistorted tangent.
-        aspect, shear: relative difference of the image scale between x and y, halved, and shear of the
-            pixels.
+        aspect, shear: half the relative difference of the image scale between x and y, and pixel shear.
         p1, p2: tangential distortion coefficients along y and along x.
-        reach: largest undistorted tangent of the field angle that is imaged; infinite if the distortion never
-            folds back.
+        reach: largest undistorted tangent that is imaged; infinite if the distortion never folds back.
 
     Raises:
         LensError: if the distortion cannot be inverted over the whole detector.

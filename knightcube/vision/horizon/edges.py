@@ -25,8 +25,7 @@ RUN = 5
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
     """Return scan lines (n, m) of dark and bright pixels after a majority filter of `run` px, an odd number.
 
-    Each scan line is extended at both ends by repeating its end pixel. Source: Meller et al., section 3.1,
-    step 2.
+    Each scan line is extended by repeating its end pixels. Source: Meller et al., section 3.1, step 2.
     """
     half = run // 2
     size = binary.shape[1]
@@ -110,8 +109,7 @@ class ScanLines:
 class ImagePart:
     """A rectangle of an image in which a second search finds edges on more scan lines.
 
-    The lowest and highest (x, y) are the `box` (2, 2), px. The brightness levels are those of the whole
-    image.
+    The lowest and highest (x, y) are the `box` (2, 2), px. The levels are those of the whole image.
     """
 
     box: FloatArray
@@ -379,8 +377,7 @@ class Samples:
     Attributes:
         rays: unit vectors to the sampled pixels (m, 3), camera axes.
         bright: whether each sampled pixel is bright (m,).
-        level: mean brightness around each sampled pixel (m,), 0 at the dark level of the image and 1 at the
-            bright level.
+        level: mean brightness around each sampled pixel (m,), 0 at the dark level and 1 at the bright level.
         mottle: texture of the image at each sampled pixel (m,), measured by the second difference of `level`
             along the scan line. The second difference is divided by 6^0.5, so that white noise has the same
             standard deviation in `mottle` and in `level`.
@@ -404,7 +401,7 @@ class Observation:
         space: distance between the scan lines, px.
         edges: detected edges as pixel positions.
         rays: detected edges as directions.
-        across, down: derivatives of the unit vector to each edge (n, 3), per pixel to the right and per pixel
+        across, down: derivatives of the unit vector to each edge (n, 3), per pixel to the right and
             downwards.
         samples: directions and brightness of sampled pixels on the scan lines.
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.

@@ -245,10 +245,8 @@ class Hypothesis:
         limb: limb points from the edges on the fitted horizon.
         residual: rms distance of the fitted edges from the limb, px.
         guess: initial guess from which the fit started.
-        lighting: agreement of the brightness of the image with the view of the Earth that the horizon
-            implies.
-        coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 if the image shows no
-            sunlit limb.
+        lighting: agreement of the image's brightness with the view of the Earth that the horizon implies.
+        coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 without a sunlit limb.
         night: fraction of the edges on the fitted limb at which the Sun's elevation is below `_NIGHT`.
         allowance: standard deviation per axis, rad, by which the uncertainty of the nadir is increased for
             unmodelled effects.

@@ -47,8 +47,7 @@ class Agreement:
     Attributes:
         stray: fraction of bright samples among the samples in the sky or on the night side.
         missing: fraction of dark samples among the samples on sunlit ground.
-        dark_samples, lit_samples: number of samples in the sky or on the night side, and number of samples on
-            sunlit ground.
+        dark_samples, lit_samples: numbers of samples in the sky or on the night side, and on sunlit ground.
     """
 
     stray: float
@@ -77,8 +76,7 @@ def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArr
 def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
     """Return how well an assumed view of the Earth agrees with samples of an image.
 
-    If the Sun's direction is unknown, only samples in the sky outside a possible glare of the Sun are
-    compared.
+    If the Sun's direction is unknown, only samples in the sky outside a possible glare are compared.
     """
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
@@ -361,8 +359,7 @@ Clouds alone cause a lower fraction of contradicting samples.
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:
     """Return why an image contradicts a known attitude, or an empty string if it agrees.
 
-    Nadir and Sun are unit vectors (3,) in body axes, accurate to a degree. The altitude is above the Earth's
-    mean radius, m.
+    Nadir and Sun (3,) are in body axes, accurate to a degree. The altitude is above the mean radius, m.
     """
 
     def mostly(against: BoolArray) -> bool:

@@ -177,8 +177,7 @@ class Orientation:
 
     Attributes:
         rotation: rotation matrix (3, 3) from inertial to camera axes, consistent with the assumed nadir.
-        sigma: standard deviation of the camera's rotation about nadir, rad; infinite if the rotation is
-            unknown.
+        sigma: standard deviation of the camera's rotation about nadir, rad; infinite if it is unknown.
         mismatch: largest difference between the measured and the expected angle from the assumed nadir to a
             known direction, in standard deviations.
         share: fraction of the sphere on which a nadir agrees with the known directions.

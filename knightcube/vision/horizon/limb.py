@@ -229,8 +229,7 @@ class FittedLimb:
         covariance: covariance (5, 5) of the fitted parameters.
         residuals: angles of the edges from the fitted limb (n,), rad, positive outside the limb.
         used: mask of the edges that lie within five standard deviations of the limb (n,).
-        correlation: factor by which the correlation of neighbouring residuals increases the variance of their
-            mean.
+        correlation: factor by which correlated neighbouring residuals increase the variance of their mean.
         prior: chi-square of the fitted parameters' deviations from their prior values.
     """
 

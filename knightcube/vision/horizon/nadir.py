@@ -200,8 +200,7 @@ def find_nadir(
         hidden: mask of the pixels that show the spacecraft's own structure (rows, columns), or None.
 
     Raises:
-        ValueError: if the size of the image or mask differs from that of the camera, or if pixels are not
-            finite.
+        ValueError: if the size of image or mask differs from the camera's, or if pixels are not finite.
 
     Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
@@ -349,8 +348,7 @@ def _by_field(
 class _Search:
     """One horizon search in an image, which read `read` pixels.
 
-    The fitted horizons are in descending order of quality. An unknown altitude is in the range `altitudes`,
-    m.
+    The horizons are in descending order of quality. An unknown altitude is in the range `altitudes`, m.
     """
 
     observation: Observation

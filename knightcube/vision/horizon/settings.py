@@ -49,8 +49,7 @@ class HorizonKnowledge:
 
     Attributes:
         position: position (3,) of the camera, m from the Earth's centre, inertial axes.
-        altitude: height of the camera above the Earth's mean radius, m, which is used if the position is
-            unknown.
+        altitude: height of the camera above the Earth's mean radius, m, used if the position is unknown.
         sun: direction (3,) to the Sun, inertial axes, of any length.
         pole: direction (3,) of the Earth's rotation axis, inertial axes.
         attitude: approximate attitude of the camera, for instance as predicted by a filter.
@@ -111,12 +110,10 @@ class EdgeSettings:
     Attributes:
         lines: number of columns, and of rows, that the first search reads.
         more_lines: number of columns, and of rows, that a second search of the image reads.
-        run: window of the majority filter that removes short fluctuations, px, odd (Meller et al., section
-            3.1).
+        run: odd window of the majority filter against short fluctuations, px (Meller et al., section 3.1).
         threshold: brightness above which a pixel counts as bright, as a fraction of the range from the dark
             level to the bright level.
-        contrast: minimum step height of an edge, as a fraction of the range from the dark level to the bright
-            level.
+        contrast: minimum step height of an edge, as a fraction of the range from dark to bright level.
         most: maximum number of edges per scan line; the edges with the darkest dark side are kept.
         psf_sigma: standard deviation of the blur of the optics, px.
         response: response of the detector, or None for a linear detector.

@@ -129,12 +129,10 @@ class StarMatch:
         fix: attitude from all matched stars, ICRS to camera, with its covariance, or None unless identified.
         scale: factor by which the observed tangents x/z, y/z must be multiplied for the true focal length.
         scale_sigma: standard deviation of the scale; 0 if the scale was given.
-        log10_false_alarm: log10 of the probability that random stars would match as well anywhere in the sky;
-            0 if unknown.
+        log10_false_alarm: log10 of the probability that random stars match as well anywhere; 0 if unknown.
         distortion: fitted distortion of the lens, as the relative displacement of a star in the image corner;
             0 if the stars matched without distortion.
-        from_lens: part of the attitude covariance of `fix` that is due to the uncertainty of `distortion` (3,
-            3), rad^2.
+        from_lens: part (3, 3) of the covariance of `fix` due to the uncertainty of `distortion`, rad^2.
         mirrored: whether the stars were identified in the mirrored field (`StarField.mirrored`). For a
             mirrored field, `fix` is the attitude of the mirrored field.
     """
@@ -503,8 +501,7 @@ class DistortedFit:
         refined: attitude and scale, with a covariance that is increased if the residuals are too large.
         distortion: radial distortion, as the relative displacement of a star in the image corner.
         seen: unit vectors to all observed points, corrected for the distortion (n, 3), camera frame.
-        from_lens: part of the attitude covariance that is due to the uncertainty of the distortion (3, 3),
-            rad^2.
+        from_lens: part (3, 3) of the attitude covariance due to the uncertainty of the distortion, rad^2.
     """
 
     observed: IntArray

@@ -64,8 +64,7 @@ class Detections:
         signal_to_noise: flux of each source divided by its standard deviation (n,).
         width: standard deviation of the Gaussian that best fits each source (n,), px, or NaN if not measured.
         quality: `Quality` flags of each source (n,), int64.
-        prediction: index of the prediction near which each source was found (n,); -1 in a search of the
-            whole frame.
+        prediction: index of the prediction near which each source was found (n,); -1 without a prediction.
         psf_sigma: standard deviation of the frame's PSF, px, or NaN if it was neither given nor measured.
     """
 

@@ -84,10 +84,8 @@ class ImageFit:
 
     Attributes:
         fix: attitude from the stars that agree; its covariance is increased if their residuals are too large.
-        scale: factor by which the observed tangents x/z, y/z must be multiplied; 1 if the focal length was
-            fixed.
-        scale_sigma: relative standard deviation of the scale along the columns; 0 if the focal length was
-            fixed.
+        scale: factor on the observed tangents x/z, y/z; 1 if the focal length was fixed.
+        scale_sigma: relative standard deviation of the scale along the columns; 0 if it was fixed.
         bend: fitted lens errors (8,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
         excess: chi-square per degree of freedom of the stars that agree with each other, for the measured

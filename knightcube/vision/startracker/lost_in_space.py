@@ -58,8 +58,7 @@ class BatchSizes:
     """Sizes of the successive batches of triangles that are looked up in the index.
 
     Attributes:
-        bright: number of triangles in each batch with only the brightest stars; these batches identify most
-            frames.
+        bright: number of triangles in each batch of only the brightest stars, which identify most frames.
         spread: number of triangles in each batch that also includes faint stars, for frames whose brightest
             points are not stars.
     """
@@ -155,8 +154,7 @@ class TriangleMatches:
     Attributes:
         observed: indices of the observed stars at the corners of each match (k, 3), uint16.
         star: indices of the guide stars at the corresponding corners (k, 3), uint16.
-        scale: factor on the observed tangents for which both triangles of a match have equal longest sides
-            (k,).
+        scale: factor (k,) on the observed tangents for which both triangles have equal longest sides.
         code: hash codes (k, 3), uint32, of the three pairs of an observed star and a guide star in each
             match. In two matches of similar scale, the same pair has the same code.
     """

@@ -108,8 +108,7 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     """Return the width of the PSF and the noise model of a frame, from the stars selected by `plain` (n,).
 
     A gain in the settings is used unchanged. The width in the settings is used unless at least eight stars
-    determine the width. If no star is usable, the width is 1 px and the photon noise 0, unless the settings
-    state them.
+    determine the width. Without a usable star and settings, the width is 1 px and the photon noise 0.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -307,8 +306,7 @@ def centre_of_mass(
 ) -> WindowCentroids:
     """Return the centroids in windows from one of `METHODS` or the centre of mass.
 
-    The centre of mass follows Michalski, eq. (12) to (20). Pixels of a window that are outside the frame
-    count as zero.
+    The centre of mass follows Michalski, eq. (12) to (20). Pixels outside the frame count as zero.
     """
     half = windows.half
     offset, flux, sky = _moments(windows.light)

@@ -285,8 +285,7 @@ def _shared_mismatch(
 ) -> float:
     """Return the mismatch of PSF and Gaussian for known photon noise, as a weighted median over the stars.
 
-    The median is used, because a wrong PSF affects all stars, but the light of neighbours affects only a few
-    stars.
+    The median is used: a wrong PSF affects all stars, but the light of neighbours only a few stars.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
@@ -721,8 +720,7 @@ def neighbour_light(
 ) -> FloatArray:
     """Return the counts of all neighbours in the window of each star (n, k, k).
 
-    Each star has its middle pixel (n, 2), offset from this pixel (n, 2), px, flux (n,), counts, and width
-    (n,), px.
+    Each star has a middle pixel (n, 2), offset from it (n, 2), px, flux (n,), counts, and width (n,), px.
     """
     size = 2 * windows.half + 1
     out = np.zeros((len(middle), size, size))

@@ -130,8 +130,7 @@ class Weighting:
     Attributes:
         weights: weights of the rotations since mid-exposure at the times `NODES`; the weight of mid-exposure
             is one minus their sum.
-        noise_share: variance due to white angular acceleration, in units of its density times the cube of the
-            exposure time.
+        noise_share: variance due to white angular acceleration, per density times exposure time cubed.
     """
 
     weights: tuple[float, float, float, float]
@@ -233,8 +232,7 @@ class SolveSettings:
         likelihood: settings of the streak estimator for images from files; flight uses other settings.
         identification: settings of the default identification method.
         method: identification function, or None for the default method.
-        attitude: solver of Wahba's problem that determines the attitude, or None for the fit of the image
-            positions.
+        attitude: solver of Wahba's problem, or None for the fit of the image positions.
         velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
             of aberration, or None for no correction.
         lens: standard deviations of the parameters of a lens with known focal length, or None if the

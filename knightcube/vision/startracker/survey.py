@@ -403,8 +403,7 @@ class DetectionSettings:
         most_stars: maximum number of stars, the brightest first. Each sixteenth of the frame's area
             contributes at most a quarter of `most_stars`.
         psf_sigma: standard deviation of the PSF, px. If `psf_sigma` is None, it is measured in the frame,
-            which needs several stars. For tracking windows with few stars, the width of the PSF should be
-            stated.
+            which needs several stars. For tracking windows with few stars, it should be stated.
         gain: electrons per count, or None to measure the gain from the residuals of the stars.
         saturation: counts at which a pixel saturates. If `saturation` is None, the frame saturates at its
             highest count if several pixels have it, otherwise at the maximum of the integer type.
@@ -535,8 +534,7 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     """Return which pixels `place` (p, 2) are in a block of 32 x 32 px with many bright pixels.
 
     A block has many bright pixels if their fraction exceeds `share`. A second grid of blocks, displaced by
-    half a block along rows and columns, is also tested, so that the result does not depend on the position of
-    the grid.
+    half a block along rows and columns, is also tested.
     """
     down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
     found = np.zeros(len(place), dtype=bool)

@@ -133,8 +133,7 @@ class VerificationSettings:
     """Settings of the verification of a candidate attitude.
 
     Attributes:
-        log10_false_alarm: log10 of the largest expected number of chance matches with which a match is
-            accepted.
+        log10_false_alarm: log10 of the largest accepted expected number of chance matches.
         gates: trial half-widths within which a star matches, in standard deviations; the gate with the most
             significant match is used. The wide gates are for a lens with distortion, and for stars with
             underestimated standard deviations.
@@ -192,8 +191,7 @@ def verify(
     """Return the identification of the whole field, or NO_MATCH if the candidate may be a chance match.
 
     The candidate has an attitude matrix (3, 3), ICRS to camera, accurate enough for stars to match, and an
-    image scale. The search for the candidate covered the fraction `searched` of all attitudes, 1 for lost in
-    space.
+    image scale. The search covered the fraction `searched` of all attitudes, 1 for lost in space.
     """
     return verify_first(field, sky, matrix[None], np.array([scale]), searched, settings)
 
@@ -670,8 +668,7 @@ def _pair(
 def _widest_difference(seen: FloatArray, reach: float) -> float:
     """Return an upper bound on the difference between the tangents of two stars at most `reach` apart.
 
-    A gnomonic image is enlarged by at most 1 + t^2 between two stars, where t is the larger field angle's
-    tangent.
+    A gnomonic image is enlarged by at most 1 + t^2 between two stars, with the larger tangent t.
     """
     lowest = 1.0
     for k in range(len(seen)):

@@ -236,10 +236,8 @@ class TriangleIndex:
     """Triangles of guide stars, sorted by their keys.
 
     Attributes:
-        key: key of each triangle (m,), uint32, from its orientation, the cell of its side ratios, and its
-            longest side.
-        corners: indices of the guide stars opposite the shortest, the middle and the longest side (m, 3),
-            uint16.
+        key: key of each triangle (m,), uint32, from orientation, cell of the side ratios, and longest side.
+        corners: indices of the guide stars opposite the shortest, middle and longest side (m, 3), uint16.
         shape: positions of each triangle's two side ratios within their cells (m, 2), uint8.
     """
 
@@ -332,8 +330,7 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
 def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
     """Return the triangles (m, 3) of the `few` brightest stars of each of the circles that cover the sky.
 
-    The circles that cover the sky have the radius `radius`. The longest side of a triangle is at least
-    `smallest`.
+    The circles have the radius `radius`. The longest side of a triangle is at least `smallest`.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
