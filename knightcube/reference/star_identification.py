@@ -681,10 +681,6 @@ class Method:
     source: str
 
 
-def _default(field: StarField, sky: KnownSky) -> StarMatch:
-    return lost_in_space.identify(field, sky.index)
-
-
 def method_of(name: str) -> Callable[[StarField, SkyIndex], StarMatch]:
     """Return an identification function of the method `name` for use in `SolveSettings`.
 
@@ -703,7 +699,10 @@ def _classical(propose: Propose, source: str) -> Method:
 
 
 METHODS: dict[str, Method] = {
-    DEFAULT_METHOD: Method(_default, "votes of triangles that match in shape, orientation and size"),
+    DEFAULT_METHOD: Method(
+        lambda field, sky: lost_in_space.identify(field, sky.index),
+        "votes of triangles that match in shape, orientation and size",
+    ),
     "angle": _classical(propose_angles, "Gottlieb 1978"),
     "spherical-triangle": _classical(propose_spherical, "Cole & Crassidis 2004"),
     "planar-triangle": _classical(propose_planar, "Cole & Crassidis 2006"),

@@ -81,9 +81,8 @@ class ScanLines:
 
     Attributes:
         columns, rows: indices of the columns and of the rows.
-        column_bright, row_bright: whether each pixel of the columns and of the rows is bright after the
-            majority filter (n, m).
-        column_light, row_light: brightness of the pixels of the columns and of the rows (n, m).
+        bright: masks (n, m) of the pixels of columns and rows that are bright after the majority filter.
+        light: brightness of the pixels of the columns and of the rows (n, m).
         space: distance between neighbouring columns, and between neighbouring rows, px.
         levels: brightness levels of dark and bright pixels.
         hidden: mask of the image's pixels that show the spacecraft's own structure (rows, columns), or None.
@@ -91,10 +90,8 @@ class ScanLines:
 
     columns: IntArray
     rows: IntArray
-    column_bright: BoolArray
-    row_bright: BoolArray
-    column_light: FloatArray
-    row_light: FloatArray
+    bright: list[BoolArray]
+    light: list[FloatArray]
     space: float
     levels: Levels
     hidden: BoolArray | None = None
@@ -102,7 +99,7 @@ class ScanLines:
     @property
     def pixels(self) -> int:
         """The number of pixels that the edge search reads."""
-        return self.column_bright.size + self.row_bright.size
+        return sum(each.size for each in self.bright)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +169,7 @@ def find_edges(
     span = levels.bright - levels.dark
     threshold = levels.dark + max(settings.threshold * span, _STANDS_OUT * levels.noise)
     bright = [run_filtered(each > threshold, settings.run) for each in light]
-    read = ScanLines(columns, rows, bright[0], bright[1], light[0], light[1], space, levels, hidden)
+    read = ScanLines(columns, rows, bright, light, space, levels, hidden)
     if not levels.bright > levels.dark or not len(columns) + len(rows):
         none = np.zeros(0)
         empty = np.zeros((0, 2))
@@ -445,9 +442,8 @@ def observe(
         sampled, imaged = _sample_rays(
             Lens.of(camera), tuple(lines.columns.tolist()), tuple(lines.rows.tolist())
         )
-        binary, lit = (lines.column_bright, lines.row_bright), (lines.column_light, lines.row_light)
-        bright = np.concatenate([each[:, _sample_places(each.shape[1])].ravel() for each in binary])
-        level, mottle = np.concatenate([_sample_levels(each, lines.levels) for each in lit], axis=1)
+        bright = np.concatenate([each[:, _sample_places(each.shape[1])].ravel() for each in lines.bright])
+        level, mottle = np.concatenate([_sample_levels(each, lines.levels) for each in lines.light], axis=1)
         if lines.hidden is not None:
             masked = lines.hidden[:, lines.columns].T, lines.hidden[lines.rows]
             seen = ~np.concatenate([_hidden_samples(each) for each in masked])

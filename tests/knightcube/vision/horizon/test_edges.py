@@ -155,7 +155,7 @@ def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, 
     noise = np.random.default_rng(3).normal(0.0, 1.0, (SIZE, SIZE))
     image = bars(0.0, sigmas, 0.0, 100.0) + noise
     low = EdgeSettings(lines=8, threshold=0.01, run=1)
-    binary = find_edges(image, low)[1].row_bright[:, 64:128]
+    binary = find_edges(image, low)[1].bright[1][:, 64:128]
     assert (float(np.mean(binary)) > 0.5) is lit
 
 
